@@ -1,8 +1,8 @@
-"""From frames to meaning: where, how hard and how a skin is touched.
+"""Estimate from frames where, how hard and how a skin is touched.
 
-Rooms: `contacts` (what an image shows, from frame to frame, in newtons), `learnt` (skins that learn from recorded
-presses, without a model), `kohonen` (maps that order frames by themselves), `gestures` (touches of a stream, and what
-they mean), `health` (cuts, electrodes that fail, repair), `attributes` (how finely a skin feels), `training` (of
+Packages: `contacts` (contacts in images, from frame to frame, in newtons), `learnt` (skins that learn from recorded
+presses, without a model), `kohonen` (self-organising maps of frames), `gestures` (touches of a stream, and their
+gestures), `health` (cuts, failing electrodes, repair), `attributes` (the resolution of a skin), `training` (of
 networks, and their files), `networks` (that image).
 
 `LogitBoostClassifier` is imported when it is first used, and scikit-learn with it.

@@ -1,7 +1,7 @@
-"""How finely a skin feels: the five attributes of touch of Silvera Tawil et al. 2011, section IV-A.
+"""The five attributes of touch of Silvera Tawil et al. 2011, section IV-A: measures of a skin's resolution.
 
-Each is measured from what was recorded on a skin; `touch_attributes` asks for all the touches that it needs, of a robot
-or of a simulated skin, and measures them all.
+Each is computed from recordings of a skin; `touch_attributes` requests all the touches that it needs, from a robot or a
+simulated skin, and measures them all.
 """
 
 from __future__ import annotations

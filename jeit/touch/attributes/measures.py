@@ -1,4 +1,4 @@
-"""Attributes of touch, each from what was recorded: loads and responses, places, separations, areas, times."""
+"""Attributes of touch, each computed from recorded loads and responses, places, separations, areas or times."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import real_array
 
-# Loads, and touches with each, at least.
+# The least number of loads, and of touches with each.
 _LEVELS, _REPEATS = 3, 3
-# Of a response's way up or down, where its time begins and ends.
+# Shares of the response's rise or fall at which its time begins and ends.
 _BEGUN, _DONE = 0.1, 0.9
 
 
 class Localisation(NamedTuple):
-    """How far from where it touched a touch is found: `mean`, standard `deviation` and `most`, metres; `missed`, the
-    share of touches that were not found at all."""
+    """Error of the estimated places of touches.
+
+    `mean`, standard `deviation` and `most`, the greatest, metres; `missed`: the share of touches that were not found.
+    """
 
     mean: float
     deviation: float
@@ -27,8 +29,11 @@ class Localisation(NamedTuple):
 
 
 class ContactArea(NamedTuple):
-    """Areas found are `least` + `gain` × those that touched, m², with this `correlation`: `least` is what a point would
-    have, by which the skin blurs."""
+    """Linear relation of estimated to true contact areas: `least` + `gain` × the true area, m², with this
+    `correlation`.
+
+    `least` is the estimated area of a point, a measure of the skin's blur.
+    """
 
     gain: float
     least: float
@@ -36,12 +41,13 @@ class ContactArea(NamedTuple):
 
 
 def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """The k loads, newtons, and at each the least relative change of load that is told: the standard deviation of the
-    response to it over its slope, and over the load. Infinite where the response does not rise.
+    """Weber's ratio: at each of the k loads, newtons, the least relative change of load that can be detected.
 
-    `load` (n,), newtons, three or more of them, each touched with three times or more; `response` (n,), of any unit,
-    such as the peak of an image. A change so large moves the response by one deviation (d′ = 1). Raises `ValueError`
-    for fewer, loads that are not positive, other lengths, and NaN.
+    It is the standard deviation of the response to the load over its slope, and over the load; infinite where the
+    response does not rise. Returns the loads and the ratios. `load` (n,), newtons, three or more different loads, each
+    applied three times or more; `response` (n,), in any unit, such as the peak of an image. Such a change moves the
+    response by one deviation (d′ = 1). Raises `ValueError` for fewer, loads that are not positive, other lengths, and
+    NaN.
     """
     load, response = _pair("load", load, "response", response)
     if (load <= 0).any():
@@ -60,8 +66,11 @@ def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray,
 
 
 def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
-    """How far touches at a `place` (n, 2 or 3) are from where they are `found` (n, 2 or 3), metres; NaN where nothing
-    was. Raises `ValueError` for other shapes, and where nothing was found at all."""
+    """Error of touches at a `place` (n, 2 or 3) that are `found` (n, 2 or 3) elsewhere, metres; NaN where none was
+    found.
+
+    Raises `ValueError` for other shapes, and where nothing was found at all.
+    """
     place = real_array("place", place, "metres (n, 2) or (n, 3)")
     found = real_array("found", found, "metres, as many as places, NaN where nothing was found")
     if place.ndim != 2 or place.shape != found.shape or not np.isfinite(place).all():
@@ -75,11 +84,11 @@ def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
 
 
 def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
-    """The least amount that is told half of the time, in its unit: of separations of two points, those that are told as
-    two; of gaps between two touches, those that are told as a gap. Infinite if never.
+    """The least amount that is detected in half of the trials, in its unit; infinite if there is none.
 
-    `amount` (n,), in trials that told it or not, `told` (n,) true or false. Shares of trials are taken to rise with the
-    amount (isotonic regression), straight between amounts. Raises `ValueError` for other lengths, and NaN.
+    An amount may be the separation of two points that are distinguished, or the gap between two touches. `amount` (n,)
+    of each trial; `detected` (n,), true or false. The detected share is assumed to rise with the amount (isotonic
+    regression), linearly between amounts. Raises `ValueError` for other lengths, and NaN.
     """
     from scipy.optimize import isotonic_regression
 
@@ -99,8 +108,10 @@ def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
 
 
 def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
-    """How areas `found` (n,) follow those that touched, `area` (n,), m², by least squares. Raises `ValueError` for
-    other lengths, NaN, and areas that are all the same."""
+    """Fit areas `found` (n,) to the true areas `area` (n,), m², by least squares.
+
+    Raises `ValueError` for other lengths, NaN, and areas that are all the same.
+    """
     area, found = _pair("area", area, "found", found)
     if len(area) < 2 or (area == area[0]).all():
         raise ValueError("area: give two different areas, or more.")
@@ -110,11 +121,11 @@ def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
 
 
 def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, float]:
-    """Seconds that a response (T,) to a touch that comes and goes at once takes from 10 to 90 % of its greatest value,
-    and from 90 to 10 % after its last. Infinite for a fall that `seconds` (T,) do not last for.
+    """Rise and fall time, seconds, of the response (T,) to a touch that begins and ends abruptly.
 
-    Before its first frame nothing touches. Raises `ValueError` for other lengths, times that do not rise, NaN, and a
-    response that is nowhere positive.
+    The rise is from 10 to 90 % of the greatest value, the fall from 90 to 10 % after its last occurrence; the fall is
+    infinite where the `seconds` (T,) end before it. Before the first frame nothing touches. Raises `ValueError` for
+    other lengths, times that do not rise, NaN, and a response that is nowhere positive.
     """
     seconds, response = _pair("seconds", seconds, "response", response)
     if (np.diff(seconds) <= 0).any():
@@ -130,7 +141,7 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
 
 
 def _pair(first: str, one: ArrayLike, second: str, other: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Both (n,) and finite."""
+    """Check that both are (n,) and finite."""
     left, right = real_array(first, one, "numbers (n,)"), real_array(second, other, "numbers (n,)")
     if left.ndim != 1 or left.shape != right.shape or not left.size:
         raise ValueError(f"{first} and {second} must be (n,), as many; they have shapes {left.shape}, {right.shape}.")

@@ -1,4 +1,4 @@
-"""All attributes of touch of one skin: the trials, whoever presses in them, and what they say."""
+"""Measure all attributes of touch of one skin, by trials on a real or a simulated skin."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from jeit.touch.attributes.measures import (
 from jeit.touch.contacts import Contact, ImageNoise, find_contacts
 from jeit.touch.contacts.finder import AbstractFinder
 
-# Untouched frames, repeats of a load, places, and trials of each separation.
+# Numbers of untouched frames, repeats of a load, places, and trials of each separation.
 _UNTOUCHED, _REPEATS, _PLACES, _TRIALS = 50, 8, 40, 8
-# Of the load told: those between which Weber's ratio is measured. Of the disc: separations, from middle to middle, and
-# diameters of others under the same pressure.
+# As multiples of the load: those at which Weber's ratio is measured. As multiples of the disc's diameter: separations,
+# from centre to centre, and diameters of other discs under the same pressure.
 _LOADS = np.geomspace(0.25, 4.0, 7)
 _SEPARATIONS = np.array([1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0])
 _DIAMETERS = np.array([1.0, 1.5, 2.0, 3.0, 4.0])
@@ -42,12 +42,12 @@ class DiscTouch(NamedTuple):
 
 
 class TouchAttributes(NamedTuple):
-    """What a skin feels.
+    """The attributes of touch of a skin.
 
-    **Fields**: `load` (k,), newtons, and `weber` (k,), the least relative change of each that is told; `localisation`,
-    metres; `two_points`, metres, from middle to middle of two discs that are told as two half of the time; `area`;
-    `rise` and `fall`, seconds, of what a touch that comes and goes at once does to an image, None where none was
-    recorded.
+    **Fields**: `load` (k,), newtons, and `weber` (k,), the least relative change of each that is detected;
+    `localisation`, metres; `two_points`, metres, the distance between the centres of two discs that are distinguished
+    in half of the trials; `area`; `rise` and `fall`, seconds, of the image's response to a touch that begins and ends
+    abruptly, None where none was recorded.
     """
 
     load: Float[np.ndarray, " k"]
@@ -72,15 +72,15 @@ def touch_attributes(
     recording: tuple[ArrayLike, ArrayLike] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> TouchAttributes:
-    """Measure a skin, real or simulated, through `linear` images of its changes and the contacts that `finder` finds.
+    """Measure a real or simulated skin, through `linear` images of its changes and the contacts that `finder` finds.
 
-    `press` is given n touches, each a list of the discs that are there at once, none for an untouched skin, and answers
-    with a frame (n, M), volts, of each: a robot with discs, or a simulated skin. Discs of a `diameter`, metres, press
-    with a `load`, newtons, or from a quarter to four times that, round the `middle` (x, y); for places, all over a disk
-    of `within` metres about it. `recording`: seconds (T,), and frames (T, M) of one touch that comes and goes at once.
-    `key` draws places and directions; `progress` is called with what is measured. Raises `ValueError` for what is no
-    key, image or finder, sizes and loads that are not positive, frames of another shape, and a skin on which nothing is
-    found.
+    `press` is given n touches, each a list of simultaneous discs, none for an untouched skin, and returns a frame (n,
+    M), volts, of each: a robot with discs, or a simulated skin. Discs of a `diameter`, metres, press with a `load`,
+    newtons, or from a quarter to four times that, near the `middle` (x, y); for localisation, anywhere in a disk of
+    radius `within`, metres, about it. `recording`: seconds (T,), and frames (T, M) of one touch that begins and ends
+    abruptly. `key` draws places and directions; `progress` is called with what is measured. Raises `ValueError` for
+    what is no key, image or finder, sizes and loads that are not positive, frames of another shape, and a skin on which
+    nothing is found.
     """
     check_key(key)
     if not callable(press):
@@ -145,10 +145,10 @@ def _directions(random: np.random.Generator, number: int) -> Float[np.ndarray, "
 
 
 def _size(found: list[Contact]) -> float:
-    """Of the strongest contact; 0 of none."""
+    """Peak of the strongest contact; 0 if there is none."""
     return abs(found[0].peak) if found else 0.0
 
 
 def _where(found: list[Contact]) -> np.ndarray:
-    """Of the strongest contact; NaN of none."""
+    """Centroid of the strongest contact; NaN if there is none."""
     return found[0].centroid if found else np.full(2, np.nan)

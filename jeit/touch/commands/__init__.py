@@ -1,3 +1,3 @@
-"""Commands of touches, and of what is learnt from them."""
+"""Commands for touches, and for models learnt from them."""
 
 from __future__ import annotations

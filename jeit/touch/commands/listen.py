@@ -1,4 +1,4 @@
-"""`jeit listen`: what is heard in a recording; and `jeit listen fit`, which learns from labelled clips."""
+"""`jeit listen`: classify the sounds of a recording; and `jeit listen fit`: learn from labelled clips."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def fit(
         raise ValueError(f"--output {output} lies in the folder of clips, where it would be a class; give another.")
     make_folder(output, LISTENER_FILES)
     console = plain_console()
-    # Trainings on their way; gone when all is done.
+    # Unfinished trainings; deleted when all is done.
     under_way = output / "training"
     with Steps(console, quiet=quiet) as step:
         step("read")
@@ -196,24 +196,24 @@ def fit(
     say_written(console, output / "listener.jeit", "report.json", "learning.png")
 
 
-def _show(console, heard: "Heard") -> None:
+def _show(console, result: "Heard") -> None:
     """The whole, and a line for each event."""
     from rich.table import Table
 
     from jeit.cli.console import pairs
 
-    name, probability = heard.whole
+    name, probability = result.whole
     said = f"{name}, {100 * probability:.0f} %" if name else "nothing"
-    rows = [("windows", str(len(heard))), ("as a whole", said), *(("note", note) for note in heard.notes)]
+    rows = [("windows", str(len(result))), ("as a whole", said), *(("note", note) for note in result.notes)]
     console.print()
-    console.print(pairs(heard.name, rows))
+    console.print(pairs(result.name, rows))
     console.print()
-    placed = heard.position is not None
+    placed = result.position is not None
     names = ("heard", "from / s", "to / s", "sure / %", *(("x / mm", "y / mm") if placed else ()))
     table = Table(*names, box=None, padding=(0, 2, 0, 0))
     for column in table.columns[1:]:
         column.justify = "right"
-    for event in heard.events:
+    for event in result.events:
         where = [""] * (2 * placed) if event.place is None else [f"{1e3 * value:z.1f}" for value in event.place[:2]]
         sure = f"{100 * event.probability:.0f}" if event.name else ""
         table.add_row(event.name or "quiet", f"{event.start:.2f}", f"{event.end:.2f}", sure, *where)

@@ -1,4 +1,4 @@
-"""Frames imaged by a network on the command line: what `reconstruct` and `stream` share of it."""
+"""Frames imaged by a network on the command line: common code of `reconstruct` and `stream`."""
 
 from __future__ import annotations
 

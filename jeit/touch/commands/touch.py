@@ -1,4 +1,4 @@
-"""`jeit touch`: skins that learn from recorded presses, what they then say of frames, and gestures."""
+"""`jeit touch`: skins that learn from recorded presses, their predictions for frames, and gestures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ touch.command()(watch)
 touch.command()(health)
 
 
-# Of the mesh of images: contacts are told between its cells.
+# Number of nodes of the mesh of images; contacts are located between its cells.
 _NODES = 400
 
 

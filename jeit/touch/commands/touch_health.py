@@ -1,4 +1,4 @@
-"""`jeit touch health`: whether a skin is still what it was: cuts, electrodes that fail, repair."""
+"""`jeit touch health`: monitor a skin for damage: cuts, electrodes that fail, repair."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from jeit.cli.options import Quiet, check_positive, make_folder, naming_options
 
-# Frames watched between two words of how far it is.
+# Number of frames processed between two progress messages.
 _AT_ONCE = 500
 
 

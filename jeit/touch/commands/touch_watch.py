@@ -1,4 +1,4 @@
-"""`jeit touch gestures` and `jeit touch watch`: gestures learnt from recordings, and named as they end."""
+"""`jeit touch gestures` and `jeit touch watch`: learn gestures from recordings, and classify touches as they end."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def watch(
         def show(one) -> None:
             if one.note and not quiet:
                 console.print(f"  note: {one.note}", soft_wrap=True)
-            # Live, a touch is named with the first frame that has none; of a file it is told once, as in the end.
+            # Live, a touch is named with the first frame after it; of a file it is reported once, with its final name.
             ended = one.ended if stream != "-" else () if one.named is None else (one.named,)
             for touch in () if quiet else ended:
                 console.print(_line(touch))

@@ -1,4 +1,4 @@
-"""Contacts found in images of change, followed from frame to frame, and what load each carries."""
+"""Find contacts in images of change, follow them from frame to frame, and estimate the load of each."""
 
 from __future__ import annotations
 

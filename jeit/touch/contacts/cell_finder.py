@@ -1,4 +1,4 @@
-"""Contacts on the mesh itself: a watershed parts the peaks, a share of each peak bounds its region."""
+"""Find contacts on the cells of a mesh: a watershed separates the peaks, a share of each peak bounds its region."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from jeit.touch.contacts.smoothing import gaussian_means
 
 
 class CellFinder(AbstractFinder):
-    """Every peak of an image with the cells round it that exceed `level` times the peak.
+    """Find every peak of an image, with the cells around it that exceed `level` times the peak.
 
-    The centroid is weighted by what exceeds that level, which is nothing at the region's edge: it does not jump when a
-    cell joins or leaves. A peak counts if it is at least `least_peak` times the strongest, and stands
+    The centroid is weighted by the excess above that level, which is zero at the region's edge, so that it does not
+    jump when a cell joins or leaves. A peak counts if it is at least `least_peak` times the strongest, and stands
     `least_prominence` times its own height above the saddle to a higher one: less is an artefact, or a shoulder.
 
-    Its defaults err least on simulated skins (`python -m benchmarks contacts`).
+    The defaults have the least error on simulated skins (`python -m benchmarks contacts`).
 
     The mesh is a flat sheet or a surface in space; contacts of the latter are (3,), on it.
 
@@ -85,7 +85,7 @@ class CellFinder(AbstractFinder):
         area, centre = self.areas[region], self.centres[region]
         weight = area * (change[region] - level)
         centroid = weight @ centre / weight.sum()
-        # Of Σ a (v − level v_peak) x / Σ a (v − level v_peak) by v.
+        # Derivative of Σ a (v − level v_peak) x / Σ a (v − level v_peak) by v.
         slope = np.zeros(self.centres.shape)
         slope[region] = area[:, None] * (centre - centroid) / weight.sum()
         slope[peak] -= self.level * slope[region].sum(axis=0)

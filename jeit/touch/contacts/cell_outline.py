@@ -1,4 +1,4 @@
-"""Outlines of sets of cells."""
+"""Compute outlines of sets of cells."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from jaxtyping import Float, Int
 
 
 def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c 3"]) -> Float[np.ndarray, "k d"]:
-    """Vertices (k, d), in metres, of the longest loop of edges that belong to one of the `cells` (c, 3) only.
+    """Outline of a set of cells: vertices (k, d), in metres, of the longest loop of its boundary edges.
 
-    Cells turn one way, so their edges do too, and those that are left lead on from one to the next; where the set
-    touches itself in a node, the loop takes either way.
+    Boundary edges belong to one of the `cells` (c, 3) only. Cells have the same orientation, and so have their edges,
+    so that the boundary edges follow one another; where the set touches itself in a node, the loop takes either way.
     """
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
     _, which, number = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)

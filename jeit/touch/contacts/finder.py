@@ -1,4 +1,4 @@
-"""What finds contacts: the one interface, and what it asks of an image."""
+"""The common interface of contact finders, and checks of their arguments."""
 
 from abc import abstractmethod
 
@@ -14,10 +14,10 @@ from jeit.touch.contacts.image_noise import ImageNoise
 
 
 class AbstractFinder(eqx.Module):
-    """A way to find contacts in images on one mesh, of which all is prepared that does not depend on the image.
+    """Finds contacts in images on one mesh; all that does not depend on the image is computed in advance.
 
     **Fields**: `smoothing` (m, m), applied to images first; `sign`, +1 where touched skin conducts better, -1 where
-    worse; `floor`, how many standard deviations a cell must stand out to belong to a contact.
+    worse; `floor`, how many standard deviations a cell must exceed to belong to a contact.
     """
 
     smoothing: eqx.AbstractVar[sparse.csr_array]
@@ -31,14 +31,14 @@ class AbstractFinder(eqx.Module):
 
     @abstractmethod
     def find(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> list[Contact]:
-        """Contacts in a `change` (m,), turned so that contacts are positive."""
+        """Find contacts in a `change` (m,), with the sign in which contacts are positive."""
 
     def above_noise(
         self, change: Float[np.ndarray, " m"], noise: ImageNoise
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """A change (m,) smoothed, and the same with zeros where it is below the floor."""
         change = self.smoothing @ change
-        # No smoothed cell strays further than this, however cells stray together.
+        # No smoothed cell deviates more than this, however cells are correlated.
         return change, np.where(change > self.floor * (self.smoothing @ noise.deviation), change, 0.0)
 
 
@@ -58,14 +58,15 @@ def find_contacts(
 
 
 def turned(finder: AbstractFinder, found: list[Contact]) -> list[Contact]:
-    """Contacts in a change that was turned so that they are positive, as they are in its image; strongest first."""
+    """Restore the sign of contacts found in a change in which they are positive; strongest first."""
     if finder.sign < 0:
         found = [eqx.tree_at(lambda one: (one.peak, one.integral), one, (-one.peak, -one.integral)) for one in found]
     return sorted(found, key=lambda one: -abs(one.peak))
 
 
 def checked_noise(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> ImageNoise:
-    """Noise of a change (m,), of itself if None. Raises `ValueError` for what is none, and noise of another mesh."""
+    """Noise of a change (m,), estimated from it if None. Raises `ValueError` for what is none, and noise of another
+    mesh."""
     if noise is None:
         return ImageNoise.of_image(change)
     check_kind("noise", noise, ImageNoise, "ImageNoise, such as ImageNoise.of_frames(reconstruction, frames)")
@@ -75,7 +76,8 @@ def checked_noise(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> 
 
 
 def checked_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
-    """An image, turned so that contacts are positive. Raises `ValueError` for what is no image on the finder's mesh."""
+    """An image with the sign in which contacts are positive. Raises `ValueError` for what is no image on the finder's
+    mesh."""
     values = np.asarray(image)
     if values.shape != (finder.num_cells,):
         raise ValueError(
@@ -90,8 +92,11 @@ def checked_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
 
 
 def check_finder(mesh: Mesh, sign: int, floor: float, *, flat: bool = True) -> None:
-    """Raises `ValueError` for what is no 2-D mesh, and a surface in space where it must be flat, a sign that is none,
-    and a floor that is negative."""
+    """Check the arguments of a finder.
+
+    Raises `ValueError` for what is no 2-D mesh, and a surface in space where it must be flat, a sign that is none, and
+    a floor that is negative.
+    """
     check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
     if flat:
         check_flat(mesh, "contacts on a raster")
@@ -106,6 +111,6 @@ def check_finder(mesh: Mesh, sign: int, floor: float, *, flat: bool = True) -> N
 
 
 def check_share(name: str, value) -> None:
-    """Raises `ValueError` for what is not between 0 and 1."""
+    """Check a share. Raises `ValueError` for what is not between 0 and 1."""
     if not (is_number(value) and 0 <= value < 1):
         raise ValueError(f"{name} must be a share, from 0 to below 1; it is {describe(value)}.")

@@ -1,4 +1,4 @@
-"""Noise of linear images: how far each cell strays while nothing touches, and how cells stray together."""
+"""Noise of linear images of an untouched skin: the standard deviation of each cell, and their covariance."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from scipy import sparse
 from jeit.arguments import check_kind, counted, real_array
 from jeit.inverse.linear.one_step import LinearReconstruction
 
-# Fewer frames do not say how far the next one may stray.
+# With fewer frames the deviation of the next one is not known.
 _LEAST_FRAMES = 10
-# Of normal noise: the standard deviation over the median of the absolute value; deviations that a cell may lie off, and
-# the standard deviation over that of what lies within them.
+# Of normal noise: the standard deviation over the median of the absolute value; the number of deviations within which a
+# cell is kept, and the standard deviation over that of the cells kept.
 _NORMAL, _OFF, _WITHIN = 1.4826, 3.0, 1.0136
-# Rounds of clipping, at most.
+# The greatest number of rounds of clipping.
 _ROUNDS = 20
 
 
 class ImageNoise(eqx.Module):
-    """Standard deviation of every cell, `deviation` (m,), in the unit of the image; and, where it is known how cells
-    stray together, `factor` (r, m), whose product factorᵀ factor is their covariance."""
+    """Standard deviation of every cell, `deviation` (m,), in the unit of the image, and their covariance, if known.
+
+    `factor` (r, m), whose product factorᵀ factor is the covariance; None where it is not known.
+    """
 
     deviation: Float[np.ndarray, " m"]
     factor: Float[np.ndarray, "r m"] | None = None
 
     def __check_init__(self):
-        """Raises `ValueError` for deviations that are negative or not finite, and factors of other cells."""
+        """Check the fields. Raises `ValueError` for deviations that are negative or not finite, and factors of other
+        cells."""
         wanted = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
         check_kind("deviation", self.deviation, (np.ndarray, jax.Array), wanted)
         deviation = real_array("deviation", self.deviation, wanted)
@@ -43,11 +46,11 @@ class ImageNoise(eqx.Module):
 
     @classmethod
     def of_frames(cls, reconstruction: LinearReconstruction, frames: Float[np.ndarray, "n M"]) -> "ImageNoise":
-        """From repeated frames (n, M) volts of the skin that nobody touches, ten at least.
+        """Estimate the noise from repeated frames (n, M) volts of the untouched skin, ten at least.
 
-        What they stray by about their mean is imaged. Frames that span as long as readings will last hold the drift
-        too, which frames of one moment do not. Raises `ValueError` for fewer frames, other channels, NaN, and frames
-        that are all the same.
+        Their deviations from the mean are imaged. Frames that span as long as readings will last include drift, which
+        frames of one moment do not. Raises `ValueError` for fewer frames, other channels, NaN, and frames that are all
+        the same.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
         frames = real_array("frames", frames, "voltages (n, M)")
@@ -63,10 +66,11 @@ class ImageNoise(eqx.Module):
 
     @classmethod
     def of_channels(cls, reconstruction: LinearReconstruction, deviation: ArrayLike) -> "ImageNoise":
-        """From the standard deviation of each channel, (M,) or one number, volts; channels independent.
+        """Compute the noise from the standard deviation of each channel, (M,) or one number, volts; channels
+        independent.
 
-        A difference of two such frames strays √2 as far. Raises `ValueError` for those that are negative, not finite,
-        all zero, or of another number of channels.
+        The difference of two such frames deviates by √2 times as much. Raises `ValueError` for those that are negative,
+        not finite, all zero, or of another number of channels.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
         number = reconstruction.num_measurements
@@ -79,12 +83,12 @@ class ImageNoise(eqx.Module):
 
     @classmethod
     def of_image(cls, image: Float[np.ndarray, " m"]) -> "ImageNoise":
-        """From an image (m,) alone, contacts in it or not: the standard deviation, for all cells alike, once cells are
-        left out that lie more than three from the median, again and again (sigma clipping).
+        """Estimate the noise from an image (m,) alone, with or without contacts, by sigma clipping.
 
-        What a contact leaves all over an image, and ringing, count as noise, so that weak contacts beside strong ones
-        go unseen; and cells that stray further than most are taken for contacts. Raises `ValueError` for an image
-        that is not (m,), finite and real.
+        It is the standard deviation, the same for all cells, after cells more than three deviations from the median are
+        removed repeatedly. Artefacts of a contact all over an image, and ringing, count as noise, so that weak contacts
+        beside strong ones are not found; and cells that are noisier than most are taken for contacts. Raises
+        `ValueError` for an image that is not (m,), finite and real.
         """
         values = np.asarray(image)
         if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
@@ -96,22 +100,26 @@ class ImageNoise(eqx.Module):
         return cls(np.sqrt((factor**2).sum(axis=0)), factor)
 
     def distance(self, slope: Float[np.ndarray, "m 2"]) -> float:
-        """Root mean square distance that a place moves whose derivative by the image is `slope` (m, 2), metres over the
-        image's unit. Where it is not known how cells stray together: the most that it can be."""
+        """Root mean square displacement, metres, of a place whose derivative by the image is `slope` (m, 2).
+
+        The slope is in metres over the image's unit. Where the covariance of cells is not known, it is the upper bound.
+        """
         if self.factor is None:
             return float(np.linalg.norm(self.deviation @ np.abs(slope)))
         return float(np.linalg.norm(self.factor @ slope))
 
     def smoothed(self, smoothing: sparse.csr_array) -> Float[np.ndarray, " m"]:
-        """Standard deviation (m,) of the image once smoothed by a matrix (m, m), which is the most that it can be where
-        it is not known how cells stray together."""
+        """Standard deviation (m,) of the image after smoothing by a matrix (m, m).
+
+        Where the covariance of cells is not known, it is the upper bound.
+        """
         if self.factor is None:
             return smoothing @ self.deviation
         return np.sqrt(((smoothing @ self.factor.T) ** 2).sum(axis=1))
 
 
 def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
-    """Standard deviation of those values that lie within three of the median, begun with the median distance."""
+    """Standard deviation of the values within three deviations of the median, initially from the median distance."""
     kept = values
     for _ in range(_ROUNDS):
         middle = np.median(kept)

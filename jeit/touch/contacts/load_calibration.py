@@ -1,9 +1,9 @@
-"""Load calibration: from how strong a contact is in an image to newtons, with what it is uncertain by.
+"""Load calibration: estimate the load of a contact, in newtons, from its peak in an image, with its uncertainty.
 
-    peak = s exp(b ρ² + c ρ⁴) F / (F + F½),    ρ = distance from the middle of the skin / its radius,
+peak = s exp(b ρ² + c ρ⁴) F / (F + F½), ρ = distance from the middle of the skin / its radius,
 
-rises with the load F and saturates, as conductivity under pressure does, and is the stronger the nearer the electrodes
-are. It is for one indenter, or those much alike: a wider contact under the same load has another peak.
+rises with the load F and saturates, as conductivity under pressure does, and is greater near the electrodes. It is
+valid for one indenter, or similar ones: a wider contact under the same load has another peak.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from scipy.optimize import least_squares
 from jeit.arguments import check_kind, check_metres, describe, real_array
 from jeit.touch.contacts.contact import Contact
 
-# Parameters s, b, c and F½, and what is left to tell how well they fit.
+# Parameters s, b, c and F½, and some degrees of freedom to estimate the goodness of fit.
 _FEWEST = 8
-# Calibrated peaks end before the curve's saturation, where any load would do.
+# Calibrated peaks end below the curve's saturation, where the load is undetermined.
 _HIGHEST = 0.98
-# Of the radius: no contact of the skin is farther out, and no image shows any that is narrower.
+# Relative to the radius: the greatest distance of a contact from the middle, and the least width of a contact in an
+# image.
 _FARTHEST, _NARROWEST = 10.0, 1e-3
 
 
@@ -35,12 +36,12 @@ class Load(eqx.Module):
 
 
 class LoadCalibration(eqx.Module):
-    """How peaks follow loads.
+    """A fitted relation of peaks to loads.
 
     **Fields**: `centre` (2,) and `radius` of the skin, metres; `parameters` (4,): log s, b, c and log F½, with their
     `covariance` (4, 4); `sign` of the peaks, 1 or -1; `scatter`, standard deviation of the logarithm of a peak about
-    the curve; of what was calibrated, `loads`, least and greatest, newtons, `farthest` ρ, and `highest`, the greatest
-    share of saturation.
+    the curve; of the calibrated contacts, `loads`, least and greatest, newtons, `farthest` ρ, and `highest`, the
+    greatest share of saturation.
     """
 
     centre: Float[np.ndarray, "2"]
@@ -57,11 +58,11 @@ class LoadCalibration(eqx.Module):
     def fit(
         cls, contacts: Sequence[Contact], loads: ArrayLike, *, radius: float, centre: ArrayLike = (0.0, 0.0)
     ) -> "LoadCalibration":
-        """From `contacts` (n) under known `loads` (n,) newtons, eight at least, at several places, by least squares of
-        the logarithm of their peaks; `radius` of the skin and its `centre`, metres.
+        """Fit to `contacts` (n) under known `loads` (n,) newtons, eight at least, at several places.
 
-        Raises `ValueError` for fewer, loads that are not positive or all the same, peaks of both signs, and a curve
-        that does not fit.
+        The logarithm of the peaks is fitted by least squares; `radius` of the skin and its `centre`, metres. Raises
+        `ValueError` for fewer, loads that are not positive or all the same, peaks of both signs, and a curve that does
+        not fit.
         """
         check_metres("radius", radius)
         check_kind("contacts", contacts, (list, tuple), "a list of them, one for each load")
@@ -95,7 +96,7 @@ class LoadCalibration(eqx.Module):
         def left(parameters):
             return _log_peak(parameters, distance, loads) - logarithm
 
-        # Weak priors, of a thousandth of a reading each, where places or loads do not tell a parameter.
+        # Weak priors, of a thousandth of a reading each, where places or loads do not determine a parameter.
         weak = np.sqrt(1e-3) * np.array([0.0, 0.3, 0.3, 0.3])
         found = least_squares(lambda parameters: np.concatenate([left(parameters), weak * (parameters - begin)]), begin)
         if not found.success:
@@ -108,10 +109,11 @@ class LoadCalibration(eqx.Module):
         return cls(centre, float(radius), found.x, covariance, sign, scatter, span, float(distance.max()), highest)
 
     def load(self, contact: Contact) -> Load:
-        """The load of a contact, newtons, and its standard deviation: of the fit, and of the scatter about it.
+        """Estimate the load of a contact, newtons, and its standard deviation, from that of the fit and the scatter
+        about it.
 
-        Raises `ValueError` for a peak beyond those calibrated, where the curve says nothing of the load, for one of the
-        other sign, and for a place farther out.
+        Raises `ValueError` for a peak beyond those calibrated, where the curve does not determine the load, for one of
+        the other sign, and for a place farther out.
         """
         check_kind("contact", contact, Contact, "a Contact, as of find_contacts")
         if contact.peak * self.sign <= 0:
@@ -127,7 +129,7 @@ class LoadCalibration(eqx.Module):
             )
         scale, first, second, half = self.parameters
         share = abs(contact.peak) / np.exp(scale + first * distance**2 + second * distance**4)
-        # Two standard deviations of a peak about the curve are no sign of a greater load.
+        # A peak within two standard deviations of the curve is no evidence of a greater load.
         if share > min(self.highest * np.exp(2 * self.scatter), max(self.highest, _HIGHEST)):
             raise ValueError(
                 f"contact: its peak {describe(contact.peak)} is {share / self.highest:.2f} times the highest that was "

@@ -1,8 +1,8 @@
-"""Contacts on a raster, by OpenCV: region of interest, grey, adaptive threshold, opening, contours, centroids.
+"""Find contacts on a raster, by OpenCV: region of interest, grey, adaptive threshold, opening, contours, centroids.
 
-The steps of Chen et al., "New flexible tactile sensor based on electrical impedance tomography", Micromachines 13
-(2022) 185. Sizes are not printed there: those here err less than a constant of 10, an opening of 5 pixels and no
-smoothing, on simulated skins (`python -m benchmarks contacts`).
+The steps are those of Chen et al., "New flexible tactile sensor based on electrical impedance tomography",
+Micromachines 13 (2022) 185. The paper does not state sizes: those here have less error than a constant of 10, an
+opening of 5 pixels and no smoothing, on simulated skins (`python -m benchmarks contacts`).
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from jeit.touch.contacts.finder import AbstractFinder, check_finder, checked_ima
 from jeit.touch.contacts.image_noise import ImageNoise
 from jeit.touch.contacts.smoothing import gaussian_means
 
-# Pixels across the band, along a contact's edge, in which cells may join it or leave.
+# Width in pixels of the band along a contact's edge in which cells may join or leave it.
 _EDGE = 15
-# Along a side: with more, memory is short, and no image has as many cells.
+# Along a side: more pixels need much memory, and no image has as many cells.
 _MOST_PIXELS = 4096
 
 
 class RasterStages(eqx.Module):
-    """What every step of `RasterFinder` makes of an image; all (rows, columns), row 0 at the top.
+    """The result of every step of `RasterFinder`; all (rows, columns), row 0 at the top.
 
     **Fields**: `region`, the change on the pixels of the skin, NaN beside it; `grey`, 0 to 255; `threshold` and
     `opened`, whether a pixel is kept; `contacts`; `extent` (x_min, x_max, y_min, y_max), metres.
@@ -46,12 +46,15 @@ class RasterStages(eqx.Module):
 
 
 class RasterFinder(AbstractFinder):
-    """Grey levels from the floor to the image's greatest change; pixels `constant` levels above the Gaussian mean of
-    the `block` round them; opened by an ellipse; external contours, and the centroid of what each encloses.
+    """Finds contacts by an adaptive threshold on a raster.
+
+    Grey levels are from the floor to the image's greatest change; pixels are kept that are `constant` levels above the
+    Gaussian mean of the `block` around them; they are opened by an ellipse; each contact is an external contour, with
+    the centroid of what it encloses.
 
     **Fields**: `raster` of the mesh; `smoothing` (m, m), applied first; `block` and `opening`, odd numbers of pixels;
-    `constant`, grey levels; `floor` and `sign`, see `AbstractFinder`: what stands out by less is black, or empty frames
-    would have contacts.
+    `constant`, grey levels; `floor` and `sign`, see `AbstractFinder`: what exceeds the noise by less is black, or empty
+    frames would have contacts.
     """
 
     raster: Raster
@@ -99,14 +102,14 @@ class RasterFinder(AbstractFinder):
         return self._stages(change, noise).contacts if clear.any() else []
 
     def stages(self, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None) -> RasterStages:
-        """What every step makes of an image (m,) and its noise; both, and errors, as of `find_contacts`."""
+        """Compute every step for an image (m,) and its noise; both, and errors, as of `find_contacts`."""
         change = checked_image(self, image)
         found = self._stages(change, checked_noise(change, noise))
         own = self.sign * found.region, turned(self, found.contacts)
         return eqx.tree_at(lambda stages: (stages.region, stages.contacts), found, own)
 
     def _stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
-        """Those of a change that was turned so that contacts are positive."""
+        """Compute the steps for a change with the sign in which contacts are positive."""
         opencv = _opencv()
         cell = np.asarray(self.raster.cell)
         inside = cell >= 0
@@ -114,8 +117,8 @@ class RasterFinder(AbstractFinder):
         region, clear = np.where(inside, change[cell], np.nan), np.where(inside, clear[cell], 0.0)
         highest = clear.max()
         grey = np.rint(255 * clear / (highest or 1.0)).astype(np.uint8)
-        # OpenCV takes pixels above the mean less its constant. Beside the skin stands what is near on it: beside black,
-        # all of its rim would stand out.
+        # OpenCV keeps pixels above the mean less its constant. Pixels beside the skin have the value of the nearest
+        # pixel on it: if they were black, all of the skin's rim would exceed the mean.
         size = (self.block, self.block)
         weight = np.maximum(opencv.GaussianBlur(inside * 1.0, size, 0), 1e-12)
         near = opencv.GaussianBlur(grey * 1.0, size, 0) / weight
@@ -140,8 +143,11 @@ class RasterFinder(AbstractFinder):
     def _contact(
         self, opencv, region, contour: np.ndarray, stray: tuple, weight, clear, noise: ImageNoise
     ) -> Contact | None:
-        """What a contour (k, 2) of columns and rows encloses. `stray`: see `_stray`; `weight` (rows, columns) of the
-        skin in the means that pixels stand out from, of those that are `clear` of noise."""
+        """Describe the contact that a contour (k, 2) of columns and rows encloses.
+
+        `stray`: see `_stray`; `weight` (rows, columns) of the skin in the means that pixels are compared with, of those
+        that are `clear` of noise.
+        """
         filled = np.zeros(region.shape, np.uint8)
         opencv.drawContours(filled, [contour[:, None]], -1, 1, opencv.FILLED)
         within = (filled > 0) & np.isfinite(region)
@@ -150,13 +156,13 @@ class RasterFinder(AbstractFinder):
         place = self.raster.pixel_centres()
         centroid, area = place[within].mean(axis=0), float(self.raster.pixel_area * within.sum())
         (together, alone), size = stray, (self.block, self.block)
-        # Only at the edge do cells join and leave: what is inside a contour counts whatever its grey level.
+        # Cells join and leave only at the edge: what is inside a contour counts whatever its grey level.
         ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (_EDGE, _EDGE))
         edge = (opencv.dilate(filled, ellipse) > opencv.erode(filled, ellipse)) & np.isfinite(region)
         cell = np.asarray(self.raster.cell)
         lever = np.where(edge[..., None], (place - centroid) * self.raster.pixel_area / area, 0.0)
         follows = np.where(edge, together[cell], 0.0)[..., None] * lever
-        # The threshold moves too: with the mean of what is near.
+        # The threshold moves too: with the mean of the surrounding pixels.
         spread = opencv.GaussianBlur((follows / weight[..., None]).astype(np.float32), size, 0)
         slope = self._on_cells(follows - spread * clear[..., None])
         moved = noise.distance(self.smoothing.T @ slope), np.linalg.norm(alone[:, None] * self._on_cells(lever))
@@ -172,11 +178,11 @@ class RasterFinder(AbstractFinder):
         return np.stack([np.bincount(own, one, minlength=self.num_cells) for one in weights], axis=-1)
 
     def _stray(self, cell: np.ndarray, above: np.ndarray, noise: ImageNoise) -> tuple[np.ndarray, np.ndarray]:
-        """How far the membership of every cell strays: by its smoothed value (m,), and besides (m,).
+        """Uncertainty of the membership of every cell: from its smoothed value (m,), and in addition (m,).
 
-        A raster steps by cells: one of mean `above` over the threshold, whose smoothed value strays by σ, is in with
-        probability p = Φ(z), z = above / σ. Its membership follows the value by φ(z) / σ on the whole, and strays about
-        that by √(p (1 − p) − φ(z)²), each cell for itself.
+        A raster changes by whole cells: one of mean `above` over the threshold, whose smoothed value has standard
+        deviation σ, is in with probability p = Φ(z), z = above / σ. Its membership follows the value by φ(z) / σ on
+        average, and deviates from that by √(p (1 − p) − φ(z)²), each cell independently.
         """
         number = np.bincount(cell, minlength=self.num_cells)
         mean = np.bincount(cell, above, minlength=self.num_cells) / np.maximum(number, 1)

@@ -1,4 +1,4 @@
-"""Smoothing of images on a mesh: back-projected ones have an edge along every band, and each edge has peaks."""
+"""Smooth images on a mesh: back-projected ones have an edge along every band, and each edge has peaks."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from scipy.spatial import KDTree
 from jeit.arguments import describe, is_number
 from jeit.mesh import Mesh, centroids, measures
 
-# Standard deviations beyond which a Gaussian is nothing.
+# Standard deviations beyond which a Gaussian is taken as zero.
 _REACH = 3.0
-# Of the root of the mesh's area: the length unless given.
+# Default length, as a share of the root of the mesh's area.
 _SHARE = 0.03
 
 

@@ -1,4 +1,4 @@
-"""Contacts followed from frame to frame: which is which, when each begins and ends, and where it went."""
+"""Follow contacts from frame to frame: identify them, and determine when each begins and ends, and its path."""
 
 from __future__ import annotations
 
@@ -12,15 +12,18 @@ from scipy.optimize import linear_sum_assignment
 from jeit.arguments import check_kind, check_metres, describe, is_number, real_array
 from jeit.touch.contacts.contact import Contact
 
-# Of what a contact is off its prediction, how much goes into the velocity: half, so that two frames' noise evens out.
+# The share of a contact's prediction error that is added to the velocity: half, which averages the noise of two frames.
 _BELIEVED = 0.5
-# Gaps that a touch is waited for which another's contact hides.
+# The number of gaps for which a touch is waited for that is hidden by another's contact.
 _HIDDEN = 4
 
 
 class TouchPath(eqx.Module):
-    """One touch: its `number`, in order of onset, and of every frame that it was seen in `times` (T,) seconds,
-    `position` (T, 2) metres, `peak` (T,) in the images' unit and `area` (T,) m²."""
+    """The path of one touch.
+
+    `number`, in order of onset; of every frame in which it was seen, `times` (T,) seconds, `position` (T, 2) metres,
+    `peak` (T,) in the images' unit and `area` (T,) m².
+    """
 
     number: int
     times: Float[np.ndarray, " T"]
@@ -45,8 +48,8 @@ class TouchPath(eqx.Module):
 
 
 class _Followed(eqx.Module):
-    """A touch that goes on: where it was at `time`, how fast it moved there (m/s), what was seen of it, and whether
-    another's contact may hide it now."""
+    """A touch that is being followed: its place at `time`, its velocity (m/s), its path, and whether it may be hidden
+    now."""
 
     number: int
     time: float
@@ -56,27 +59,28 @@ class _Followed(eqx.Module):
     hidden: bool = False
 
     def at(self, time: float) -> np.ndarray:
-        """Where it is expected, metres."""
+        """Predicted place, metres."""
         return self.place + (time - self.time) * self.velocity
 
     def path(self) -> TouchPath:
-        """What was seen of it."""
+        """The path so far."""
         times, contacts = zip(*self.seen, strict=True)
         columns = ([getattr(one, name) for one in contacts] for name in ("centroid", "peak", "area"))
         return TouchPath(self.number, np.array(times), *map(np.array, columns))
 
 
 class ContactTracker(eqx.Module):
-    """Touches up to now. `tracker.follow(time, contacts)` gives the tracker after the next frame; this one stays.
+    """The touches up to now. `tracker.follow(time, contacts)` returns the tracker after the next frame; this one is not
+    changed.
 
-    A frame's contacts go to the touches whose predicted places (place + velocity · time) are nearest, all distances
-    together as small as can be, none more than `reach` metres, for what places stray by, and what a touch as fast as
-    `fastest`, m/s, may have gone since the frame before. What no contact is left for is waited for `gap` seconds from
-    the first frame without it. Where it may be hidden in another's contact, as when two fingers cross, it is taken to
-    move on as it did, for four gaps at most.
+    A frame's contacts are assigned to the touches whose predicted places (place + velocity · time) are nearest, with
+    the least sum of distances, none more than `reach` metres, for the noise of places, plus the distance that a touch
+    as fast as `fastest`, m/s, may have moved since the frame before. A touch without a contact is waited for `gap`
+    seconds from the first frame without one. Where it may be hidden in another's contact, as when two fingers cross, it
+    is assumed to continue with its velocity, for four gaps at most.
 
-    **Fields**: those; `least` frames of a touch, fewer are not told of; `time` of the last frame, -inf before the
-    first; `open` and `closed` touches; `number`, so many were begun.
+    **Fields**: those; `least` frames of a touch, shorter ones are not reported; `time` of the last frame, -inf before
+    the first; `open` and `closed` touches; `number`, how many have begun.
     """
 
     gap: float = 0.15
@@ -89,8 +93,8 @@ class ContactTracker(eqx.Module):
     number: int = 0
 
     def __check_init__(self):
-        """Raises `ValueError` for a gap and a reach that are not positive, a negative speed, and numbers of frames that
-        are none."""
+        """Check the fields. Raises `ValueError` for a gap and a reach that are not positive, a negative speed, and
+        numbers of frames that are none."""
         check_metres("reach", self.reach)
         if not (is_number(self.fastest) and self.fastest >= 0):
             raise ValueError(f"fastest must be zero or more, in metres a second; it is {describe(self.fastest)}.")
@@ -100,14 +104,16 @@ class ContactTracker(eqx.Module):
             raise ValueError(f"least must be a number of frames, 1 or more; it is {describe(self.least)}.")
 
     def follow(self, time: float, contacts: Sequence[Contact]) -> "ContactTracker":
-        """After a frame at `time`, seconds, with these contacts. Raises `ValueError` for a time that is not later."""
+        """Return the tracker after a frame at `time`, seconds, with these contacts. Raises `ValueError` for a time that
+        is not later."""
         if not (is_number(time) and time > self.time):
             raise ValueError(f"time must be later than the frame before, {self.time:g} s; it is {describe(time)}.")
         check_kind("contacts", contacts, (list, tuple, np.ndarray), "a list of them, those of one frame")
         for number, contact in enumerate(contacts):
             check_kind(f"contacts[{number}]", contact, Contact, "a Contact, as of find_contacts")
         passed = time - self.time
-        # A touch was gone a frame after it was seen at the earliest: a slow stream's single frame is bridged too.
+        # A touch is lost at the earliest a frame after it was seen: a single missing frame of a slow stream is bridged
+        # too.
         spare = min(passed, self.gap)
         waited = [time - one.seen[-1][0] > self.gap * (_HIDDEN if one.hidden else 1) + spare for one in self.open]
         late = [one for one, over in zip(self.open, waited, strict=True) if over]
@@ -116,7 +122,7 @@ class ContactTracker(eqx.Module):
         places = np.array([one.centroid for one in contacts]).reshape(1, -1, 2)
         distance = np.linalg.norm(expected - places, axis=-1)
         most = self.reach + self.fastest * passed if going else 0.0
-        # Farther apart any two are as good as none: no pair within it is given up for another's sake.
+        # All pairs farther apart are equally bad: no pair within reach is given up for them.
         rows, columns = linear_sum_assignment(np.where(distance <= most, distance, 1e3 * most))
         pairs = {int(row): int(one) for row, one in zip(rows, columns, strict=True) if distance[row, one] <= most}
         wide = self.reach + np.sqrt(np.array([one.area for one in contacts]) / np.pi)
@@ -138,7 +144,7 @@ class ContactTracker(eqx.Module):
 
     @property
     def touches(self) -> list[TouchPath]:
-        """All touches so far, those that go on too, in order of onset."""
+        """All touches so far, including those that continue, in order of onset."""
         return sorted(self.closed + self._reported(self.open), key=lambda path: path.number)
 
     def _reported(self, followed: Iterable[_Followed]) -> tuple[TouchPath, ...]:
@@ -148,7 +154,7 @@ class ContactTracker(eqx.Module):
 def track_contacts(
     times: Float[np.ndarray, " F"], contacts: Sequence[Sequence[Contact]], tracker: ContactTracker | None = None
 ) -> list[TouchPath]:
-    """Touches of a recording: `contacts` of every frame, at `times` (F,) seconds that rise.
+    """Follow the touches of a recording: `contacts` of every frame, at `times` (F,) seconds that rise.
 
     `tracker` to begin with, `ContactTracker()` unless given. Raises `ValueError` for another number of times, and as
     `ContactTracker.follow` does.
@@ -168,7 +174,7 @@ def track_contacts(
 
 
 def _after(one: _Followed, time: float, contact: Contact) -> _Followed:
-    """A touch after a frame with this contact."""
+    """Return a touch after a frame with this contact."""
     off = (contact.centroid - one.at(time)) / (time - one.time)
     velocity = one.velocity + _BELIEVED * off
     return _Followed(one.number, time, contact.centroid, velocity, (*one.seen, (time, contact)))

@@ -1,4 +1,4 @@
-"""Gestures: a stream of images cut into touches, what is measured of each, and which of the learnt gestures it is."""
+"""Classify gestures: segment a stream of images into touches, compute features of each, and predict its gesture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is kept of an image of change: a few numbers a frame, from which touches are told apart and described."""
+"""Summarise images of change by a few numbers a frame, from which touches are segmented and described."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from jaxtyping import Float
 from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.mesh import Mesh, centroids, check_flat, measures
 
-# Fewer frames do not say how far the next one may stray.
+# With fewer frames the deviation of the next one is not known.
 _LEAST_FRAMES = 10
-# Deviations of the peaks of untouched frames above their mean that a touch exceeds.
+# A touch exceeds the mean of the peaks of untouched frames by so many deviations.
 _ABOVE = 5.0
 
 
 class ChangeCourse(eqx.Module):
-    """T frames in short, images x_e of change in the unit of the images, elements e.
+    """Summary of T frames, images x_e of change in the unit of the images, elements e.
 
     **Fields**: `seconds` (T,); `peak` (T,), P = max_e x_e; `least` (T,), min_e x_e; `half_share` (T,), the share of the
     elements with x_e ≥ P / 2; `mean` (T,) of x_e over the elements above the level that a touch exceeds, 0 where none
-    is; `area` (T,), m², of those; `centroid` (T, 2), metres, theirs, weighted by area and by how far above, NaN where
-    none is.
+    is; `area` (T,), m², of those; `centroid` (T, 2), metres, theirs, weighted by area and by the excess, NaN where none
+    is.
     """
 
     seconds: Float[np.ndarray, " T"]
@@ -37,12 +37,12 @@ class ChangeCourse(eqx.Module):
         return len(self.seconds)
 
     def of_frames(self, which: slice | np.ndarray) -> "ChangeCourse":
-        """Some of the frames."""
+        """Select some of the frames."""
         return ChangeCourse(*(getattr(self, name)[which] for name in _COLUMNS))
 
     @classmethod
     def joined(cls, courses: "list[ChangeCourse]") -> "ChangeCourse":
-        """One after the other; of none, no frames."""
+        """Concatenate courses; an empty list gives no frames."""
         shapes = {name: np.empty((0, 2) if name == "centroid" else 0) for name in _COLUMNS}
         parts = {name: [shapes[name], *(getattr(one, name) for one in courses)] for name in _COLUMNS}
         return cls(*(np.concatenate(parts[name]) for name in _COLUMNS))
@@ -52,8 +52,10 @@ _COLUMNS = ("seconds", "peak", "least", "half_share", "mean", "area", "centroid"
 
 
 class TouchLevel(eqx.Module):
-    """A mesh and the `level` that the images' greatest change exceeds where there is a touch, in their unit; `centres`
-    (m, 2), metres, and `areas` (m,), m², of its elements."""
+    """The `level` that the greatest change of an image exceeds where there is a touch, in the unit of the images.
+
+    `centres` (m, 2), metres, and `areas` (m,), m², of the mesh's elements.
+    """
 
     level: float
     centres: Float[np.ndarray, "m 2"]
@@ -72,11 +74,11 @@ class TouchLevel(eqx.Module):
 
     @classmethod
     def of_untouched(cls, mesh: Mesh, images: Float[np.ndarray, "F m"]) -> "TouchLevel":
-        """Five standard deviations above the mean of max_e x_e, of images (F, m) of a skin that nobody touches, ten at
-        least; frames with NaN are left out.
+        """Estimate the level from images (F, m) of an untouched skin, ten at least.
 
-        Frames that span as long as readings will last hold the drift too. Raises `ValueError` for fewer frames, images
-        of another mesh, and such as are all the same.
+        It is five standard deviations above the mean of max_e x_e; frames with NaN are left out. Frames that span as
+        long as readings will last include drift. Raises `ValueError` for fewer frames, images of another mesh, and such
+        as are all the same.
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
         images = check_images(images, mesh.num_cells)
@@ -90,8 +92,10 @@ class TouchLevel(eqx.Module):
         return cls(mesh, float(peaks.mean() + _ABOVE * peaks.std(ddof=1)))
 
     def course(self, seconds: Float[np.ndarray, " F"], images: Float[np.ndarray, "F m"]) -> ChangeCourse:
-        """What is kept of images (F, m) at times `seconds` (F,). Raises `ValueError` for images of another mesh, values
-        that are not finite, and other numbers of times."""
+        """Summarise images (F, m) at times `seconds` (F,).
+
+        Raises `ValueError` for images of another mesh, values that are not finite, and other numbers of times.
+        """
         images = check_images(images, len(self.areas))
         seconds = check_seconds(seconds, len(images))
         if not np.isfinite(images).all():
@@ -114,7 +118,7 @@ class TouchLevel(eqx.Module):
 
 
 def check_images(images: Float[np.ndarray, "F m"], number: int) -> Float[np.ndarray, "F m"]:
-    """Images of a mesh of `number` elements as an array. Raises `ValueError` for others."""
+    """Convert images of a mesh of `number` elements to an array. Raises `ValueError` for others."""
     images = real_array("images", images, f"images of change (F, {number}), a row a frame")
     if images.ndim != 2 or images.shape[1] != number:
         raise ValueError(
@@ -124,8 +128,8 @@ def check_images(images: Float[np.ndarray, "F m"], number: int) -> Float[np.ndar
 
 
 def check_seconds(seconds: Float[np.ndarray, " F"], number: int) -> Float[np.ndarray, " F"]:
-    """Times of `number` frames as an array. Raises `ValueError` for others, for such as fall, and such as are not
-    finite."""
+    """Convert times of `number` frames to an array. Raises `ValueError` for others, for such as fall, and such as are
+    not finite."""
     seconds = real_array("seconds", seconds, f"times ({number},) of the frames")
     if seconds.shape != (number,):
         raise ValueError(f"seconds have shape {seconds.shape}; give one for each of the {number} frames.")

@@ -1,4 +1,4 @@
-"""What is measured of a touch: the seven features of Silvera Tawil et al. (2011), table II, and more of its course."""
+"""Features of touches: the seven of Silvera Tawil et al. (2011), table II, and more of the touch's course."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jeit.arguments import check_kind
 from jeit.touch.gestures.change_course import ChangeCourse
 from jeit.touch.gestures.segmentation import StreamTouch
 
-# Names and units, "image" for that of the images of change: siemens (a sheet's) or S/m.
+# Names and units; "image" stands for that of the images of change: siemens (a sheet's) or S/m.
 FEATURES = {
     "greatest change": "image",
     "least change": "image",
@@ -23,22 +23,22 @@ FEATURES = {
 }
 """The seven features of a touch, by name, each with its unit; "image" stands for that of the images."""
 
-# Of a touch's course: places in it at which P is taken, from onset to end.
+# The number of instants of a touch, from onset to end, at which P is taken.
 _PLACES = 16
 _MORE = (
     "area", "area spread", "path length", "farthest", "speed", "fastest", "straightness", "peaks", "rise", "decay",
     "roughness", "pauses", "centre of gravity", "breadth",
 )  # fmt: skip
 COURSE_FEATURES = (*FEATURES, *_MORE, *(f"course {one + 1}" for one in range(_PLACES)))
-"""Names of what `course_features` gives: the seven, more of the same course, and P as it goes, from onset to end."""
+"""Names of the features of `course_features`: the seven, more of the same course, and P from onset to end."""
 
 SEQUENCE_PLACES = 32
 SEQUENCE_VALUES = ("change", "share", "mean", "area", "half", "speed", "distance", "along")
-"""What `sequence_features` takes at each of `SEQUENCE_PLACES` places in a touch, from onset to end."""
+"""Values of `sequence_features` at each of `SEQUENCE_PLACES` instants of a touch, from onset to end."""
 SEQUENCE_FEATURES = (
     *COURSE_FEATURES, *(f"{name} {one + 1}" for one in range(SEQUENCE_PLACES) for name in SEQUENCE_VALUES)
 )  # fmt: skip
-"""Names of what `sequence_features` gives."""
+"""Names of the features of `sequence_features`."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Touc
 
 
 def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
-    """The seven features of n touches and more of their courses, `COURSE_FEATURES`: mean and spread of the contact's
-    area; the path's length, its farthest distance from its beginning, mean and greatest speed, and displacement over
-    length; peaks of P a touch; how fast P rises to its greatest and falls from there; how rough it is; the share of
-    frames below half of it; when it is, and how long, on the whole; and P / max P at places evenly spread in time.
+    """Compute the seven features of n touches and more of their courses, `COURSE_FEATURES`.
 
-    Raises `ValueError` for what is no list of touches.
+    They are: mean and spread of the contact's area; the path's length, its farthest distance from its beginning, mean
+    and greatest speed, and displacement over length; peaks of P a touch; how fast P rises to its greatest and falls
+    from there; how rough it is; the share of frames below half of it; the mean and the spread in time of P; and P / max
+    P at instants evenly spread in time. Raises `ValueError` for what is no list of touches.
     """
     courses = _courses(touches)
     seven = touch_features(touches)
@@ -83,11 +83,11 @@ def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Tou
 
 
 def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
-    """`course_features` of n touches and their whole course, `SEQUENCE_FEATURES`: at places evenly spread in time P;
-    P / max P; mean change and area in contact; the share of elements above half of P; the centroid's speed, its
-    distance from where it began, and its place along the line that it mostly goes along, beginning forwards.
+    """Compute `course_features` of n touches and their whole course, `SEQUENCE_FEATURES`.
 
-    Raises `ValueError` for what is no list of touches.
+    The course has, at instants evenly spread in time: P; P / max P; mean change and area in contact; the share of
+    elements above half of P; the centroid's speed, its distance from where it began, and its position along the line
+    that it mainly moves along, initially forwards. Raises `ValueError` for what is no list of touches.
     """
     courses = _courses(touches)
     whole = course_features(touches)
@@ -120,7 +120,7 @@ def _seven(course: ChangeCourse) -> list[float]:
 
 
 def _more(course: ChangeCourse) -> list[float]:
-    there = np.isfinite(course.centroid[:, 0])  # at a bridged frame there is none
+    there = np.isfinite(course.centroid[:, 0])  # no centroid in a bridged frame
     place, seconds = course.centroid[there], course.seconds[there]
     steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
     length, moved = float(steps.sum()), float(np.linalg.norm(place[-1] - place[0]))
@@ -153,10 +153,10 @@ def _more(course: ChangeCourse) -> list[float]:
 
 
 def _sequence(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
-    """`SEQUENCE_VALUES` at `SEQUENCE_PLACES` places in time."""
+    """`SEQUENCE_VALUES` at `SEQUENCE_PLACES` instants."""
     seconds = course.seconds
     when = np.linspace(seconds[0], seconds[-1], SEQUENCE_PLACES)
-    there = np.isfinite(course.centroid[:, 0])  # at a bridged frame there is none
+    there = np.isfinite(course.centroid[:, 0])  # no centroid in a bridged frame
     place = np.stack([np.interp(when, seconds[there], one[there]) for one in course.centroid.T], axis=1)
     steps = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=1)
     speed = steps / max((seconds[-1] - seconds[0]) / (SEQUENCE_PLACES - 1), 1e-9)

@@ -1,4 +1,4 @@
-"""Classifiers of gestures by name, and how right each is of touches that are held out."""
+"""Classifiers of gestures by name, and their cross-validation."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 
 def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:
-    """LogitBoost as the paper has it, `LogitBoostClassifier()`, as a forest, which is quicker to ask."""
+    """Fit LogitBoost as in the paper, `LogitBoostClassifier()`, converted to a forest, which is faster to evaluate."""
     from jeit.touch.gestures.logit_boost import LogitBoostClassifier
 
     return Forest.of_stumps(LogitBoostClassifier().fit(features, label))
 
 
 def temporal_network(features: Float[np.ndarray, "n k"], label: np.ndarray) -> TemporalNetwork:
-    """A small network on the course, of features as `sequence_features` gives them."""
+    """Fit a small network to the course of touches, with features from `sequence_features`."""
     return TemporalNetwork.fit(features, label, whole=len(COURSE_FEATURES), values=len(SEQUENCE_VALUES))
 
 
@@ -39,14 +39,14 @@ GESTURE_CLASSIFIERS: dict[str, Callable[..., Any]] = {
     **CLASSIFIERS,
     "temporal-network": temporal_network,
 }
-"""Classifiers by name: the paper's, the nine of skins that learn, and a network on the course."""
+"""Classifiers by name: the paper's, the nine of learnt skins, and a network on the course."""
 
 FORMS: dict[str, Callable[..., Any]] = {
     "seven": touch_features,
     "course": course_features,
     "sequence": sequence_features,
 }
-"""What a touch is described by: the paper's seven features, those and more of its course, or all of the course."""
+"""Forms of features of a touch: the paper's seven, those and more of its course, or all of the course."""
 
 
 def forms_of(method: str) -> tuple[str, ...]:
@@ -56,7 +56,7 @@ def forms_of(method: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Scale:
-    """Features on a common scale: sign(x) log(1 + |x| / size), less its `mean`, over its `deviation`, all (k,)."""
+    """A common scale of features: sign(x) log(1 + |x| / size), less its `mean`, over its `deviation`, all (k,)."""
 
     size: Float[np.ndarray, " k"]
     mean: Float[np.ndarray, " k"]
@@ -64,7 +64,7 @@ class Scale:
 
     @classmethod
     def of(cls, values: Float[np.ndarray, "n k"]) -> "Scale":
-        """Of features (n, k), `size` the median of |x|; what is constant stays zero."""
+        """Learn the scale from features (n, k), with `size` the median of |x|; constant features become zero."""
         size = np.median(np.abs(values), axis=0)
         size = np.where(size > 0, size, np.maximum(np.abs(values).max(axis=0), 1e-300))
         logs = np.sign(values) * np.log1p(np.abs(values) / size)
@@ -72,16 +72,18 @@ class Scale:
         return cls(size, logs.mean(axis=0), np.where(deviation > 1e-12, deviation, 1.0))
 
     def __call__(self, values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-        """Of these features."""
+        """Scale features."""
         return (np.sign(values) * np.log1p(np.abs(values) / self.size) - self.mean) / self.deviation
 
 
 def held_out_odds(
     method: str, values: Float[np.ndarray, "n k"], right: Int[np.ndarray, " n"], folds: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n C"]:
-    """What a classifier that learns all other folds says of each class (n, C), as `log_odds`, of features (n, k) of
-    classes `right` (n,), 0 … C − 1; of a class that the other folds lack, next to nothing. Raises `ValueError` where
-    they have one class alone."""
+    """Log-odds of each class (n, C) of touches, from a classifier that is fitted to all other folds.
+
+    As `log_odds`, of features (n, k) of classes `right` (n,), 0 … C − 1; a class that the other folds lack has next to
+    none. Raises `ValueError` where they have one class alone.
+    """
     odds = np.full((len(right), right.max() + 1), -1e3)
 
     def predict(fold: int) -> None:
@@ -97,8 +99,8 @@ def held_out_odds(
 
 
 def random_folds(right: np.ndarray, number: int, seed: int = 0) -> Int[np.ndarray, " n"]:
-    """The fold (n,) that each touch is held out in, drawn at random, of every class alike: fewer than `number` folds
-    where there are fewer touches."""
+    """Assign touches to folds (n,) at random, each class evenly; fewer than `number` folds where there are fewer
+    touches."""
     rng = np.random.default_rng(seed)
     fold, first = np.empty(len(right), int), 0
     for one in np.unique(right):
@@ -109,6 +111,6 @@ def random_folds(right: np.ndarray, number: int, seed: int = 0) -> Int[np.ndarra
 
 
 def person_folds(people: np.ndarray, most: int | None = None) -> Int[np.ndarray, " n"]:
-    """The fold (n,) of each touch: one for each person, or `most`, each of as many people."""
+    """Assign touches to folds (n,): one for each person, or `most`, each of as many people."""
     number = np.unique(people, return_inverse=True)[1].ravel()
     return number if most is None else number % most

@@ -1,4 +1,4 @@
-"""From recorded gestures of a skin to a model that tells them: imaged, cut into touches, learnt."""
+"""Learn a gesture classifier from recorded gestures of a skin: image them, segment touches, and train."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from jeit.touch.gestures.gesture_model import METHODS, check_labels
 from jeit.touch.gestures.reading import Reading
 from jeit.touch.gestures.touch_images import TouchImages
 
-# Recordings from which it is told whether touches raise conductivity or lower it, at most.
+# The greatest number of recordings from which the sign of touches is determined.
 _SIGNED = 60
 
 
 @dataclass(frozen=True)
 class LearntGestures:
-    """A `model`, the `images` it was learnt from, and the numbers of the recordings without a touch, `untold`."""
+    """A `model`, the `images` it was learnt from, and the numbers of the recordings without a touch,
+    `without_touch`."""
 
     model: GestureModel
     images: TouchImages
@@ -38,10 +39,10 @@ def learn_gestures(
     form: str = "auto",
     progress: Callable[[str], None] | None = None,
 ) -> LearntGestures:
-    """Learn the gestures of a described skin from recordings of them. Of each, the touch that lasts longest is taken.
+    """Learn the gestures of a described skin from recordings of them, of each the touch that lasts longest.
 
-    `method` and `form` as in `GestureModel.fit`; `progress` is called with how far it is. Raises `ValueError` as
-    `TouchImages.prepare` and `GestureModel.fit` do, and where most recordings have no touch.
+    `method` and `form` as in `GestureModel.fit`; `progress` is called with a description of the progress. Raises
+    `ValueError` as `TouchImages.prepare` and `GestureModel.fit` do, and where most recordings have no touch.
     """
     check_kind("recordings", recordings, GestureSet, "a GestureSet, as of GestureSet.read(path)")
     report = progress or (lambda said: None)
@@ -82,7 +83,7 @@ def learn_gestures(
 
 
 def _level_and_sign(images: TouchImages, still: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:
-    """Whichever sign touches exceed their level with by more, and that level."""
+    """The sign with which touches exceed their level by more, and that level."""
     some = np.unique(np.linspace(0, len(recordings) - 1, min(_SIGNED, len(recordings))).astype(int))
     changes = [one for _, one in _imaged(images, recordings, some.tolist())]
     found = []
@@ -96,7 +97,7 @@ def _level_and_sign(images: TouchImages, still: np.ndarray, recordings: GestureS
 def _imaged(
     images: TouchImages, recordings: GestureSet, which: Sequence[int]
 ) -> Iterator[tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T m"]]]:
-    """Times and changes of these recordings, by one stream."""
+    """Times and changes of these recordings, imaged by one stream."""
     frames = (frame for one in which for frame in recordings.recording(one)[1])
     found = images.stream(frames)
     for one in which:

@@ -1,4 +1,4 @@
-"""`GestureModel`: which of the gestures that it learnt a touch is, how probable, and whether it is like any of them."""
+"""`GestureModel`: predicts the gesture of a touch, its probability, and whether it is unlike the training set."""
 
 from __future__ import annotations
 
@@ -31,20 +31,23 @@ from jeit.touch.learnt.extras import in_parts
 from jeit.touch.learnt.file import read_plain, write_plain
 
 METHODS = ("auto", *GESTURE_CLASSIFIERS)
-# Folds that a method is chosen on, at most; and of touches that are like those learnt, the share that passes for such.
+# The greatest number of folds by which the method is chosen; and the share of touches like those learnt that are
+# accepted as such.
 _FOLDS, _LIKE = 10, 0.99
-# Touches whose distances from all that is known are worked out at once.
+# The number of touches whose distances from the training set are computed at once.
 _AT_ONCE = 1000
 GESTURE_FILE = "gestures.skops"
-"""What a model is called in the folder of `jeit touch gestures`."""
+"""Name of a model's file in the folder of `jeit touch gestures`."""
 _KIND, _VERSION = "a jeit gesture model", 3
 
 
 @dataclass(frozen=True)
 class Gestures:
-    """What was told of n touches: `gesture` (n,), the likeliest name, how probable it is, `probability` (n,), and
-    `probabilities` (n, C) of all C `names`; `unlike` (n,), whether a touch is unlike any that was learnt from, where
-    nothing that is said of it counts."""
+    """Predictions for n touches.
+
+    `gesture` (n,): the likeliest name; `probability` (n,) of it; `probabilities` (n, C) of all C `names`; `unlike`
+    (n,): whether a touch is unlike any in the training set, where the prediction does not count.
+    """
 
     gesture: np.ndarray
     probability: Float[np.ndarray, " n"]
@@ -63,10 +66,10 @@ class GestureModel:
 
     **Fields**: `names` (C,) of the gestures; the `method` and the `form` of its features ("seven": the paper's,
     "course": those and more of the course, "sequence": all of it); their `scale`, the `model` of the classifier and the
-    `sharpness` of its probabilities; `known` (N, k), scaled course features of what was learnt from, their
-    `known_scale`, and the distance from the nearest of them beyond which a touch is unlike all, `farthest`. `reading`:
-    how the skin was read, None where nobody said. `standing`: what was said of touches held out, and the errors of all
-    that was tried, the best first, None of a model that was read; `notes` on it.
+    `sharpness` of its probabilities; `known` (N, k), scaled course features of the training set, their `known_scale`,
+    and `farthest`, the distance from the nearest of them beyond which a touch is unlike all. `reading`: how the skin
+    was read, None where it is not known. `standing`: the predictions for held-out touches, and the errors of all that
+    was tried, the best first, None of a model read from a file; `notes` on it.
     """
 
     names: tuple[str, ...]
@@ -95,13 +98,12 @@ class GestureModel:
         notes: tuple[str, ...] = (),
         progress: Callable[[str], None] | None = None,
     ) -> "GestureModel":
-        """Learn the `labels` (n,), names of gestures, of touches, by whom each was made, `people` (n,), names or
-        numbers.
+        """Learn the `labels` (n,), names of gestures, of touches, made by `people` (n,), names or numbers.
 
-        `method`: one of `METHODS`; `form`: "seven", "course", "sequence" (the network's) or "auto". Of "auto" that is
-        taken which is right most often of touches by people held out, one after the other, or a tenth of them where
-        there are more than ten; without people, or of one person, of touches held out at random, which promises nothing
-        of other people. `reading`, and `notes` on the touches, are kept with it. `progress` is called with what is
+        `method`: one of `METHODS`; `form`: "seven", "course", "sequence" (the network's) or "auto". "auto" chooses what
+        is most accurate on touches of held-out people, one after the other, or a tenth of them where there are more
+        than ten; without people, or of one person, on touches held out at random, which is no estimate of the accuracy
+        for other people. `reading`, and `notes` on the touches, are kept with it. `progress` is called with what is
         tried. Raises `ValueError` for labels and people that are not as many, gestures of fewer than two touches, fewer
         than two gestures, and names of methods and forms that there are not; `ImportError` without the extra `learn`.
         """
@@ -150,8 +152,10 @@ class GestureModel:
         )
 
     def predict(self, touches: list[StreamTouch]) -> Gestures:
-        """What touches are; those that are cut off too, of which less is known than was learnt from. Raises
-        `ValueError` for what is no list of touches."""
+        """Predict gestures of touches; for those that are cut off, less is known than for those in the training set.
+
+        Raises `ValueError` for what is no list of touches.
+        """
         values = FORMS[self.form](touches).values
         if not len(values):
             nothing = np.empty(0)
@@ -166,7 +170,7 @@ class GestureModel:
         return Gestures(said, shares.max(axis=1), shares, self.names, distance > self.farthest)
 
     def write(self, path: str | Path) -> None:
-        """Write it to one file, without how it stood. Raises `ValueError` for a folder."""
+        """Write the model to one file, without its `standing`. Raises `ValueError` for a folder."""
         own = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "standing"}
         for name in ("scale", "known_scale"):
             own[name] = {one.name: getattr(own[name], one.name) for one in fields(Scale)}
@@ -175,9 +179,12 @@ class GestureModel:
 
     @classmethod
     def read(cls, path: str | Path) -> "GestureModel":
-        """Undo `write`, or read the folder of `jeit touch gestures`; nothing in the file is executed. Raises
-        `FileNotFoundError`, and `ValueError` for files of another kind, and such as hold anything else than numbers and
-        estimators of scikit-learn."""
+        """Read a model that `write` wrote, also from the folder of `jeit touch gestures`; nothing in the file is
+        executed.
+
+        Raises `FileNotFoundError`, and `ValueError` for files of another kind, and such as hold anything else than
+        numbers and estimators of scikit-learn.
+        """
         path = Path(path) / GESTURE_FILE if Path(path).is_dir() else Path(path)
         if not path.is_file():
             raise FileNotFoundError(f"'{path}': there is no such file; `jeit touch gestures` makes one.")
@@ -215,13 +222,13 @@ def check_labels(labels: np.ndarray) -> None:
 
 
 def _nearest(known: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Distances of the nearest of what is known (N, k)."""
+    """Distances from the nearest of the known features (N, k)."""
     from scipy.spatial.distance import cdist
 
     return in_parts(lambda some: cdist(some, known).min(axis=1), values, _AT_ONCE)
 
 
 def _farthest(known: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
-    """Of touches held out, the distance from the nearest of the others that all but a hundredth keep."""
+    """Distance from the nearest other touch that all but a hundredth of held-out touches do not exceed."""
     apart = [_nearest(known[folds != one], known[folds == one]) for one in np.unique(folds)]
     return float(np.quantile(np.concatenate(apart), _LIKE))

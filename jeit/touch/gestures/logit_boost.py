@@ -1,4 +1,4 @@
-"""LogitBoost: additive logistic regression by stumps, as scikit-learn's estimators are used."""
+"""LogitBoost: additive logistic regression by stumps, with the interface of scikit-learn's estimators."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from jeit.arguments import describe
 
-# Responses are clipped to it (Friedman et al. 2000, section 4.2; WEKA's); weights are no less, nor is a step halved
-# more often.
+# The bound of responses (Friedman et al. 2000, section 4.2; WEKA's); the least weight; the greatest number of times
+# that a step is halved.
 _MOST_RESPONSE, _LEAST_WEIGHT, _MOST_HALVINGS = 3.0, 1e-12, 30
 
 
@@ -89,17 +89,17 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
             yield score
 
     def staged_decision_function(self, X: Any) -> Iterator[np.ndarray]:
-        """As of `decision_function`, after each round in turn."""
+        """`decision_function` after each round in turn."""
         for score in self._staged_scores(X):
             yield score[:, 1] - score[:, 0] if len(self.classes_) == 2 else score
 
     def staged_predict_proba(self, X: Any) -> Iterator[Float[np.ndarray, "n J"]]:
-        """As of `predict_proba`, after each round in turn."""
+        """`predict_proba` after each round in turn."""
         for score in self._staged_scores(X):
             yield _softmax(score)
 
     def staged_predict(self, X: Any) -> Iterator[np.ndarray]:
-        """As of `predict`, after each round in turn."""
+        """`predict` after each round in turn."""
         for score in self._staged_scores(X):
             yield self.classes_[score.argmax(axis=1)]
 
@@ -121,7 +121,7 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
 
 
 def _stumps(X: np.ndarray, right: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, ...]:
-    """One for each class: feature, threshold, and answers below and above it (J,); constant where nothing parts."""
+    """Fit a stump for each class: feature, threshold, and answers below and above it (J,); constant without a split."""
     off = right - probability
     variance = probability * (1 - probability)
     response = np.clip(off / np.maximum(variance, _LEAST_WEIGHT), -_MOST_RESPONSE, _MOST_RESPONSE)
@@ -140,14 +140,17 @@ def _stumps(X: np.ndarray, right: np.ndarray, probability: np.ndarray) -> tuple[
 
 
 def _answers(X: np.ndarray, feature, threshold, below, above) -> Float[np.ndarray, "n J"]:
-    """What the stumps of a round add to F."""
+    """Values that the stumps of a round add to F."""
     said = np.where(X[:, feature] <= threshold, below, above)
     return said - said.mean(axis=1, keepdims=True)
 
 
 def _uphill(score, gained, number, step: float, before: float) -> tuple[float, float]:
-    """The largest step of full, half, quarter … ones that lowers the log-likelihood of the classes `number` (n,) no
-    further than `before`, and what it is then; 0 where rounding is all that is left to gain."""
+    """The largest step of full, half, quarter … ones that does not lower the log-likelihood below `before`.
+
+    Returns the step, and the log-likelihood of the classes `number` (n,) after it; 0 where all that remains to gain is
+    rounding.
+    """
     for _ in range(_MOST_HALVINGS):
         found = _log_likelihood(score + step * gained, number)
         if found >= before:
@@ -157,7 +160,7 @@ def _uphill(score, gained, number, step: float, before: float) -> tuple[float, f
 
 
 def _log_likelihood(score: np.ndarray, number: np.ndarray) -> float:
-    """Of a sample, on average, natural."""
+    """Mean log-likelihood of a sample, natural."""
     shifted = score - score.max(axis=1, keepdims=True)
     return float(np.mean(shifted[np.arange(len(number)), number] - np.log(np.exp(shifted).sum(axis=1))))
 

@@ -1,4 +1,4 @@
-"""`Reading`: how a skin was read whose touches gestures were learnt from, and what another reading must share."""
+"""`Reading`: how the skin was read from which gestures were learnt, and checks that another reading is compatible."""
 
 from __future__ import annotations
 
@@ -6,15 +6,18 @@ from dataclasses import dataclass
 
 from jeit.arguments import describe, is_number
 
-# So many times the conductivity is another skin's, or another unit's.
+# A conductivity that differs by this factor is of another skin, or in another unit.
 _OTHER_SKIN = 5.0
 
 
 @dataclass(frozen=True)
 class Reading:
-    """**Fields**: the `level` that a touch exceeds, and the `background`, the untouched skin's conductivity, both S;
+    """How a skin was read.
+
+    **Fields**: the `level` that a touch exceeds, and the `background`, the untouched skin's conductivity, both S;
     `sign`, 1 where a touch raises conductivity, -1 where it lowers it; the frame `rate`, frames/s; `num_channels`, and
-    the `protocol`'s name."""
+    the `protocol`'s name.
+    """
 
     level: float
     background: float

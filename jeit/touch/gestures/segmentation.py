@@ -1,7 +1,7 @@
-"""A stream cut into touches: frame by frame, or a whole recording at once, to the same touches.
+"""Segment a stream into touches: frame by frame, or a whole recording at once, with the same result.
 
-A touch is where the greatest change P(t) = max_e x_e exceeds a level; where it does not for less than 100 ms, it goes
-on. Frames with NaN or infinite values, and such as have the time of the one before, are not looked at, but counted.
+A touch is where the greatest change P(t) = max_e x_e exceeds a level; where it does not for less than 100 ms, it
+continues. Frames with NaN or infinite values, and such as have the time of the one before, are counted, but not used.
 Where no frame came for so long that a touch might have ended in between, it is cut off there.
 """
 
@@ -16,16 +16,15 @@ from jaxtyping import Float
 from jeit.arguments import check_kind, describe, is_number
 from jeit.touch.gestures.change_course import ChangeCourse, TouchLevel, check_images, check_seconds
 
-# Seconds untouched that part two touches; frames of a touch, at least; rounding of times.
+# Seconds untouched that separate two touches; the least number of frames of a touch; rounding of times.
 _GAP, _LEAST, _ROUNDING = 0.1, 2, 1e-9
 
 
 class StreamTouch(eqx.Module):
-    """One touch of a stream: its `course`, from the first to the last frame above the level, and how many frames in it
-    were of no use, `lost`.
+    """One touch of a stream: its `course`, from the first to the last frame above the level.
 
-    `begun_before` and `cut_off`: whether it was there in the first frame, or the last, of what was seen at a stretch,
-    so that its true onset, or its end, is not known.
+    `lost`: how many frames in it were not usable. `begun_before` and `cut_off`: whether it was there in the first
+    frame, or the last, of an uninterrupted part of the stream, so that its true onset, or its end, is not known.
     """
 
     course: ChangeCourse
@@ -45,7 +44,7 @@ class StreamTouch(eqx.Module):
 
     @property
     def longest_gap(self) -> float:
-        """The longest time between two of its frames, seconds; 0 of one frame."""
+        """The longest time between two of its frames, seconds; 0 for one frame."""
         return float(np.diff(self.course.seconds).max(initial=0.0))
 
     @property
@@ -55,14 +54,15 @@ class StreamTouch(eqx.Module):
 
 
 class TouchStream(eqx.Module):
-    """A stream up to now. `stream.follow(second, image)` gives the stream after the next frame; this one stays.
+    """A stream up to now. `stream.follow(second, image)` returns the stream after the next frame; this one is not
+    changed.
 
-    A touch has ended once its last frame above the level is `gap` seconds past; it has `least` frames, fewer are not
-    told of. A stream whose frames are `gap` apart, or more, has no touches but such as are cut off: give a greater one.
+    A touch has ended once its last frame above the level is `gap` seconds past; it has `least` frames, shorter ones are
+    not reported. A stream whose frames are `gap` apart, or more, has only touches that are cut off: give a greater one.
 
-    **Fields**: `level`; `gap`; `least`; `second` of the last frame that was of use, -inf before the first; `open`, the
-    frames of the touch that goes on, of which so many are `held`, up to its last one above the level; how many frames
-    were `lost` up to that, and since; `begun_before`, of that touch; `ended` touches.
+    **Fields**: `level`; `gap`; `least`; `second` of the last usable frame, -inf before the first; `open`, the frames of
+    the touch that continues, of which so many are `held`, up to its last one above the level; how many frames were
+    `lost` up to that, and since; `begun_before`, of that touch; `ended` touches.
     """
 
     level: TouchLevel
@@ -80,8 +80,8 @@ class TouchStream(eqx.Module):
         _check(self.level, self.gap, self.least)
 
     def follow(self, second: float, image: Float[np.ndarray, " m"]) -> "TouchStream":
-        """After a frame (m,) at `second`. Raises `ValueError` for a time before the last one, and images of another
-        mesh."""
+        """Return the stream after a frame (m,) at `second`. Raises `ValueError` for a time before the last one, and
+        images of another mesh."""
         if not (is_number(second) and second >= self.second):
             raise ValueError(f"second must not be before the last frame, {self.second:g} s; it is {describe(second)}.")
         frame = check_images(np.asarray(image)[None], len(self.level.areas))
@@ -102,13 +102,13 @@ class TouchStream(eqx.Module):
 
     @property
     def touches(self) -> list[StreamTouch]:
-        """All touches so far, that which goes on too, in order of onset."""
+        """All touches so far, including the one that continues, in order of onset."""
         return [*self.ended, *self._going()]
 
     def _going(self) -> tuple[StreamTouch, ...]:
         if self.held < self.least:
             return ()
-        # Where the last frame that was seen is one of the touch's, it may have gone on after that.
+        # Where the last frame seen is one of the touch's, it may have continued after that.
         cut_off = self.held == len(self.open)
         course = ChangeCourse.joined(list(self.open[: self.held]))
         return (StreamTouch(course, self.lost[0], self.begun_before, cut_off),)
@@ -122,10 +122,10 @@ def find_touches(
     gap: float = _GAP,
     least: int = _LEAST,
 ) -> list[StreamTouch]:
-    """Touches of a recording, images (F, m) at times `seconds` (F,): those of a `TouchStream` that followed it.
+    """Find the touches of a recording, images (F, m) at times `seconds` (F,), as a `TouchStream` that follows it does.
 
     Raises `ValueError` for times that fall or are not finite, images of another mesh, and frames that mostly are as far
-    apart as the `gap` that parts touches.
+    apart as the `gap` that separates touches.
     """
     _check(level, gap, least)
     images = check_images(images, len(level.areas))

@@ -1,7 +1,7 @@
-"""`TouchImages`: images of change of a skin, frame after frame, from how it is when nobody touches it.
+"""`TouchImages`: images of the change of a skin from its untouched state, frame by frame.
 
-One linear step on a coarse mesh, with the prior that Silvera Tawil et al. (2011) image with, NOSER, unless told
-otherwise. Frames are looked after as in every stream: bad ones are refused, a dead electrode's channels left out.
+They are one linear step on a coarse mesh, by default with the prior of Silvera Tawil et al. (2011), NOSER. Frames are
+checked as in every stream: bad ones are refused, a dead electrode's channels left out.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from jeit.inverse.nonlinear.solvers import OneStep
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import Mesh
 
-# Frames that an untouched skin is known by, at least.
+# The least number of frames of an untouched skin.
 _FEWEST = 3
 
 TOUCH_IMAGES = StreamSettings(solver=OneStep(), prior="noser")
-"""How touches are imaged unless told otherwise."""
+"""Default settings for imaging touches."""
 
 
 @dataclass(frozen=True)
 class TouchImages:
-    """An `imager` of a skin and the `calibration` that it stands on; `reference`, the untouched skin."""
+    """An `imager` of a skin and the `calibration` that it is based on; `reference`, the untouched skin."""
 
     imager: Imager
     calibration: Calibration
@@ -47,10 +47,11 @@ class TouchImages:
         *,
         progress: Callable[[str], None] | None = None,
     ) -> "TouchImages":
-        """Of a described skin that reads `untouched` (u, M), volts, while nobody touches it; their mean is taken.
+        """Prepare imaging of a described skin that reads `untouched` (u, M), volts, while nobody touches it.
 
-        `progress` is called with each step as it begins. Raises `ValueError` for a skin that is not described whole, a
-        solid one, another number of channels, and as `jeit.imaging.prepare_imager`.
+        The mean of these frames is the reference. `progress` is called with each step as it begins. Raises `ValueError`
+        for a skin that is not described whole, a solid one, another number of channels, and as
+        `jeit.imaging.prepare_imager`.
         """
         check_kind("description", description, Description, "a Description, as of load_description('skin.toml')")
         protocol = description.protocol(description.origin)
@@ -83,11 +84,12 @@ class TouchImages:
 
     @property
     def num_channels(self) -> int:
-        """Voltages of a frame, M."""
+        """Number of voltages of a frame, M."""
         return self.calibration.model.protocol.num_measurements
 
     def stream(self, frames: Iterable) -> Iterator[tuple[FrameImage, Float[np.ndarray, " m"]]]:
-        """What became of each frame (M,), volts, and its change of conductivity (m,), S: NaN where it was refused."""
+        """Image each frame (M,), volts: its status, and its change of conductivity (m,), S; NaN where it was
+        refused."""
         refused = np.full(self.mesh.num_cells, np.nan)
         for one in stream(self.imager, frames):
             yield one, refused if one.conductivity is None else one.conductivity - self.background

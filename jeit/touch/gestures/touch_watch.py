@@ -1,8 +1,8 @@
-"""Touches of a live skin, named as they end: frames in, what became of each out, and with it what has ended.
+"""Classify touches of a live skin as they end.
 
-A touch is named with the first frame below its level, as soon as its end can be known; it has ended, for good, when it
-has been over for the `gap`. Where nobody touches, what the untouched skin reads is followed, so that drift makes no
-touches; what lasts longer than the `patience` is told as held, and is from then on how the skin is.
+A touch is named with the first frame below its level, as soon as its end can be known; it has ended finally when it has
+been over for the `gap`. While nobody touches, the reference follows the untouched skin, so that drift makes no touches;
+what lasts longer than the `patience` is reported as held, and is from then on part of the reference.
 """
 
 from __future__ import annotations
@@ -20,24 +20,24 @@ from jeit.inverse.streaming.stream import FrameImage
 from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, TouchStream
 from jeit.touch.gestures.touch_images import TouchImages
 
-# Seconds that part two touches, or so many frames if that is longer; untouched seconds after which the skin is at rest
-# again, and with what time constant, seconds, it is followed then.
+# Seconds that separate two touches, or so many frames if that is longer; untouched seconds after which the skin is at
+# rest again, and the time constant, seconds, with which the reference follows it then.
 _GAP, _FRAMES_APART, _SETTLED, _FOLLOWED = 0.1, 2.5, 0.5, 2.0
-# Of the untouched frames at first, the share that may exceed the level that was learnt.
+# The greatest share of the initial untouched frames that may exceed the learnt level.
 _MOST_ABOVE = 0.1
-# Where the opposite of a touch is the greatest change, so many times the level, and for so many seconds, the skin is
-# more at rest than it was when its rest was read.
+# If a change opposite to a touch is the greatest, above the level by the first factor, for the second number of
+# seconds, the skin was touched when its reference was read.
 _OPPOSITE, _LIFTED = 3.0, 0.5
 
 
 @dataclass(frozen=True)
 class NamedTouch:
-    """A touch and what it was told to be.
+    """A touch and its predicted gesture.
 
-    **Fields**: `number`, from 1, in order of onset; `touch`; the `gesture`, how probable it is, `probability`, and
-    `probabilities` (C,) of all; `unlike`, whether it is unlike any that was learnt, where nothing of that counts;
-    `named`, the stream's second when it was named, and `latency`, seconds of computing from that frame to the name;
-    `held`, whether it lasted beyond the patience and was cut off for that.
+    **Fields**: `number`, from 1, in order of onset; `touch`; the `gesture`, its `probability`, and `probabilities` (C,)
+    of all; `unlike`, whether it is unlike any in the training set, where the prediction does not count; `named`, the
+    stream's second when it was named, and `latency`, seconds of computing from that frame to the name; `held`, whether
+    it lasted beyond the patience and was cut off for that.
     """
 
     number: int
@@ -53,10 +53,12 @@ class NamedTouch:
 
 @dataclass(frozen=True)
 class WatchedFrame:
-    """What became of a frame at a `second`: its `image`, None of what comes after the last frame; the greatest change
-    `peak`, S, NaN where it was refused; whether the skin is `touched`; the touch that was `named` with it, or None,
-    which may go on yet; those that have `ended` for good; `latency`, seconds from the frame to all that; and a `note`,
-    where there is something to be told."""
+    """The result of a frame at a `second`.
+
+    Its `image`, None of what comes after the last frame; the greatest change `peak`, S, NaN where it was refused;
+    whether the skin is `touched`; the touch that was `named` with it, or None, which may yet continue; those that have
+    `ended` finally; `latency`, seconds from the frame to the result; and a `note`, where there is one.
+    """
 
     second: float
     image: FrameImage | None
@@ -70,9 +72,12 @@ class WatchedFrame:
 
 @dataclass(frozen=True)
 class TouchWatch:
-    """What is watched for: `images` of a skin, the `level` that a touch exceeds, the `model` that names it; `gap`,
-    seconds untouched that part two touches; `patience`, seconds after which a touch is taken for how the skin is now;
-    `notes` on what was found."""
+    """Settings of a watched skin.
+
+    `images` of the skin, the `level` that a touch exceeds, the `model` that classifies it; `gap`, seconds untouched
+    that separate two touches; `patience`, seconds after which a touch becomes part of the reference; `notes` on what
+    was found.
+    """
 
     images: TouchImages
     level: TouchLevel
@@ -91,7 +96,7 @@ class TouchWatch:
         rate: float,
         patience: float = 30.0,
     ) -> "TouchWatch":
-        """For frames at `rate`, frames/s, of a skin that read `untouched` (u, M), volts, at first.
+        """Create a watch for frames at `rate`, frames/s, of a skin that initially read `untouched` (u, M), volts.
 
         The level is the one that the model learnt with, or the untouched frames' own where these are noisier. Raises
         `ValueError` for a model of another skin, or of none, frames in which the skin is touched, and rates and
@@ -124,17 +129,18 @@ class TouchWatch:
         return cls(images, level, model, max(_GAP, _FRAMES_APART / rate), patience, tuple(notes))
 
     def follow(self, frames: Iterable[tuple[float, Any]]) -> Iterator[WatchedFrame]:
-        """What becomes of frames, each its second and its voltages (M,), as they come.
+        """Process frames as they come, each its second and its voltages (M,).
 
         Frames that are refused, or come with the time of the one before, count as lost. A touch that is there at the
-        end is told, cut off, with one more `WatchedFrame`, without an image. Raises `ValueError` for times that fall.
+        end is reported, cut off, with one more `WatchedFrame`, without an image. Raises `ValueError` for times that
+        fall.
         """
         check_kind("frames", frames, Iterable, "pairs of a second and a frame (M,), one after another")
         return _Session(self).follow(frames)
 
 
 class _Session:
-    """What a watch keeps from one frame to the next."""
+    """The state of a watch from one frame to the next."""
 
     def __init__(self, watch: TouchWatch):
         self.watch = watch
@@ -159,7 +165,7 @@ class _Session:
             yield WatchedFrame(self.second, None, np.nan, False, None, ended, time.perf_counter() - self.came)
 
     def _coming(self, frames: Iterable) -> Iterator:
-        """Frames as they are to be imaged, without what the untouched skin has drifted by."""
+        """Subtract the drift of the untouched skin from frames before they are imaged."""
         for second, frame in frames:
             self.came = time.perf_counter()
             if not (is_number(second) and second >= self.second):
@@ -174,7 +180,7 @@ class _Session:
             yield frame if self.frame is None else self.frame
 
     def _watched(self, image: FrameImage, change: np.ndarray) -> WatchedFrame:
-        """After a frame whose change of conductivity is `change` (m,), positive where touched."""
+        """Process a frame whose change of conductivity is `change` (m,), positive where touched."""
         second = self.second
         self.touches = self.touches.follow(second, change)
         ended = tuple(self._ended(one) for one in self.touches.ended)
@@ -182,7 +188,7 @@ class _Session:
         going, named = bool(self.touches.open), None
         touched = going and self.touches.held == len(self.touches.open)
         if touched:
-            self.last_touched, self.named = second, None  # what was named goes on
+            self.last_touched, self.named = second, None  # the named touch continues
         elif self.named is None and self.touches.touches:
             (over,) = self.touches.touches
             named = self.named = self._name(over)
@@ -199,7 +205,7 @@ class _Session:
         return WatchedFrame(second, image, peak, touched, named, ended, time.perf_counter() - self.came, note)
 
     def _lifted(self, image: FrameImage, change: np.ndarray) -> bool:
-        """Whether what touched the skin when its rest was read has gone for good."""
+        """Whether a touch that was there when the reference was read has been lifted for good."""
         if not image.imaged or -change.min() <= max(change.max(), _OPPOSITE * self.watch.level.level):
             self.opposite_since = None
         elif self.opposite_since is None:
@@ -207,7 +213,7 @@ class _Session:
         return self.opposite_since is not None and self.second - self.opposite_since >= _LIFTED
 
     def _rest_here(self, image: FrameImage) -> tuple[NamedTouch, ...]:
-        """Take the skin as it is now for untouched; the touch that this ends."""
+        """Take the skin as it is now as the reference; returns the touch that this ends."""
         ended = tuple(self._ended(one) for one in self.touches.touches)
         self.touches = replace(self.touches, open=(), held=0, lost=(0, 0))
         self.opposite_since = None
@@ -215,7 +221,7 @@ class _Session:
         return ended
 
     def _follow_rest(self, image: FrameImage, share: float) -> None:
-        """Take a `share` of what the last frame is off by for drift."""
+        """Add a `share` of the last frame's deviation to the drift."""
         if self.frame is not None and image.imaged:
             there = image.usable & np.isfinite(self.frame)
             self.drift = self.drift + np.where(there, share * (self.frame - self.rest), 0.0)
@@ -234,7 +240,7 @@ class _Session:
         )
 
     def _ended(self, touch: StreamTouch) -> NamedTouch:
-        """A touch that has ended, as it was named when it was over; what was cut off is named now."""
+        """A touch that has ended, as it was named when it was over; touches that are cut off are named now."""
         named, self.named = self.named, None
         if named is None or len(named.touch.course) != len(touch.course):
             named = self._name(touch)

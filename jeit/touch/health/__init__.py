@@ -1,4 +1,4 @@
-"""Whether a skin is still what it was: cuts, electrodes that fail, and repair, told from frames, and with a model."""
+"""Monitor a skin for damage: detect cuts, failing electrodes and repair from frames, and with a model locate cuts."""
 
 from __future__ import annotations
 

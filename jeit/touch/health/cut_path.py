@@ -1,10 +1,9 @@
-"""A cut's path from the change of voltages that it made: a line that resists what crosses it, fitted exactly.
+"""Estimate the path of a cut from the change of voltages that it made, by least squares on the forward model.
 
-Across the path a sheet conducts as if it were longer there by some length, very long where it is cut through; along
-the path it conducts as before. This is spread over a band about as wide as two edges of a mesh that is made finer where
-images show a loss. The places of the path's ends and its bend, and that length, are found by least squares, the
-voltages solved anew in every step. A round spot is fitted too, which is what a press makes: the better of the two says
-what it is.
+Across the path a sheet conducts as if it were longer there by some length, very long where it is cut through; along the
+path it conducts as before. This is spread over a band about as wide as two edges of a mesh, which is refined where
+images show a loss. The unknowns are the ends of the path, its bend, and that length; the voltages are computed exactly
+in every step. A round spot, which is what a press makes, is fitted too: the better fit determines what the change is.
 """
 
 from __future__ import annotations
@@ -19,35 +18,40 @@ from jeit.mesh import centroids
 from jeit.touch.health.finer_mesh import finer_model
 from jeit.touch.health.local_change import LocalChange
 
-# Directions and lengths, of the skin's side, tried first, and how many of these are followed, in steps of each.
+# Numbers of directions, and lengths as shares of the skin's side, tried first; how many of these starts are followed,
+# and the greatest number of steps of each.
 _DIRECTIONS, _LENGTHS, _FOLLOWED, _STEPS = 8, (0.08, 0.2), 2, 25
-# Of the skin's side, by how much longer it is across a cut that goes through, at most; and where a lesser cut begins.
+# Added length across a cut, as shares of the skin's side: the greatest, of a cut that goes through; the start of the
+# fit of a lesser cut; and the least.
 _THROUGH, _PART, _LEAST = 3.0, 0.02, 1e-4
-# Of the skin's side, how far around a place it is looked at, and the edges of the mesh there.
+# As shares of the skin's side: the radius of the refined region, and the length of the mesh edges in it.
 _RADIUS, _EDGE = 0.22, 0.0125
-# Half the width of the band, in edges of the fine mesh; beyond a path's ends it is so many times as narrow.
+# Half the width of the band, in edges of the fine mesh; the factor by which it is narrower beyond a path's ends.
 _BAND, _ENDS = 1.5, 2.0
-# Of a spot, the radius, of the skin's side, the greatest, and how many of them it reaches; depths that are begun with,
+# Of a spot: the radius as a share of the skin's side, and the greatest; how many radii it extends; the initial depths,
 # and the greatest.
 _SPOT, _MOST_SPOT, _REACH, _SPOT_DEPTHS, _MOST_DEPTH = 0.05, 0.1, 3.0, (0.5, -0.5), 6.0
-# Of a line's length, how far its middle is put aside to begin with for a bend.
+# Initial offset of a bend from the middle of a line, as a share of the line's length.
 _ASIDE = 0.2
-# A bend, or a cut that does not go through, has to take so much of the misfit that without it is left.
+# A bend, or a cut that does not go through, is accepted if it reduces the misfit below this share.
 _BEND, _NOT_THROUGH = 0.7, 0.4
-# A cut that leaves less than this and goes through is one; else it is told from one that does not where that leaves so
-# many times more. An end is known to so many edges at worst.
-_CLEAR, _TOLD_APART, _WIDEST = 0.01, 4.0, 10.0
-# Of a change, and of the root mean square of all, what no model of it gets right; and of all of it, a common factor.
+# A cut that goes through with a misfit below the first is certain. Otherwise the alternative is excluded if its misfit
+# is greater by the second factor. The greatest uncertainty of an end, in edges.
+_CLEAR, _DISTINCT, _WIDEST = 0.01, 4.0, 10.0
+# Relative model error, of a change and of the root mean square of all; and that of a common factor.
 _MODEL, _FACTOR = 0.05, 0.1
-# Of the skin's side, a step of a derivative.
+# Step of a numerical derivative, as a share of the skin's side.
 _STEP = 1e-5
 
 
 @dataclass(frozen=True)
 class FittedLoss:
-    """Conductivity lost: along a `path` (k, 2), metres, or of a round spot at `path` (1, 2); `misfit`, the share of the
-    change's energy that it does not explain; its `conductivity` (m,), S/m (2-D: S); whether the cut goes `through`,
-    which is so where nothing else is needed; and the standard `deviation` of its length, metres."""
+    """A loss of conductivity along a `path` (k, 2), metres, or in a round spot at `path` (1, 2).
+
+    `misfit`: the share of the change's energy that it does not explain; `conductivity` (m,), S/m (2-D: S), with the
+    loss; `through`: whether the cut goes through the whole depth, which is assumed unless the data need a lesser cut;
+    `deviation`: the standard deviation of its length, metres.
+    """
 
     path: Float[np.ndarray, "k 2"]
     misfit: float
@@ -63,13 +67,16 @@ class _Found:
 
 
 def _length(found: _Found) -> float:
-    """Of its path, metres."""
+    """Length of the fitted path, metres."""
     return float(np.linalg.norm(np.diff(found.unknowns[:-2].reshape(-1, 2), axis=0), axis=1).sum())
 
 
 class LossFit:
-    """Least squares for a `change` (K,) of voltages of a model's `channels` (K,), volts, from `conductivity` (m,), S/m
-    (2-D: S), in a skin that is looked at finely around a `centre` (2,), metres."""
+    """Least-squares fit of a cut or a spot to a `change` (K,) of voltages of a model's `channels` (K,), volts.
+
+    The change is from `conductivity` (m,), S/m (2-D: S), in a skin whose mesh is refined around a `centre` (2,),
+    metres.
+    """
 
     def __init__(
         self,
@@ -80,7 +87,7 @@ class LossFit:
         noise: Float[np.ndarray, " K"],
         centre: Float[np.ndarray, " 2"],
     ):
-        """`conductivity` as it was, S/m (2-D: S); `noise` (K,) of the change, volts."""
+        """Prepare the fit; `conductivity` before the change, S/m (2-D: S); `noise` (K,) of the change, volts."""
         own = np.asarray(centroids(model.mesh))[:, :2]
         self.low, self.high = own.min(axis=0), own.max(axis=0)
         self.side = float((self.high - self.low).max())
@@ -99,13 +106,13 @@ class LossFit:
         size = np.sqrt(np.mean(change**2))
         self.weight = 1 / np.hypot(noise, _MODEL * np.hypot(change, size))
         self.change = change
-        # A skin that conducts better or worse as a whole is not what is looked for.
+        # A uniform change of the skin's conductivity is projected out.
         whole = self.weight * self.rest
         self.drift = whole / np.linalg.norm(whole)
         self.energy = float(np.sum(self._weighted(change) ** 2))
 
     def line(self, starts: list[np.ndarray]) -> FittedLoss:
-        """A straight cut near one of some places (x, y), or a bent one where that is far better."""
+        """Fit a straight cut near one of some places (x, y), or a bent one if it fits far better."""
         angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         ways = np.column_stack([np.cos(angles), np.sin(angles)])
         tried = []
@@ -123,15 +130,15 @@ class LossFit:
         is_through = not partly.misfit < _NOT_THROUGH * through.misfit
         best, other = (through, partly) if is_through else (partly, through)
         path = best.unknowns[:-2].reshape(-1, 2)
-        # A shallow long line and a deep short one may both explain it, neither well.
+        # A shallow long line and a deep short one may fit about equally well.
         clear = is_through and best.misfit < _CLEAR
-        alike = not clear and other.misfit < _TOLD_APART * best.misfit
+        alike = not clear and other.misfit < _DISTINCT * best.misfit
         unsure = abs(_length(best) - _length(other)) if alike else 0.0
         deviation = float(np.hypot(self._deviation(best), unsure))
         return FittedLoss(path, best.misfit, self._own(best.unknowns), is_through, deviation)
 
     def spot(self, start: np.ndarray) -> FittedLoss:
-        """A round one, or a round gain."""
+        """Fit a round spot of lost or gained conductivity."""
         begun = [np.array([*start, np.log(_SPOT), depth, 0.0]) for depth in _SPOT_DEPTHS]
         best = min((self._fitted(one) for one in begun), key=lambda one: one.misfit)
         return FittedLoss(best.unknowns[None, :2], best.misfit, self._own(best.unknowns))
@@ -148,7 +155,7 @@ class LossFit:
         return bent if bent.misfit < _BEND * straight.misfit else straight
 
     def _fitted(self, start: np.ndarray, *, fixed: bool = False) -> _Found:
-        """From a `start`; with how long the cut is across, `fixed`."""
+        """Fit the unknowns from a `start`; if `fixed`, the added length across the cut stays as it is."""
         from scipy.optimize import least_squares
 
         low, high, scale = self._bounds(len(start))
@@ -174,7 +181,7 @@ class LossFit:
         return _Found(whole(found.x), 2 * found.cost / self.energy)
 
     def _bounds(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Least and greatest unknowns, and of what size they are."""
+        """Lower and upper bounds of the unknowns, and their scale."""
         if number == 5:  # a spot
             low, high = (
                 [*self.low, np.log(self.band / self.side), -_MOST_DEPTH],
@@ -189,7 +196,7 @@ class LossFit:
         return np.array([*low, -0.5]), np.array([*high, 0.5]), np.array([*scale, _FACTOR])
 
     def _deviation(self, found: _Found) -> float:
-        """Of a path's length, metres: by how much its ends may move, and half an edge of the mesh."""
+        """Standard deviation of a path's length, metres: from that of its ends, and half an edge of the mesh."""
         least = found.misfit * self.energy
         each = least / max(len(self.change) - len(found.unknowns), 1)
         path = found.unknowns[:-2].reshape(-1, 2)
@@ -213,7 +220,7 @@ class LossFit:
         return float(np.sum(self._residual(unknowns) ** 2))
 
     def _volts(self, impedance: np.ndarray) -> np.ndarray:
-        """Of the channels (K,), from a transfer impedance (L, L)."""
+        """Voltages of the channels (K,) from a transfer impedance (L, L)."""
         return np.einsum("kl,kl->k", self.measured @ impedance, self.driven)
 
     def _predicted(self, unknowns: np.ndarray) -> np.ndarray:
@@ -241,7 +248,7 @@ class LossFit:
         return np.concatenate([self._weighted(found), last[None]])
 
     def _change(self, unknowns: np.ndarray) -> np.ndarray:
-        """Of the region's conductivity: of a spot (c,), along a path tensors (c, d, d)."""
+        """Change of the region's conductivity: of a spot (c,), along a path tensors (c, d, d)."""
         if len(unknowns) == 5:
             return self.conductivity * np.expm1(self._spot_log(unknowns))
         left, across = self._across(unknowns)
@@ -250,12 +257,12 @@ class LossFit:
         return change
 
     def _spot_log(self, unknowns: np.ndarray) -> np.ndarray:
-        """The logarithm (c,) of what share of conductivity is left in a spot."""
+        """Logarithm (c,) of the share of conductivity that is left in a spot."""
         square = np.sum((self.centres - unknowns[:2]) ** 2, axis=1) / (np.exp(unknowns[2]) * self.side) ** 2
         return -unknowns[3] * np.where(square < _REACH**2, np.exp(-square / 2), 0.0)
 
     def _across(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What share of conductivity is left (m,) across the nearest part of a path, and the direction (m, 2) of it."""
+        """Share of conductivity (m,) left across the nearest part of a path, and the direction (m, 2) across it."""
         path = unknowns[:-2].reshape(-1, 2)
         start, along = path[:-1], np.diff(path, axis=0)
         lengths = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
@@ -263,7 +270,7 @@ class LossFit:
         normal = np.column_stack([-along[:, 1], along[:, 0]])
         off = self.centres[:, None] - start  # (m, s, 2)
         place = np.sum(off * along, axis=-1)
-        # The band ends where the path does.
+        # The band ends at the ends of the path.
         pulled = np.minimum(self.band / _ENDS, 0.45 * lengths)
         first, last = np.zeros(len(lengths)), lengths.copy()
         first[0] += pulled[0]
@@ -272,12 +279,12 @@ class LossFit:
         square = np.sum(off * normal, axis=-1) ** 2 + beyond**2
         nearest = square.argmin(axis=1)
         square = square[np.arange(len(square)), nearest] / self.band**2
-        # A bump of integral 1 across the path.
+        # A bump across the path, with integral 1.
         shape = np.where(square < 1, (1 - square) ** 2, 0.0) * 15 / (16 * self.band)
         return 1 / (1 + np.exp(unknowns[-2]) * self.side * shape), normal[nearest]
 
     def _own(self, unknowns: np.ndarray) -> np.ndarray:
-        """On the mesh that was given, one number for each cell."""
-        # Across a path conductivity is lost, along it none.
+        """Conductivity on the given mesh, one number for each cell."""
+        # Conductivity is lost across the path, not along it.
         lost = self._spot_log(unknowns) if len(unknowns) == 5 else 0.5 * np.log(self._across(unknowns)[0])
         return self.whole * np.exp(np.bincount(self.parent, lost, len(self.whole)) / self.parts)

@@ -1,4 +1,4 @@
-"""Which electrodes are behind a change: those in whose channels nearly all of it is."""
+"""Identify the electrodes that cause a change: those whose channels contain nearly all of it."""
 
 from __future__ import annotations
 
@@ -7,26 +7,30 @@ from jaxtyping import Bool, Float
 
 from jeit.touch.health.event import EventKind
 
-# Of the energy of a change, relative to the reference, what no electrode accounts for; of an electrode's channels, how
-# many have changed, by what share of their reading; and of all electrodes, those that may fail at once.
+# The greatest share of a change's energy, relative to the reference, that the electrodes leave unexplained; the least
+# share of an electrode's channels that have changed, and by what share of their reading; the greatest share of
+# electrodes that may fail at once.
 _LEFT, _OWN, _RELATIVE, _AT_ONCE = 0.1, 0.75, 0.12, 0.25
-# A wire reads nothing below this share of what it did; contacts that wander have so many times the noise.
+# A torn wire reads less than this share of its reference; a loose contact has at least so many times the noise.
 _NOTHING, _WANDERS = 0.2, 5.0
-# Deviation of a normal number over the median magnitude of the difference of two.
+# Standard deviation of a normal variable over the median magnitude of the difference of two.
 _DEVIATION = 1.0484
-# Beyond so many times its reading, a channel tells no more.
+# Relative changes are clipped at this multiple of the reading.
 _MOST = 10.0
 
 
 def faulty_electrodes(
     change: Float[np.ndarray, " M"], reference: Float[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
-    """Numbers of the electrodes that account for a change from the reference, volts, by themselves; none if a change of
-    the skin is needed too. `touching` (L, M): which channels each takes part in."""
+    """Find the electrodes that account for a change from the reference, volts, by themselves.
+
+    Returns their numbers; none if a change of the skin is needed too. `touching` (L, M): the channels that each
+    electrode takes part in.
+    """
     size = np.sqrt(np.mean(reference[np.isfinite(reference)] ** 2))
     relative = np.abs(np.nan_to_num(change)) / np.maximum(np.abs(reference), 0.1 * size)
     relative = np.minimum(relative, _MOST)
-    # A channel with a weak reading is no larger a change for that.
+    # A channel with a weak reading does not count as a larger change.
     energy = np.minimum(np.abs(np.nan_to_num(change)) / size, relative) ** 2
     total, left, found = energy.sum(), np.ones(len(energy), bool), []
     while total > 0 and energy[left].sum() > _LEFT * total and len(found) < max(1, _AT_ONCE * len(touching)):
@@ -46,14 +50,14 @@ def kind_of_fault(
     noise: Float[np.ndarray, " M"],
     own: Bool[np.ndarray, " M"],
 ) -> EventKind:
-    """What has become of an electrode with channels `own` (M,) whose frames (n, M) are these now."""
+    """Classify the fault of an electrode with channels `own` (M,) from its latest `frames` (n, M)."""
     now = frames[:, own]
     middle = np.nanmedian(now, axis=0)
     size = np.sqrt(np.mean(reference[own] ** 2))
     constant = len(middle) > 1 and np.ptp(middle) <= 0.02 * np.abs(middle).max() and np.ptp(reference[own]) > 0.1 * size
     if constant or np.median(np.abs(middle)) < _NOTHING * np.median(np.abs(reference[own])):
         return EventKind.TORN
-    # From frame to frame: what touches do is not meant.
+    # Differences from frame to frame, so that touches do not count.
     steps = np.diff(now, axis=0)
     some = np.isfinite(steps).any(axis=0)
     wander = np.zeros(len(middle))

@@ -1,4 +1,4 @@
-"""`HealthEvent`: one thing that happened to a skin, when, where, and how far it may be believed."""
+"""`HealthEvent`: an event in the state of a skin: what happened, when, where, and how certain it is."""
 
 from __future__ import annotations
 
@@ -10,48 +10,48 @@ from jaxtyping import Bool, Float
 
 
 class EventKind(StrEnum):
-    """What happened. Each is equal to its word."""
+    """The kind of an event. Each is equal to its word."""
 
     CUT = "cut"
-    """Conductivity is lost along a path, for good."""
+    """Conductivity is permanently lost along a path."""
     DEAD = "dead electrode"
-    """An electrode's channels read something else altogether, far more than its contact ever made."""
+    """An electrode's channels have changed by far more than its contact ever did."""
     TORN = "torn wire"
     """An electrode's channels read next to nothing, or one constant; a dead electrode may look the same."""
     LOOSE = "loose electrode"
-    """An electrode's contact is worse, and wanders."""
+    """An electrode's contact is worse, and fluctuates."""
     NOISY = "noisy channel"
-    """A single channel has several times its noise, or jumps about."""
+    """A single channel has several times its noise, or jumps."""
     STUCK = "stuck channel"
-    """A single channel does not move any more, while others do."""
+    """A single channel no longer changes, while others do."""
     CHANGED = "changed"
-    """The skin is not what it was; of what kind that is, frames alone do not tell, or no model bears out."""
+    """The skin has changed; frames alone do not determine how, or no model explains it."""
     REPAIRED = "repaired"
-    """A change is gone again, or the user says so."""
+    """A change has disappeared, or the user has reported a repair."""
 
 
 class EventStatus(StrEnum):
-    """How sure it is. Each is equal to its word."""
+    """How certain an event is. Each is equal to its word."""
 
     HELD = "held, or a void"
-    """It looks like a touch that is held: only time or the user tells the two apart."""
+    """It looks like a touch that is held: only time or the user can distinguish the two."""
     LASTING = "lasting"
-    """It has outlasted every touch, or is unlike any."""
+    """It has lasted longer than every touch, or is unlike any."""
     CONFIRMED = "confirmed"
     DENIED = "denied"
     MENDED = "mended"
-    """It is gone: mended, or a press that was held longer than any was taken to be."""
+    """It has disappeared: mended, or a press that was held longer than any was assumed to be."""
 
 
 class HealthEvent(eqx.Module):
-    """What happened to a skin.
+    """An event in the state of a skin.
 
-    **Fields**: `number`, in order of telling; `kind`; `status`; `time`, when it began, and `told`, when it was noticed,
-    both seconds (frames, where there are no times); `frame`, the number of the frame that it began at; `channels` (M,)
-    that changed; `change` (M,), by what, volts; `strength`: how many times more than anything that healthy frames did;
-    `electrode`, its number from 0, or None; `path` (k, 2) of a cut, metres, or None, its `length`, metres, and the
-    standard `deviation` of that, as the voltages tell it; `through`, whether all of the skin's depth is cut, or None;
-    `reason`, a sentence.
+    **Fields**: `number`, in the order of detection; `kind`; `status`; `time`, when it began, and `noticed`, when it was
+    detected, both seconds (frames, where there are no times); `frame`, the number of the frame at which it began;
+    `channels` (M,) that changed; `change` (M,), by how much, volts; `strength`: the ratio to the greatest change among
+    healthy frames; `electrode`, its number from 0, or None; `path` (k, 2) of a cut, metres, or None, its `length`,
+    metres, and the standard `deviation` of the length, estimated from the voltages; `through`, whether all of the
+    skin's depth is cut, or None; `reason`, a sentence.
     """
 
     number: int
@@ -71,11 +71,11 @@ class HealthEvent(eqx.Module):
 
     @property
     def length(self) -> float:
-        """Of the path, metres; 0 where there is none."""
+        """Length of the path, metres; 0 where there is none."""
         return 0.0 if self.path is None else float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
 
     @property
     def open(self) -> bool:
-        """Whether it is still so: neither denied nor mended, and no repair."""
+        """Whether the event still applies: neither denied nor mended, and no repair."""
         gone = self.status in (EventStatus.DENIED, EventStatus.MENDED)
         return not gone and self.kind != EventKind.REPAIRED

@@ -1,4 +1,4 @@
-"""What a lasting change is: of an electrode, a cut, something unlike a touch, or what a touch may be too."""
+"""Classify a lasting change: an electrode's fault, a cut, a change unlike a touch, or one that a touch may make too."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from jeit.touch.health.event import EventKind
 from jeit.touch.health.healthy import Healthy
 from jeit.touch.health.imaged_skin import ImagedSkin
 
-# Of a change in the channels of an electrode, what a cut beside it leaves at most; a contact leaves more.
+# The greatest share of a change in an electrode's channels that a cut beside it leaves; a contact leaves more.
 _CUT_BESIDE = 0.1
 
 
 @dataclass(frozen=True)
 class Change:
-    """A change that lasts: `vector` (M,), volts; its `size` in the scale of healthy ones; `time` and `frame` that it
-    began at; and `told`, the time now."""
+    """A lasting change.
+
+    `vector` (M,), volts; its `size` in the scale of healthy changes; `time` and `frame` at which it began; `noticed`,
+    the time at which it was detected.
+    """
 
     vector: Float[np.ndarray, " M"]
     size: float
@@ -31,8 +34,11 @@ class Change:
 
 @dataclass(frozen=True)
 class Finding:
-    """**Fields**: `kind`; `reason`; whether it is `sure`, or a press may do the same; `electrode`; `loss`, of a cut;
-    `own` (M,), the channels that it is in, all if None."""
+    """The classification of a lasting change.
+
+    **Fields**: `kind`; `reason`; whether it is `sure`, or a press may do the same; `electrode`; `loss`, of a cut; `own`
+    (M,), the channels that it affects, all if None.
+    """
 
     kind: EventKind
     reason: str
@@ -50,7 +56,7 @@ def findings(
     touching: Bool[np.ndarray, "L M"] | None,
     skin: ImagedSkin | None,
 ) -> list[Finding]:
-    """What a `change` (M,) from `reference` (M,) is, after which `frames` (n, M) came."""
+    """Classify a `change` (M,) from `reference` (M,), with the `frames` (n, M) that came after it."""
     used = healthy.used & np.isfinite(change)
     electrodes = [] if touching is None else faulty_electrodes(change, reference, touching & healthy.used)
     faults = []
@@ -59,8 +65,8 @@ def findings(
         kind = kind_of_fault(frames, reference, healthy.noise, own)
         reason = f"Nearly all of the change is in the {int(own.sum())} channels of electrode {one}."
         faults.append(Finding(kind, reason, True, electrode=one, own=own))
-    # A cut right beside an electrode is nearly all in its channels too; but does not wander, and more current does not
-    # reach it than did.
+    # Nearly all of a cut right beside an electrode is in its channels too; but it does not fluctuate, and does not
+    # increase the current at the electrode.
     if faults and (skin is None or any(one.kind != EventKind.DEAD for one in faults)):
         return faults
     loss = None if skin is None else skin.loss(change, used, healthy.scale)
@@ -81,5 +87,5 @@ def findings(
 
 
 def _opposite(skin: ImagedSkin | None) -> bool:
-    """Whether a loss of conductivity is what no touch makes."""
+    """Whether a loss of conductivity has the sign opposite to that of a touch."""
     return skin is not None and skin.sign > 0

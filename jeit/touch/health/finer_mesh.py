@@ -1,7 +1,7 @@
-"""A flat mesh made finer where something thin has to be told: triangles halved across their longest edge.
+"""Refine a flat mesh locally, to resolve thin structures: triangles are halved across their longest edge.
 
-Rivara's closure: a triangle of which any edge is halved has its longest halved too, so that no triangle gets thinner
-than half of what it was, and no node hangs.
+Rivara's closure: a triangle with any halved edge has its longest edge halved too, so that no triangle gets thinner than
+half of what it was, and there are no hanging nodes.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from jeit.forward import ForwardModel
 from jeit.mesh import Mesh, centroids, check_flat, measures
 from jeit.mesh.sizes import size_checked
 
-# Halvings of a cell at most.
+# The greatest number of times that a cell is halved.
 _ROUNDS = 12
-# Electrodes that another mesh of the same skin, with more nodes, takes as they are.
+# Electrodes that can be used unchanged with another mesh of the same skin with more nodes.
 _FREE = (BoundaryElectrodes, SheetDiscs, PointElectrodes, NodeElectrodes)
 
 
 def finer_model(
     model: ForwardModel, centre: np.ndarray, radius: float, edge: float
 ) -> tuple[ForwardModel, Int[np.ndarray, " m"], float]:
-    """A model of a skin with edges of `edge` metres within `radius` metres of a `centre` (2,); of each of its cells
-    (m,), the number of that which it is a part of; and the length of its edges there, metres.
+    """Refine a model's mesh to edges of `edge` metres within `radius` metres of a `centre` (2,).
 
-    A layer, and a skin whose electrodes are facets of its mesh, stays as it is.
+    Returns the model; for each of its cells (m,), the number of the original cell that it is part of; and the length of
+    its edges there, metres. A layer, and a skin whose electrodes are facets of its mesh, stay as they are.
     """
     mesh = model.mesh
     check_flat(mesh, "cuts")
@@ -43,8 +43,10 @@ def finer_model(
 
 @size_checked()
 def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tuple[Mesh, Int[np.ndarray, " m"]]:
-    """A flat mesh whose cells within `radius` metres of a `centre` (2,) are no larger than `area`, m²; and of each
-    cell (m,), the number of that which it is a part of."""
+    """Refine a flat mesh so that cells within `radius` metres of a `centre` (2,) are no larger than `area`, m².
+
+    Returns the mesh; and for each cell (m,), the number of the original cell that it is part of.
+    """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     parent = np.arange(len(cells))
     for _ in range(_ROUNDS):
@@ -58,12 +60,12 @@ def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tu
 
 
 def _halved(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, large: Bool[np.ndarray, " m"]):
-    """Points, cells and parents after those that are `large`, and what hangs on them, are halved."""
+    """Halve the `large` cells, and those needed to leave no hanging nodes; returns points, cells and parents."""
     pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
     edges, number = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
     number = number.reshape(-1, 3)
     lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    # Of two edges of one length, both sides must take the same.
+    # Of two edges of equal length, both neighbours must choose the same.
     lengths = lengths * (1 + 1e-9 * np.arange(len(lengths)) / len(lengths))
     longest = number[np.arange(len(cells)), lengths[number].argmax(axis=1)]
     split = np.zeros(len(edges), bool)

@@ -1,4 +1,4 @@
-"""What a skin is like while it is healthy, from a recording of it: on frames alone, or with a calibrated model."""
+"""Learn the healthy state of a skin from a recording of it: on frames alone, or with a calibrated model."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from jeit.data.description import Description
 from jeit.touch.gestures.touch_images import TouchImages
 from jeit.touch.health import SkinHealth
 
-# Of a frame's channels, how many have a reading at least; healthy frames of which little is known of drift; and between
-# recordings, how many times larger readings are of another unit.
+# The least share of a frame's channels that have a reading; the number of healthy frames below which little is known of
+# drift; and the ratio between readings of two recordings that suggests another unit.
 _READ, _FEW, _ANOTHER = 0.5, 250, 20.0
 
 
@@ -27,18 +27,17 @@ def learn_health(
     patience: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> SkinHealth:
-    """A skin to be watched, from frames of it while it is healthy, at its times, or `rate` frames/s; without either,
-    frames are counted.
+    """Learn the healthy state of a skin to be monitored, from a recording of frames while it is healthy.
 
-    A `description` with a protocol lets electrodes that fail be named; with geometry and electrodes too, a model is
-    calibrated on the median of the frames, so that cuts are found on it: `sign` as in `SkinHealth.fit`, -1 for skins
-    that conduct worse where touched. `patience`, seconds. Raises `ValueError` as `SkinHealth.fit` and
-    `TouchImages.prepare` do.
+    Frames are at the recording's times, or at `rate` frames/s; without either, frames are counted. A `description` with
+    a protocol lets failing electrodes be identified; with geometry and electrodes too, a model is calibrated on the
+    median of the frames, so that cuts are located on it: `sign` as in `SkinHealth.fit`, -1 for skins that conduct worse
+    where touched. `patience`, seconds. Raises `ValueError` as `SkinHealth.fit` and `TouchImages.prepare` do.
     """
     check_kind("healthy", healthy, FrameRecording, "a FrameRecording, as of read_frame_recording(path)")
     frames, seconds = healthy.frames, seconds_of(healthy, rate)
     if seconds is not None:
-        later = np.diff(seconds, prepend=-np.inf) > 0  # doubled frames are left out
+        later = np.diff(seconds, prepend=-np.inf) > 0  # duplicate frames are left out
         frames, seconds = frames[later], seconds[later]
     given = {"patience": patience, "sign": sign}
     if description is None:
@@ -52,16 +51,16 @@ def learn_health(
 
 
 def seconds_of(recording: FrameRecording, rate: float | None) -> Float[np.ndarray, " F"] | None:
-    """When frames came: as the recording says, or at `rate` frames/s; None where nobody knows."""
+    """Times of frames: those of the recording, or at `rate` frames/s; None where neither is known."""
     if recording.seconds is None:
         return None if rate is None else np.arange(len(recording.frames)) / rate
     return recording.seconds
 
 
 def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndarray, "F M"]) -> list[str]:
-    """What speaks against what a `health`, learnt from `healthy`, tells of frames (F, M): a sentence each.
+    """List the reasons to doubt the events that a `health`, learnt from `healthy`, detects in frames (F, M).
 
-    Raises `ValueError` for frames of which none has enough readings.
+    Returns a sentence for each. Raises `ValueError` for frames of which none has enough readings.
     """
     known = health.healthy
     there = np.isfinite(frames)

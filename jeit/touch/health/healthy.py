@@ -1,4 +1,4 @@
-"""`Healthy`: what a recording of a healthy skin says of how frames differ that mean no harm."""
+"""`Healthy`: the harmless variation of a skin's frames, learnt from a recording of the healthy skin."""
 
 from __future__ import annotations
 
@@ -10,46 +10,50 @@ from jaxtyping import Bool, Float
 from jeit.touch.health.lasting import lasting_step, median, size_of, window_change
 from jeit.touch.health.unsteady import Steadiness
 
-# Steps of a window at most, more frames are averaged; at least; and windows that a healthy recording has at least.
+# The greatest number of steps of a window (with more frames, several are averaged to a step), and the least; and the
+# number of windows that a healthy recording has at least.
 _MOST, _FEWEST, _WINDOWS = 48, 5, 8
-# Windows of a healthy recording that has no quiet in it, in frames.
+# Least and greatest length of windows, in frames, of a healthy recording without a quiet interval.
 _LEAST_ALWAYS, _MOST_ALWAYS = 12, 64
-# A window is so many times the longest touch, where no time is given, and no less than this share of the frames.
+# Length of a window, as a multiple of the longest touch, where no time is given; and its least share of the frames.
 _LONGEST, _LEAST_SHARE = 3.0, 1 / 40
-# Of what healthy windows did at most, and in deviations of normal ones: a change below is none. Few windows say less.
+# Limit of a change, as a multiple of the greatest among healthy windows; its least value, in deviations of healthy
+# ones; and how much the multiple grows where windows are few.
 _BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 20.0
-# Where windows are so many times shorter than touches ask for, touches look as if they stayed: limits are so much
-# higher.
+# If windows are shorter by this factor than touches require, touches appear to last: limits are raised by the second
+# factor.
 _SHORT, _DOUBT = 1.5, 2.0
-# A step is still there when so much of it is.
+# The share of a step that has to be left for it to count as lasting.
 _STILL = 0.4
-# The same from the healthy recording to another.
+# The multiple for a change of level, from the healthy recording to another.
 _BEYOND_LEVEL = 3.0
-# A touch stands out so far from what quiet frames do; of the frames, the quietest are this share.
+# A touch exceeds the variation of quiet frames by this factor; the share of frames that are taken as quiet.
 _STANDS_OUT, _QUIET = 3.0, 0.3
-# Touches' directions at most, and the share of their energy that directions have.
+# The greatest number of directions of touches, and the share of their energy that the directions explain.
 _DIRECTIONS, _EXPLAINED = 40, 0.98
-# Of healthy touches, how many are as unlike the others; those count that have this share of a strong one's energy.
+# Quantile of healthy touches that defines what is unlike them; the least energy of the touches counted, as a share of
+# that of a strong one.
 _UNLIKE, _STRONG = 0.99, 0.2
 _LEAST_FRAMES = 20
-# Of steps from frame to frame, those that touches have no part in; the mean magnitude of as many of a normal number.
+# The share of steps from frame to frame, the smallest, that touches do not affect; the mean magnitude of the same share
+# of a normal variable.
 _QUIETER, _OF_NORMAL = 0.8, 0.5586
-# Deviation of a normal number over its mean magnitude.
+# Standard deviation of a normal variable over its mean magnitude.
 _MEAN = float(np.sqrt(np.pi / 2))
 
 
 @dataclass(frozen=True)
 class Healthy:
-    """What is known of a healthy skin with M channels.
+    """The healthy state of a skin with M channels, and its variation.
 
-    **Fields**: `reference` (M,), untouched, volts; `used` (M,): channels that read anything; `noise` (M,), volts, from
-    frame to frame; `span` (2, M): least and greatest change in it; `stride`: frames averaged to a step; `window`: steps
-    of a window; `scale` (M,), volts: how far windows that follow each other are apart; `limit` of
-    `size_of` a step that stays, and `sudden` of one that may be a touch; `level`
-    (M,), volts, how far any two are apart, and its `level_limit`; `touches` (M, k): directions of touches, orthonormal
-    in units of noise; `unlike`: the share of a change that no touch has outside of those; `steadiness` of single
-    channels; `period`, seconds a frame, or 1; whether the recording was too `brief` for its touches, with limits
-    twice as high for it.
+    **Fields**: `reference` (M,), untouched, volts; `used` (M,): channels that have readings; `noise` (M,), volts, from
+    frame to frame; `span` (2, M): least and greatest change in the recording; `stride`: frames averaged to a step;
+    `window`: steps of a window; `scale` (M,), volts: the change between consecutive windows; `limit`: of `size_of` for
+    a step that stays, and `sudden`: for one that may be a touch; `level` (M,), volts: the change between any two
+    windows, and its `level_limit`; `touches` (M, k): directions of touches, orthonormal in units of noise; `unlike`:
+    the share of a change outside of these directions that no touch exceeds; `steadiness` of single channels; `period`,
+    seconds a frame, or 1; `brief`: whether the recording was too short for its touches, so that limits are twice as
+    high.
     """
 
     reference: Float[np.ndarray, " M"]
@@ -71,10 +75,10 @@ class Healthy:
 
     @classmethod
     def learn(cls, frames: Float[np.ndarray, "F M"], period: float = 1.0, longest: float | None = None) -> "Healthy":
-        """From healthy frames (F, M), touches among them or not, `period` seconds apart. `longest`: seconds that
-        windows take, what a touch is shorter than; from the touches in the frames unless given.
+        """Learn from healthy frames (F, M), with or without touches, `period` seconds apart.
 
-        Raises `ValueError` for fewer than 20 frames, and where no channel reads anything.
+        `longest`: the length of windows in seconds, which every touch is shorter than; estimated from the touches in
+        the frames unless given. Raises `ValueError` for fewer than 20 frames, and where no channel reads anything.
         """
         if len(frames) < _LEAST_FRAMES:
             raise ValueError(
@@ -126,12 +130,12 @@ class Healthy:
         )
 
     def outside(self, change: Float[np.ndarray, " M"]) -> float:
-        """The share of a change that is in no direction that touches have, of its energy in units of noise."""
+        """Share of a change's energy, in units of noise, that is outside of the directions of touches."""
         return float(_outside((np.nan_to_num(change) / self.noise)[None], self.touches)[0])
 
 
 def averaged(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.ndarray, "n M"]:
-    """Means of every `stride` frames, of the readings there are."""
+    """Means of every `stride` frames, over the channels that have readings."""
     if stride == 1:
         return frames
     groups = frames[: len(frames) // stride * stride].reshape(-1, stride, frames.shape[1])
@@ -141,7 +145,7 @@ def averaged(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.ndarray,
 
 
 def _noise(frames: np.ndarray) -> np.ndarray:
-    """Of every channel from frame to frame; what moves only now and then has the deviation that this makes."""
+    """Noise of every channel from frame to frame: the standard deviation estimated from the smaller steps."""
     steps = np.diff(frames, axis=0)
     some = np.isfinite(steps).any(axis=0)
     quiet, most, whole = np.zeros((3, frames.shape[1]))
@@ -149,7 +153,7 @@ def _noise(frames: np.ndarray) -> np.ndarray:
     there = np.isfinite(sizes).sum(axis=0)
     quiet[some] = 1.4826 * np.nanmedian(sizes, axis=0) / np.sqrt(2)
     whole[some] = np.nanstd(steps[:, some], axis=0) / np.sqrt(2)
-    # Coarse steps of a converter have a median of zero, or of one of them; their mean tells more.
+    # Coarse steps of a converter have a median of zero, or of one of them; the mean is more informative.
     small = np.maximum((_QUIETER * there).astype(int), 1)
     most[some] = (
         np.cumsum(np.nan_to_num(sizes), axis=0)[small - 1, np.arange(len(small))] / small / _OF_NORMAL / np.sqrt(2)
@@ -159,7 +163,7 @@ def _noise(frames: np.ndarray) -> np.ndarray:
 
 
 def _window(frames: np.ndarray, noise: np.ndarray, period: float, longest: float | None) -> tuple[int, float]:
-    """Frames of a window, and as many as it would have were the recording long enough."""
+    """Number of frames of a window, and the number that it would have if the recording were long enough."""
     most = max(_FEWEST, len(frames) // _WINDOWS)
     if longest is not None:
         return int(np.clip(np.ceil(longest / period), _FEWEST, most)), longest / period
@@ -176,12 +180,12 @@ def _window(frames: np.ndarray, noise: np.ndarray, period: float, longest: float
 
 
 def _floor(noise: np.ndarray, frames: int) -> np.ndarray:
-    """By what medians of two windows of so many frames of nothing but noise differ, at least."""
+    """Least difference between the medians of two windows of `frames` frames that contain only noise."""
     return noise * np.sqrt(np.pi / max(frames, 2))
 
 
 def _triples(steps: np.ndarray, window: int) -> np.ndarray:
-    """Three windows (n, 3w, M) that follow each other, all over a recording."""
+    """Triples of consecutive windows (n, 3w, M) throughout a recording."""
     starts = range(0, max(1, len(steps) - 3 * window + 1), max(1, window // 4))
     return np.array([steps[start : start + 3 * window] for start in starts])
 
@@ -193,10 +197,10 @@ def _levels(steps: np.ndarray, window: int) -> np.ndarray:
 
 
 def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """The scale (M,) of changes between windows; how large a step may be in it that is still there a window later; and
-    one that need not be, such as a touch.
+    """Estimate the scale (M,) of changes between windows, and the limits of steps in that scale.
 
-    Steps are of each half in the scale of the other, which they had no part in.
+    The first limit is for steps that are still there a window later; the second for any step, such as a touch. The
+    steps of each half of the recording are scaled by the other half, which is independent of them.
     """
     pairs = triples[:, : 2 * window]
     changes = np.nan_to_num(np.array([window_change(one) for one in pairs]))
@@ -223,7 +227,7 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
 
 
 def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, float]:
-    """The same of how far windows are from the median of all, each half of them."""
+    """Estimate the scale and the limit of changes of windows from the median of all, each half scaled by the other."""
     changes = np.nan_to_num(changes)
     half = len(changes) // 2
     sizes = [
@@ -235,15 +239,15 @@ def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, fl
 
 
 def _scale(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """Of changes (n, M): what a normal number would have for a deviation."""
+    """Standard deviation of changes (n, M), estimated from their mean magnitude as for a normal variable."""
     own = _MEAN * np.mean(np.abs(changes), axis=0) if len(changes) else np.zeros(changes.shape[1])
-    # A channel that hardly moved among others that did was lucky.
+    # A channel that hardly changed, while others did, may have done so by chance.
     typical = np.median(own[np.isfinite(floor)] / floor[np.isfinite(floor)])
     return np.maximum(own, np.maximum(1.0, 0.5 * typical) * floor)
 
 
 def _touches(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.ndarray, float]:
-    """Directions (M, k) of what healthy frames do, in units of noise, and the share outside of them that is common."""
+    """Directions (M, k) of healthy changes, in units of noise, and the usual share of energy outside of them."""
     there = np.where(np.isfinite(frames), frames, median(frames))
     centres = np.concatenate(
         [np.tile(median(part), (len(part), 1)) for part in np.array_split(there, max(1, len(there) // (2 * window)))]
@@ -262,7 +266,7 @@ def _touches(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.nda
 
 
 def _directions(frames: np.ndarray) -> np.ndarray:
-    """Principal directions (M, k)."""
+    """Principal directions (M, k) of frames."""
     _, values, rows = np.linalg.svd(frames, full_matrices=False)
     explained = np.cumsum(values**2) / max(np.sum(values**2), 1e-300)
     number = min(int(np.searchsorted(explained, _EXPLAINED)) + 1, _DIRECTIONS, max(1, len(frames) // 4))
@@ -270,7 +274,7 @@ def _directions(frames: np.ndarray) -> np.ndarray:
 
 
 def _outside(scaled: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Of changes (n, M), the share of their energy that is in none of the directions."""
+    """Share of the energy of changes (n, M) that is outside of the directions."""
     energy = np.sum(scaled**2, axis=1)
     left = energy - np.sum((scaled @ directions) ** 2, axis=1)
     return np.clip(left / np.maximum(energy, 1e-300), 0.0, 1.0)

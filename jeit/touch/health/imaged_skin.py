@@ -1,4 +1,4 @@
-"""`ImagedSkin`: a skin's model, tied to its readings, for images that go on with what is left and for paths of cuts."""
+"""`ImagedSkin`: a calibrated model of a skin, which images with the remaining channels and fits cuts."""
 
 from __future__ import annotations
 
@@ -16,22 +16,25 @@ from jeit.mesh import centroids, measures
 from jeit.touch.health.cut_path import FittedLoss, LossFit
 from jeit_solvers.engines import as_array
 
-# Gains of channels are read off the reference where the model agrees with it within this factor.
+# Gains of channels are estimated from the reference where the model agrees with it within this factor.
 _AGREES = 3.0
-# Units and polarity: what is wrong by so many times is not the model's error.
+# A ratio beyond this factor is due to units or polarity, not to model error.
 _OFF = 10.0
-# A place to begin at is the middle of what stands above this share of an image's peak.
+# A starting point of the fit is the middle of the region above this share of an image's peak.
 _ABOVE = 0.5
-# A line is a cut if it leaves no more of the change than this, and no more than this share of what a spot does.
+# A line is a cut if its misfit is no more than the first, and no more than the second times that of a spot.
 _EXPLAINS, _BETTER = 0.4, 0.6
-# Of the skin's side: a second place to begin at is so far from the first, or it is no second.
+# Least distance of a second starting point from the first, as a share of the skin's side.
 _APART = 0.05
 
 
 @dataclass(frozen=True)
 class ImagedSkin:
-    """**Fields**: `model`; `conductivity` (m,), S/m (2-D: S), as it is now, cuts and all, and when it was
-    `healthy`; `gain` (M,), what channels read of the model's volts; `noise` (M,), volts; `sign` of a touch."""
+    """A calibrated model of a skin.
+
+    **Fields**: `model`; `conductivity` (m,), S/m (2-D: S), as it is now, with all cuts, and when it was `healthy`;
+    `gain` (M,), the ratio of readings to the model's volts; `noise` (M,), volts; `sign` of a touch.
+    """
 
     model: ForwardModel
     conductivity: Float[np.ndarray, " m"]
@@ -44,7 +47,8 @@ class ImagedSkin:
     def create(
         cls, model: ForwardModel, conductivity: ArrayLike, reference: np.ndarray, noise: np.ndarray, sign: int
     ) -> "ImagedSkin":
-        """Raises `ValueError` for a conductivity that is none, a reference of another skin, and a sign that is none."""
+        """Calibrate a model on a `reference`. Raises `ValueError` for a conductivity that is none, a reference of
+        another skin, and a sign that is none."""
         if sign not in (1, -1):
             raise ValueError(f"sign must be 1, where touched skin conducts better, or -1, where worse; it is {sign!r}.")
         values = np.asarray(check_conductivity(model.mesh, conductivity))
@@ -68,13 +72,15 @@ class ImagedSkin:
         return cls(model, values, values, gain, noise, int(sign))
 
     def linear(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
-        """One-step images of the model's volts by the `usable` channels (M,), about the skin as it is now."""
+        """One-step reconstruction from the model's volts of the `usable` channels (M,), about the skin as it is now."""
         noise = np.where(np.isfinite(self.noise), self.noise / np.abs(self.gain), 1.0)
         return one_step(self.model, self.conductivity, noise=as_array(noise), mask=as_array(usable))
 
     def images(self, changes: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, " M"]) -> Float[np.ndarray, "F m"]:
-        """Changes of conductivity (F, m), S/m (2-D: S), of changes (F, M), volts, NaN where there is no reading; NaN
-        for a frame without any."""
+        """Reconstruct changes of conductivity (F, m), S/m (2-D: S), from changes (F, M), volts.
+
+        Changes are NaN where there is no reading; a frame without any gives NaN.
+        """
         there = np.isfinite(changes) & usable
         volts = np.where(there, changes / self.gain, 0.0)
         found = np.full((len(changes), self.model.mesh.num_cells), np.nan)
@@ -88,8 +94,10 @@ class ImagedSkin:
     def loss(
         self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"], noise: Float[np.ndarray, " M"]
     ) -> FittedLoss | None:
-        """The cut that explains a change (M,), volts, if one does, and better than a press would. `noise` (M,) of the
-        change, volts."""
+        """Fit a cut to a change (M,), volts; None if no cut explains it, or a press explains it as well.
+
+        `noise` (M,) of the change, volts.
+        """
         there = usable & np.isfinite(change)
         volts = np.where(there, change / self.gain, 0.0)
         image = np.asarray(self.linear(there).image(as_array(volts)))
@@ -112,9 +120,9 @@ class ImagedSkin:
         return line
 
     def with_loss(self, loss: FittedLoss) -> "ImagedSkin":
-        """The skin with a cut."""
+        """Return the skin with a cut added."""
         return replace(self, conductivity=loss.conductivity)
 
     def healed(self) -> "ImagedSkin":
-        """The skin without any."""
+        """Return the skin without any cuts."""
         return replace(self, conductivity=self.healthy)

@@ -1,8 +1,8 @@
-"""A step that lasts in frames with touches, noise and drift, told from all of these by medians of two windows.
+"""Detect a lasting step in frames with touches, noise and drift, by comparing the medians of two windows.
 
-A touch is shorter than half a window, so that the median of the window hardly knows of it; drift is as far within a
-window as between two; what is left is a step. How far windows of healthy frames are apart, channel by channel, is the
-scale for all.
+A touch is shorter than half a window, so that it hardly affects the median of the window; drift within a window is as
+large as between two; what is left is a step. The change between windows of healthy frames, channel by channel, is the
+scale of steps.
 """
 
 from __future__ import annotations
@@ -13,20 +13,24 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtr
 
-# Of a step, how much lies between the quarters of a window right before and after it: of a slope, a quarter.
+# The least share of a step between the quarters of a window right before and after it; a slope has a quarter.
 _SHARP = 0.55
-# Of a step, what all thirds of the window after it are above, and of the window before it below.
+# The share of a step that all thirds of the window after it exceed, and that the window before it does not.
 _STAYED, _NOT_YET = 0.5, 0.5
-# Below this share of the step a frame is as before it; so few may be, by touches that do the opposite.
+# A frame below this share of the step is as before it; the share of frames that may be so, by touches of the opposite
+# sign.
 _BACK, _SOME = 0.3, 0.1
-# A single channel among many is heard in the mean of so high a power.
+# Exponent of the mean, so high that a change of a single channel among many is detected.
 _POWER = 4
 
 
 @dataclass(frozen=True)
 class Step:
-    """**Fields**: `change` (M,) from window to window; `size`, in the scale of healthy windows; `first`: its first step
-    among those of both windows."""
+    """A step between two windows.
+
+    **Fields**: `change` (M,) from window to window; `size`, in the scale of healthy windows; `first`: the index of its
+    first time step in both windows.
+    """
 
     change: Float[np.ndarray, " M"]
     size: float
@@ -34,13 +38,13 @@ class Step:
 
 
 def window_change(frames: Float[np.ndarray, "2w M"]) -> Float[np.ndarray, " M"]:
-    """From the median of the first half to that of the second, 0 where a half has no reading."""
+    """Change from the median of the first half of frames to that of the second, 0 where a half has no reading."""
     half = len(frames) // 2
     return median(frames[half:]) - median(frames[:half])
 
 
 def median(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
-    """Of every channel, of what readings there are; NaN where there are none."""
+    """Median of every channel over its readings; NaN where there are none."""
     if not np.isnan(frames).any():
         return np.median(frames, axis=0)
     some = ~np.isnan(frames).all(axis=0)
@@ -50,7 +54,7 @@ def median(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
 
 
 def size_of(scaled: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
-    """Of changes in the scale of healthy ones; channels without a reading are left out."""
+    """Size of changes in the scale of healthy ones; channels without a reading are left out."""
     powers = np.minimum(np.abs(scaled), 1e9) ** _POWER
     there = np.isfinite(powers)
     mean = np.sum(np.where(there, powers, 0.0), axis=-1) / np.maximum(there.sum(axis=-1), 1)
@@ -58,8 +62,10 @@ def size_of(scaled: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
 
 
 def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M"], limit: float) -> Step | None:
-    """The step between two windows of frames (2w, M), if there is one above the `limit`, it is sharp, and it lasts for
-    all of the second."""
+    """Find the step between two windows of frames (2w, M).
+
+    Returns None unless it is above the `limit`, is sharp, and lasts for all of the second window.
+    """
     change = window_change(frames)
     size = float(size_of(change / scale))
     if size <= limit:
@@ -84,8 +90,10 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
 
 
 def is_distinct(along: Float[np.ndarray, " n"], first: int) -> bool:
-    """Whether frames are 0 before the `first` and 1 from it on, but for noise and a few: between two touches frames
-    come back."""
+    """Whether frames are 0 before the `first` and 1 from it on, but for noise and a few.
+
+    Between two touches, in contrast, frames return to 0.
+    """
     noise = 1.4826 * np.median(np.abs(np.diff(along))) / np.sqrt(2)
     most = max(_SOME, 1.5 * float(ndtr((_BACK - 1) / max(noise, 1e-12))))
     early = np.mean(along[:first] > 1 - _BACK) if first else 0.0
@@ -93,7 +101,7 @@ def is_distinct(along: Float[np.ndarray, " n"], first: int) -> bool:
 
 
 def _split(along: np.ndarray, half: int) -> int:
-    """Where two constants fit best."""
+    """Find the index at which splitting into two constants fits best."""
     number = len(along)
     total, sums = along.sum(), np.cumsum(along)[:-1]
     count = np.arange(1, number)

@@ -1,9 +1,9 @@
-"""Voltages of a model whose conductivity changes in one region only, again and again: a dense update of one solve.
+"""Voltages of a model whose conductivity changes in one region only: dense low-rank updates of one solution.
 
 With the grounded matrix A of stiffness and contact mass, the loads B (`jeit.forward.transfer`) and a change D of the
 stiffness between a few nodes t, the Woodbury identity gives Bᵀ(A + D)⁻¹B = BᵀX − X_tᵀ (1 + D G)⁻¹ D X_t, with X = A⁻¹B
-and G = A⁻¹ between the nodes t. G is found once for all nodes of the region; a change then costs a system of as many
-unknowns as it has nodes.
+and G = A⁻¹ between the nodes t. G is computed once for all nodes of the region; each change then needs the solution of
+a system with as many unknowns as it has nodes.
 """
 
 from __future__ import annotations
@@ -22,15 +22,18 @@ from jeit.forward.transfer import SolvedSystem, centred, electrode_impedance, un
 from jeit.mesh import centroids, measures
 from jeit_solvers.engines import on_host
 
-# Nodes of a region at most.
+# The greatest number of nodes of a region.
 _MOST_NODES = 2500
-# Of a region that has too many nodes, the radius that is left.
+# The factor by which the radius of a region with too many nodes is reduced.
 _LESS = 0.85
 
 
 class LocalChange:
-    """Of a `model` of `conductivity` (m,), S/m (2-D: S), that changes within about `radius` metres of a `centre` (2,):
-    `cells` (c,), those of the region, whose conductivity may change, as of `voltages`."""
+    """Voltages of a `model` whose conductivity changes within about `radius` metres of a `centre` (2,) only.
+
+    `conductivity` (m,), S/m (2-D: S), before the change; `cells` (c,): the cells of the region, whose conductivity may
+    change, as of `voltages`.
+    """
 
     def __init__(
         self, model: ForwardModel, conductivity: Float[np.ndarray, " m"], centre: Float[np.ndarray, " 2"], radius: float
@@ -56,13 +59,13 @@ class LocalChange:
         self.inverse = _inverse_between(matrix, nodes)
 
     def impedance(self, change: Float[np.ndarray, "c ..."]) -> Float[np.ndarray, "L L"]:
-        """Transfer impedance (L, L), ohms, when conductivity has changed by (c,) or tensors (c, d, d)."""
+        """Transfer impedance (L, L), ohms, after conductivity has changed by (c,) or tensors (c, d, d)."""
         return self._impedance(self._solved(change)[1])
 
     def slopes(
         self, change: Float[np.ndarray, "c ..."], ways: list[Float[np.ndarray, "c ..."]]
     ) -> tuple[Float[np.ndarray, "L L"], list[Float[np.ndarray, "L L"]]]:
-        """The impedance, and its derivatives (L, L) in directions of conductivity, where it has `change`d."""
+        """Transfer impedance after a `change`, and its derivatives (L, L) in directions of conductivity."""
         cells, product, solution = self._solved(change)
         fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
         table = np.zeros((self.solution.shape[0], fields.shape[1]))
@@ -78,7 +81,7 @@ class LocalChange:
         return self._impedance(product), found
 
     def _solved(self, change: np.ndarray):
-        """The cells that change, Bᵀ(A + D)⁻¹B, and (A + D)⁻¹B at these cells' nodes, in order."""
+        """Solve for a change: the changed cells, Bᵀ(A + D)⁻¹B, and (A + D)⁻¹B at these cells' nodes, in order."""
         size = np.abs(change).reshape(len(change), -1).max(axis=1)
         cells = np.flatnonzero(size > 0)
         if not len(cells):
@@ -101,7 +104,7 @@ class LocalChange:
 
 
 def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
-    """The inverse of a sparse symmetric matrix between some nodes: of what is left when the others are eliminated."""
+    """Inverse of a sparse symmetric matrix between some nodes: of the Schur complement that eliminates the others."""
     others = np.setdiff1d(np.arange(matrix.shape[0]), nodes)
     left = matrix[nodes][:, nodes].toarray()
     if len(others):

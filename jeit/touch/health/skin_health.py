@@ -1,4 +1,4 @@
-"""`SkinHealth`: whether a skin is still what it was, followed from frame to frame."""
+"""`SkinHealth`: monitor a skin from frame to frame, to detect damage."""
 
 from __future__ import annotations
 
@@ -20,28 +20,30 @@ from jeit.touch.health.healthy import Healthy, averaged
 from jeit.touch.health.imaged_skin import ImagedSkin
 from jeit.touch.health.lasting import Step, is_distinct, lasting_step, median, size_of
 
-# Seconds that no touch is held; windows that none is, where frames have no times.
+# Seconds that no touch is held for; the number of windows, where frames have no times.
 PATIENCE, _PATIENCE_WINDOWS = 30.0, 3
-# Of the patience, what a window takes.
+# The patience, as a multiple of the length of a window.
 _WINDOW = 3.0
-# How far the reference follows the window, a quarter of a window later.
+# The weight with which the reference follows the window, a quarter of a window later.
 _FOLLOWS = 0.1
-# A change is gone when so much of it is; of channels that have no reading, beyond which a frame is refused.
+# A change has disappeared when this share of it has; a frame is refused if more than this share of channels has no
+# reading.
 _GONE, _REFUSED = 0.6, 0.5
-# Beyond so many spans of healthy changes, a channel reads nothing of the skin; of the channels, that may be so at once.
+# A channel beyond this multiple of the span of healthy changes does not measure the skin; the greatest share of
+# channels that may do so at once.
 _SPANS, _FEW = 3.0, 0.34
 
 _OF_CHANNELS = (EventKind.NOISY, EventKind.STUCK)
 
 
 class WatchStatus(StrEnum):
-    """What became of a frame. Each is equal to its word."""
+    """How a frame was processed. Each is equal to its word."""
 
     WATCHED = "watched"
     PARTIAL = "partial"
-    """Watched; some of its channels are not to be trusted."""
+    """Processed; some of its channels are not trusted."""
     REFUSED = "refused"
-    """Not looked at: too few readings, or its time is not after the last."""
+    """Not processed: too few readings, or its time is not after the last."""
 
 
 @dataclass(frozen=True)
@@ -54,17 +56,17 @@ class _Pending:
 
 @dataclass(frozen=True)
 class SkinHealth:
-    """A skin that is watched. `health.follow(time, frame)` gives what is known after the next frame; this one stays.
+    """A monitored skin. `health.follow(time, frame)` returns its state after the next frame; this one is not changed.
 
     Every quarter of a window, the medians of two windows are compared: a step between them, larger than any among the
-    healthy frames, sharp and lasting, is a change of the skin. Unlike any healthy touch, it is told at once; a change
-    that touches make too may be a press that is held, and is told when it has lasted for `patience` seconds. Drift is
-    followed.
+    healthy frames, sharp and lasting, is a change of the skin. A change unlike any healthy touch is reported at once; a
+    change that touches make too may be a press that is held, and is reported when it has lasted for `patience` seconds.
+    The reference follows drift.
 
-    **Fields**: `healthy`, what was learnt; `reference` (M,), the skin as it is now, untouched, volts; `trusted` (M,),
-    channels that may be used; `events` so far; `patience`, seconds; `skin`, its model, or None; `touching` (L, M), the
-    channels of every electrode, or None; `time` of the last frame; `frames`, how many were given; `status` of the last
-    frame, its `usable` channels (M,), and the `reason` in a sentence.
+    **Fields**: `healthy`, the learnt healthy state; `reference` (M,), the skin as it is now, untouched, volts;
+    `trusted` (M,), channels that may be used; `events` so far; `patience`, seconds; `skin`, its model, or None;
+    `touching` (L, M), the channels of every electrode, or None; `time` of the last frame; `frames`, how many were
+    given; `status` of the last frame, its `usable` channels (M,), and the `reason` in a sentence.
 
     Make it with `SkinHealth.fit`.
     """
@@ -99,13 +101,14 @@ class SkinHealth:
         conductivity: ArrayLike | None = None,
         sign: int = 1,
     ) -> "SkinHealth":
-        """From a recording of the healthy skin, (F, M) volts or differences of volts, with touches in it at best.
+        """Learn from a recording of the healthy skin, (F, M) volts or differences of volts, preferably with touches in
+        it.
 
-        `times` (F,), seconds; without them, frames count. `patience`: seconds (frames) that no touch is held; 30 s, or
-        three windows, unless given. `protocol`: what the channels are, so that electrodes are named. `model` of the
-        skin, its `conductivity` S/m (2-D: S), and the `sign` of a touch, -1 where touched skin conducts worse: cuts are
-        then found on it. Raises `ValueError` for frames that are no recording of this skin, fewer than 20, times that
-        do not rise, and a patience that is none.
+        `times` (F,), seconds; without them, frames are counted. `patience`: seconds (frames) that no touch is held for;
+        30 s, or three windows, unless given. `protocol`: what the channels are, so that electrodes are identified.
+        `model` of the skin, its `conductivity` S/m (2-D: S), and the `sign` of a touch, -1 where touched skin conducts
+        worse: cuts are then located on it. Raises `ValueError` for frames that are no recording of this skin, fewer
+        than 20, times that do not rise, and a patience that is none.
         """
         frames = _frames("healthy", healthy)
         period = 1.0
@@ -139,10 +142,10 @@ class SkinHealth:
         return cls(learnt, learnt.reference, learnt.used, wanted, skin, touching)
 
     def follow(self, time: float, frame: ArrayLike) -> "SkinHealth":
-        """After a frame (M,) at `time`, seconds. NaN marks a channel without a reading.
+        """Return the state after a frame (M,) at `time`, seconds. NaN marks a channel without a reading.
 
-        A frame that is not later than the last, or of which fewer than half of the channels read anything, is refused,
-        as `status` and `reason` say. Raises `ValueError` for what is no time, and for another number of channels.
+        A frame that is not later than the last, or of which fewer than half of the channels have a reading, is refused,
+        as `status` and `reason` state. Raises `ValueError` for what is no time, and for another number of channels.
         """
         if not is_number(time):
             raise ValueError(f"time must be seconds; it is {describe(time)}.")
@@ -162,8 +165,10 @@ class SkinHealth:
         return replace(self, frames=self.frames + 1, status=WatchStatus.REFUSED, reason=reason, usable=none)
 
     def confirm(self, event: HealthEvent) -> "SkinHealth":
-        """The user says that it is so; also of what is only `held`. Raises `ValueError` for an event of another
-        skin."""
+        """Return the state after the user has confirmed an event, also one that is only `held`.
+
+        Raises `ValueError` for an event of another skin.
+        """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
             return replace(self, _pending=None)._with(
                 self._pending.change, [self._pending.finding], EventStatus.CONFIRMED
@@ -171,8 +176,10 @@ class SkinHealth:
         return self._with_status(event, EventStatus.CONFIRMED)
 
     def deny(self, event: HealthEvent) -> "SkinHealth":
-        """The user says that it is no damage: a press that is held. The reference is again what it was before. Raises
-        `ValueError` for an event of another skin."""
+        """Return the state after the user has denied an event: it is no damage, but a press that is held.
+
+        The reference is again what it was before. Raises `ValueError` for an event of another skin.
+        """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
             return replace(self, _pending=None)
         denied = self._with_status(event, EventStatus.DENIED)
@@ -180,10 +187,11 @@ class SkinHealth:
         return replace(denied, reference=back, trusted=denied._trusted_channels(), skin=denied._skin_left())
 
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
-        """The user says that the skin is mended, and gives frames (n, M) of it, untouched: the new reference.
+        """Return the state after the user has repaired the skin, with frames (n, M) of it, untouched, as the new
+        reference.
 
-        All that was open is mended. Raises `ValueError` for frames that are no reference: of other channels, or without
-        a reading in half of them.
+        All open events become mended. Raises `ValueError` for frames that are no reference: of other channels, or
+        without a reading in half of them.
         """
         read = _frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
         if read.shape[1] != self.reference.size:
@@ -219,8 +227,11 @@ class SkinHealth:
         )
 
     def images(self, frames: ArrayLike) -> Float[np.ndarray, "F m"]:
-        """Changes of conductivity (F, m), S/m (2-D: S), from the skin as it is now, cuts and all, by the channels that
-        are left; NaN for a frame without a reading. Raises `ValueError` without a model, and for other channels."""
+        """Reconstruct changes of conductivity (F, m), S/m (2-D: S), from the skin as it is now, with all cuts.
+
+        Only the remaining channels are used; a frame without a reading gives NaN. Raises `ValueError` without a model,
+        and for other channels.
+        """
         if self.skin is None:
             raise ValueError("images need a model: give it to SkinHealth.fit, with its conductivity.")
         read = _frames("frames", frames)
@@ -230,14 +241,15 @@ class SkinHealth:
 
     @property
     def held(self) -> HealthEvent | None:
-        """What looks like a touch that is held, or a void: time or the user will tell."""
+        """The event that looks like a touch that is held, or a void, until time or the user decides; None if there is
+        none."""
         if self._pending is None:
             return None
         return self._event(self._pending.change, self._pending.finding, EventStatus.HELD, len(self.events))
 
     @property
     def open_events(self) -> list[HealthEvent]:
-        """Those that are still so."""
+        """The events that still apply."""
         return [one for one in self.events if one.open]
 
     def _watched(self, time: float, values: np.ndarray, there: np.ndarray) -> "SkinHealth":
@@ -245,7 +257,7 @@ class SkinHealth:
         low, high = healthy.span + self.reference
         far = _SPANS * (high - low) + healthy.limit * np.where(healthy.used, healthy.noise, 0.0)
         strange = there & ((values < low - far) | (values > high + far))
-        # Where many are, the skin has changed, not they.
+        # Where many channels are beyond, the skin has changed, not they.
         strange &= strange.sum() <= _FEW * healthy.used.sum()
         usable = there & self.trusted & ~strange
         lost = int((healthy.used & ~usable).sum())
@@ -265,7 +277,7 @@ class SkinHealth:
         return after._examined() if after._steps % max(1, healthy.window // 4) == 0 else after
 
     def _examined(self) -> "SkinHealth":
-        """After looking at the windows."""
+        """Return the state after comparing the windows."""
         healthy, number = self.healthy, len(self._window)
         if number < healthy.window:
             return self
@@ -275,7 +287,7 @@ class SkinHealth:
             return self._begun(latest)
         after = self._waited(latest)
         if number == 2 * healthy.window:
-            # What is not trusted is known already.
+            # Channels that are not trusted belong to known events.
             step = lasting_step(frames, np.where(after.trusted, healthy.scale, np.inf), healthy.limit)
             if step is not None:
                 return after._stepped(step, frames)
@@ -287,10 +299,10 @@ class SkinHealth:
         return after
 
     def _begun(self, latest: np.ndarray) -> "SkinHealth":
-        """After the first window: whether the skin is still that of the healthy frames."""
+        """Return the state after the first window, which is compared with the healthy frames."""
         healthy = self.healthy
         change = np.where(np.isfinite(latest), latest - healthy.reference, 0.0)
-        # Conductivity that drifts as a whole scales every channel alike.
+        # Uniform drift of conductivity scales every channel alike.
         whole = np.where(healthy.used, healthy.reference / healthy.level, 0.0)
         scaled = np.where(healthy.used, change / healthy.level, 0.0)
         if whole @ whole > 0 and abs(scaled @ whole) < 0.1 * (whole @ whole):
@@ -308,7 +320,7 @@ class SkinHealth:
         return replace(begun, reference=healthy.reference)._with(change, found, EventStatus.LASTING)
 
     def _waited(self, latest: np.ndarray) -> "SkinHealth":
-        """Whether what was held is gone, or has lasted."""
+        """Return the state after checking whether a held change has disappeared, or has lasted."""
         pending = self._pending
         if pending is None:
             return self
@@ -326,7 +338,7 @@ class SkinHealth:
         )
 
     def _stepped(self, step: Step, frames: np.ndarray) -> "SkinHealth":
-        """After a step that lasts."""
+        """Return the state after a lasting step."""
         time, frame, _ = self._window[step.first]
         change = Change(step.change, step.size, time, frame, self.time)
         fresh = replace(self, _window=self._window[step.first :])
@@ -341,12 +353,12 @@ class SkinHealth:
         found = findings(step.change, after, self.reference, self.healthy, self.touching, self.skin)
         if found[0].electrode is not None or (found[0].sure and change.size > self.healthy.sudden):
             return fresh._with(change, found, EventStatus.LASTING)
-        if self._pending is not None:  # one thing is waited for at a time: that which began first
+        if self._pending is not None:  # only one change is pending at a time: that which began first
             return fresh
         return replace(fresh, _pending=_Pending(change, found[0]))
 
     def _steadied(self, frames: np.ndarray) -> "SkinHealth":
-        """After single channels that have got noisy, or are stuck."""
+        """Return the state after checking for single channels that are noisy or stuck."""
         after, steadiness, asked = self, self.healthy.steadiness, self.trusted.copy()
         for one in self.events:
             if one.kind in _OF_CHANNELS and one.status == EventStatus.DENIED:
@@ -367,7 +379,7 @@ class SkinHealth:
         return after if after is self else replace(after, trusted=after._trusted_channels())
 
     def _undone(self, change: Change) -> "SkinHealth | None":
-        """After a step that takes an earlier change back."""
+        """Return the state after a step that reverses an earlier change."""
         for one in self.open_events:
             there = np.isfinite(one.change) & np.isfinite(change.vector) & self.trusted
             before = (one.change[there] / self.healthy.scale[there]).clip(-1e9, 1e9)
@@ -387,9 +399,9 @@ class SkinHealth:
         return None
 
     def _with(self, change: Change, found: list[Finding], status: EventStatus) -> "SkinHealth":
-        """After events that are told; the reference contains them from now on."""
+        """Return the state with events added; the reference contains their change from now on."""
         events = [self._event(change, one, status, len(self.events) + number) for number, one in enumerate(found)]
-        # Electrodes that fail say nothing of the skin, which may be touched.
+        # Failing electrodes carry no information about the skin, which may be touched.
         own = np.logical_or.reduce([np.ones_like(self.trusted) if one.own is None else one.own for one in found])
         fresh = np.where(own & np.isfinite(change.vector), self.reference + change.vector, self.reference)
         skin = self.skin
@@ -420,7 +432,7 @@ class SkinHealth:
         )
 
     def _with_status(self, event: HealthEvent, status: EventStatus) -> "SkinHealth":
-        """After another status of an event. Raises `ValueError` for one that is not of this skin."""
+        """Return the state with another status of an event. Raises `ValueError` for one that is not of this skin."""
         check_kind("event", event, HealthEvent, "one of health.events, or health.held")
         if not event.number < len(self.events):
             raise ValueError(f"event {event.number} is none of this skin's, which has {len(self.events)}.")
@@ -428,12 +440,12 @@ class SkinHealth:
         return replace(self, events=tuple(events))
 
     def _skin_left(self) -> ImagedSkin | None:
-        """The model as it was healthy, once no cut is left."""
+        """The model of the healthy skin, once no cut is left."""
         cut = any(one.path is not None for one in self.open_events)
         return self.skin if self.skin is None or cut else self.skin.healed()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
-        """Channels (M,) that no open event of an electrode, or of themselves, takes away."""
+        """Channels (M,) that no open event of an electrode, or of a channel, excludes."""
         trusted = self.healthy.used.copy()
         for one in self.open_events:
             if one.electrode is not None and self.touching is not None:
@@ -444,8 +456,10 @@ class SkinHealth:
 
 
 def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None) -> SkinHealth:
-    """What is known after a recording (F, M), the same as following it frame by frame; `times` (F,), seconds, or
-    frames counted on. Raises `ValueError` as `SkinHealth.follow` does, and for another number of times."""
+    """Process a recording (F, M), the same as following it frame by frame; `times` (F,), seconds, or frames counted on.
+
+    Returns the state after it. Raises `ValueError` as `SkinHealth.follow` does, and for another number of times.
+    """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(healthy)")
     read = real_array("frames", frames, "(F, M) volts")
     if read.ndim != 2:

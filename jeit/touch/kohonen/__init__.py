@@ -1,6 +1,6 @@
-"""Kohonen's self-organising map: a skin's frames learnt without a model, and what the map then says of touches.
+"""Kohonen's self-organising map, learnt from a skin's frames without a model, and places of touches from it.
 
-Rooms beside it: `jeit.touch.learnt` has it as a method, "som", of `jeit touch fit`.
+`jeit.touch.learnt` uses it as a method, "som", of `jeit touch fit`.
 """
 
 from __future__ import annotations

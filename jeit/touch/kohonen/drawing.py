@@ -1,4 +1,4 @@
-"""The topology of a map, drawn: neurons as masses, neighbours held by springs."""
+"""Draw the topology of a map: neurons as masses, neighbours connected by springs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jeit.arguments import check_key, check_kind
 from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
-# Steps of the springs, and a distance of neighbours, of the usual one, below which springs grow no stronger.
+# Steps of the springs, and the distance of neighbours, relative to the usual one, below which springs grow no stronger.
 _STEPS, _LEAST = 60, 1e-2
 
 

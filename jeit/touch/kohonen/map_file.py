@@ -1,4 +1,4 @@
-"""Maps as files: arrays alone."""
+"""Read and write maps as files that hold only arrays."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
 
 
 def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
-    """The map of a file that `write_map` made. Raises `FileNotFoundError`, and `ValueError` for another file."""
+    """Read the map of a file that `write_map` made. Raises `FileNotFoundError`, and `ValueError` for another file."""
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give an NPZ file.")
     if not Path(path).is_file():

@@ -1,4 +1,4 @@
-"""`PlacedMap`: what a self-organising map says of places, once some presses have told where its neurons lie."""
+"""`PlacedMap`: a self-organising map whose neurons have places, from which places of frames are estimated."""
 
 from __future__ import annotations
 
@@ -16,24 +16,26 @@ from scipy.spatial import KDTree
 from jeit.arguments import check_kind, real_array
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
-# Neurons that a frame is told by, those nearest to it, or 5 by 5 on the grid about the nearest; and what holds their
-# shares together, over the mean square of their differences.
+# The number of neurons that a place is estimated from: those nearest to the frame, or 5 by 5 on the grid about the
+# nearest; and the regularisation of their shares, relative to the mean square of their differences.
 _NEAREST, _HELD = 9, 0.05
 _ON_GRID, _HELD_ON_GRID = 25, 0.005
-# Presses that say as much of a neuron's place as the mean of all that it won.
+# The number of presses that count as much for a neuron's place as the mean of all that it won.
 _DOUBT = 0.3
 _FEWEST = 10
-# Frames that are told at once.
+# The number of frames that are located at once.
 _AT_ONCE = 512
 
 
 @dataclass(frozen=True)
 class PlacedMap:
-    """A `learnt` map whose neurons have `places` (R, C, d), metres: the mean place of the presses that each won, NaN
-    of those that won none; make it with `PlacedMap.learn`. `widening`: the root mean square distance of presses held
-    out from where they were told, over the spread told. `missed`: the root mean square of what the neurons nearest to a
-    press leave of a channel, in the unit of frames. `fitted` (R, C, d), metres: places that tell presses best, where
-    neighbours on the grid tell a frame; None: it is told by the neurons nearest to it, and their places."""
+    """A `learnt` map whose neurons have `places` (R, C, d), metres; make it with `PlacedMap.learn`.
+
+    A place is the mean of the presses that a neuron won, NaN for those that won none. `widening`: the root mean square
+    error of held-out presses, over the estimated spread. `missed`: the root mean square of what the neurons nearest to
+    a press leave of a channel, in the unit of frames. `fitted` (R, C, d), metres: places that fit presses best, where
+    neighbours on the grid locate a frame; None: it is located by the neurons nearest to it, and their places.
+    """
 
     learnt: SelfOrganisingMap
     places: Float[np.ndarray, "R C d"]
@@ -43,14 +45,13 @@ class PlacedMap:
 
     @classmethod
     def learn(cls, learnt: SelfOrganisingMap, frames: ArrayLike, positions: ArrayLike) -> "PlacedMap":
-        """Places of the neurons of a `learnt` map, from presses: frames (N, M) as it was learnt from, those or others,
-        and their `positions` (N, d), metres.
+        """Learn places of the neurons of a `learnt` map from presses: frames (N, M) and their `positions` (N, d),
+        metres.
 
-        Of few presses the neurons nearest to a frame say more; of many, neighbours on the grid, with places fitted by
-        least squares. That is taken which errs less on presses held out.
-
-        Raises `ValueError` for what is no map, fewer than ten presses, and positions that are not finite, one for each
-        frame, or all the same.
+        The frames are those that the map was learnt from, or others. With few presses the neurons nearest to a frame
+        locate it better; with many, neighbours on the grid, with places fitted by least squares. The choice is what has
+        less error on held-out presses. Raises `ValueError` for what is no map, fewer than ten presses, and positions
+        that are not finite, one for each frame, or all the same.
         """
         check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
         frames = learnt.checked(frames)
@@ -69,7 +70,7 @@ class PlacedMap:
             off = spread = missed = 0.0
             for out in (odd, ~odd):
                 part = cls._of(learnt, frames[~out], positions[~out], winners[~out], fit)
-                placed = part._told(frames[out])
+                placed = part._located(frames[out])
                 off += float(np.sum((placed.places - positions[out]) ** 2))
                 spread += float(np.sum(placed.spread**2))
                 missed += float(np.sum(placed.left**2))
@@ -80,7 +81,7 @@ class PlacedMap:
 
     @classmethod
     def _of(cls, learnt, frames, positions, winners, fit: bool) -> "PlacedMap":
-        """The map whose places these presses say, with these winners (N,); of deviations it knows nothing yet."""
+        """The map with places from these presses, with these winners (N,); without an estimate of deviations yet."""
         number = learnt.shape[0] * learnt.shape[1]
         count = np.bincount(winners, minlength=number)[:, None]
         sums = np.stack([np.bincount(winners, one, minlength=number) for one in positions.T], axis=1)
@@ -103,18 +104,18 @@ class PlacedMap:
         return np.isfinite(self.places[..., 0])
 
     def locate(self, frames: ArrayLike) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-        """Places (n, d) of frames (n, M), or one (M,), and their standard deviations (n, d), metres.
+        """Estimate the places (n, d) of frames (n, M), or one (M,), and their standard deviations (n, d), metres.
 
-        The neurons nearest to it, or those about the nearest on the grid (`fitted`), are combined so that their frames,
-        in shares of sum 1, come nearest to the one read: their places, in the same shares, are where it is (a map that
-        is linear between neurons; the shares are those of Roweis and Saul 2000), at most as far from the middle of
-        these, or on the grid from the nearest, as any of them. Raises `ValueError` for frames of another number of
-        channels, and NaN.
+        The neurons nearest to a frame, or those about the nearest on the grid (`fitted`), are combined with shares of
+        sum 1 so that their frames are nearest to it; the place is the combination of their places with the same shares
+        (a map that is linear between neurons; the shares are those of Roweis and Saul 2000), at most as far from the
+        middle of these, or on the grid from the nearest, as any of them. Raises `ValueError` for frames of another
+        number of channels, and NaN.
         """
-        placed = self._told(self.learnt.checked(frames))
+        placed = self._located(self.learnt.checked(frames))
         return placed.places, self.widening * placed.spread
 
-    def _told(self, frames: Float[np.ndarray, "n M"]) -> "_Told":
+    def _located(self, frames: Float[np.ndarray, "n M"]) -> "_Located":
         near, shares, left = self._shares(frames)
         there = self._known.places[near]
         own = there.mean(axis=1) if self.fitted is None else there[:, 0]
@@ -122,10 +123,10 @@ class PlacedMap:
         most = np.linalg.norm(there - own[:, None], axis=2).max(axis=1)
         length = np.linalg.norm(offset, axis=1)
         said = own + offset * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
-        return _Told(said, np.sqrt(np.mean((there - said[:, None]) ** 2, axis=1)), left)
+        return _Located(said, np.sqrt(np.mean((there - said[:, None]) ** 2, axis=1)), left)
 
     def _shares(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Numbers (n, q) among the neurons with places of those that tell frames, the shares (n, q) of these, and what
+        """Numbers (n, q), among the neurons with places, of those that locate frames, their shares (n, q), and what
         they leave (n, M)."""
         known = self._known
         if self.fitted is None:
@@ -139,7 +140,7 @@ class PlacedMap:
         return near, shares, left
 
     def predict(self, features: ArrayLike) -> Float[np.ndarray, "n d"]:
-        """Places (n, d) alone, as of `locate`, for who asks as of scikit-learn's estimators."""
+        """Places (n, d) alone, as of `locate`, in the interface of scikit-learn's estimators."""
         return self.locate(features)[0]
 
     @cached_property
@@ -152,15 +153,17 @@ class PlacedMap:
 
 
 class _Known(NamedTuple):
-    """The neurons that have a place, in one row; the places that tell; the numbers of those about each on the grid."""
+    """The neurons that have a place, in one row; the places that estimates use; the numbers of those about each on the
+    grid."""
 
     neurons: SelfOrganisingMap
     places: Float[np.ndarray, "k d"]
     around: Int[np.ndarray, "k q"]
 
 
-class _Told(NamedTuple):
-    """Places (n, d), how far those of the neurons are spread about them (n, d), what their frames leave (n, M)."""
+class _Located(NamedTuple):
+    """Estimated places (n, d), the spread of the neurons' places about them (n, d), and the residual of frames (n,
+    M)."""
 
     places: Float[np.ndarray, "n d"]
     spread: Float[np.ndarray, "n d"]
@@ -168,7 +171,8 @@ class _Told(NamedTuple):
 
 
 def _combined(own: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], held: float):
-    """Shares (n, q), of sum 1, in which neurons' own frames come nearest to those read, and what they leave (n, M)."""
+    """Shares (n, q), of sum 1, with which the neurons' frames are nearest to the given ones, and the residual (n,
+    M)."""
     count = own.shape[1]
     middle = own.mean(axis=1, keepdims=True)
     apart = own - middle

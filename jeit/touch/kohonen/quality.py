@@ -1,4 +1,4 @@
-"""How well a map keeps the order of its frames, in the field's measures."""
+"""Measure how well a map preserves the order of its frames, by standard measures."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ from jeit.arguments import check_kind
 from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
-# Frames of which all pairs are compared, and neighbours of each.
+# The number of frames of which all pairs are compared, and of neighbours of each.
 _COMPARED, _NEIGHBOURS = 2000, 12
 
 
 @dataclass(frozen=True)
 class MapQuality:
-    """`quantisation_error`, mean distance of frames from their winners, in their unit; `topographic_error`, share of
-    the frames whose two nearest neurons are no neighbours on the grid, of eight each (Kiviluoto 1996);
-    `trustworthiness`, 1 if all that is near on the map was near among the frames (Venna and Kaski 2001)."""
+    """Measures of how well a map preserves the order of frames.
+
+    `quantisation_error`, mean distance of frames from their winners, in their unit; `topographic_error`, share of the
+    frames whose two nearest neurons are no neighbours on the grid, of eight each (Kiviluoto 1996); `trustworthiness`, 1
+    if all that is near on the map was near among the frames (Venna and Kaski 2001).
+    """
 
     quantisation_error: float
     topographic_error: float
@@ -27,10 +30,10 @@ class MapQuality:
 
 
 def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
-    """Of a `learnt` map, by frames (n, M), those it was learnt from or others; trustworthiness by 2,000 of them at
-    most, evenly chosen, of whose neighbours 12 are looked at.
+    """Compute the quality of a `learnt` map for frames (n, M), those it was learnt from or others.
 
-    Raises `ValueError` for what is no map, fewer than 25 frames, another number of channels, and NaN.
+    Trustworthiness is computed for 2,000 of them at most, evenly chosen, with 12 neighbours of each. Raises
+    `ValueError` for what is no map, fewer than 25 frames, another number of channels, and NaN.
     """
     trustworthiness = optional("sklearn.manifold", "the trustworthiness of a map").trustworthiness
 

@@ -1,4 +1,4 @@
-"""`SelfOrganisingMap`: neurons on a grid, each with a frame of its own, neighbours with frames that are alike."""
+"""`SelfOrganisingMap`: neurons on a grid, each with a frame of its own, so that neighbours have similar frames."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_key, check_kind, counted, describe, is_number, real_array
 from jeit.touch.kohonen.training import Schedule, train
 
-# Fewer frames teach no order.
+# Fewer frames define no order.
 _FEWEST = 3
 # Weights at the start, over the frames' root mean square.
 _SMALL = 1e-3
-# A radius, grid steps, within which there is the winner alone: of its neighbours exp(−1/2ρ²) is no number.
+# A radius, grid steps, within which only the winner moves: for its neighbours exp(−1/2ρ²) underflows.
 _ALONE = 0.01
-# Frames of which the distances to all neurons are worked out at once.
+# The number of frames whose distances to all neurons are computed at once.
 _AT_ONCE = 1024
 
 
@@ -75,12 +75,14 @@ class SelfOrganisingMap:
         return np.sqrt(self._squared(self.checked(frames))).reshape(-1, *self.shape)
 
     def activity(self, frames: ArrayLike) -> Float[np.ndarray, "n R C"]:
-        """1 / (1 + distance / scale) of frames (n, M), or one (M,): 1 where a neuron's own frame is read. Raises as
-        `distances` does."""
+        """Activity of neurons for frames (n, M), or one (M,): 1 / (1 + distance / scale), 1 for a neuron's own frame.
+
+        Raises as `distances` does.
+        """
         return 1 / (1 + self.distances(frames) / self.scale)
 
     def winners(self, frames: ArrayLike) -> Int[np.ndarray, "n 2"]:
-        """Row and column of the neuron that each of frames (n, M), or one (M,), is nearest to. Raises as `distances`
+        """Row and column (n, 2) of the neuron nearest to each of frames (n, M), or one (M,). Raises as `distances`
         does."""
         nearest = self._squared(self.checked(frames)).argmin(axis=1)
         return np.stack(np.unravel_index(nearest, self.shape), axis=1)
@@ -95,7 +97,7 @@ class SelfOrganisingMap:
         return np.take_along_axis(some, order, axis=1), np.sqrt(np.take_along_axis(near, order, axis=1))
 
     def checked(self, frames: ArrayLike) -> Float[np.ndarray, "n M"]:
-        """Frames (n, M) as numbers. Raises `ValueError` for other shapes, and NaN."""
+        """Convert frames (n, M) to numbers. Raises `ValueError` for other shapes, and NaN."""
         return checked_frames(frames, self.weights.shape[2])
 
     def _squared(self, frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n k"]:
@@ -126,8 +128,10 @@ def fit_maps(
     schedules: Sequence[Schedule] = (Schedule(),),
     scale: float | None = None,
 ) -> list[SelfOrganisingMap]:
-    """Maps of the same frames, learnt at once: of each key with each schedule, all of which show as many frames; those
-    of the first key first. The other arguments, and what is raised, as of `SelfOrganisingMap.fit`."""
+    """Learn several maps of the same frames at once: for each key with each schedule, those of the first key first.
+
+    All schedules show as many frames. The other arguments, and what is raised, are as in `SelfOrganisingMap.fit`.
+    """
     frames = checked_frames(frames)
     learnt, _ = learn_weights(frames, keys, shape, schedules)
     return [_scaled(one, frames, scale) for one in learnt]
@@ -139,8 +143,10 @@ def learn_weights(
     shape: tuple[int, int],
     schedules: Sequence[Schedule],
 ) -> tuple[Float[np.ndarray, "k R C M"], Float[np.ndarray, "k T"]]:
-    """Weights of the maps that `fit_maps` makes, and the mean of their weights after each frame shown. Raises
-    `ValueError` as that does."""
+    """Learn the weights of the maps that `fit_maps` makes, and the mean of their weights after each frame.
+
+    Raises `ValueError` as `fit_maps` does.
+    """
     if len(frames) < _FEWEST or (frames == frames[0]).all():
         raise ValueError(f"frames: {counted(len(frames), 'frame')}, all the same or too few to learn a map from.")
     check_kind("keys", keys, (list, tuple), "a list of them, such as [jax.random.key(0)]")
@@ -163,7 +169,8 @@ def learn_weights(
 
 
 def checked_frames(given, channels: int | None = None) -> Float[np.ndarray, "n M"]:
-    """Frames (n, M), or one (M,), as numbers. Raises `ValueError` for other shapes and numbers of channels, and NaN."""
+    """Convert frames (n, M), or one (M,), to numbers. Raises `ValueError` for other shapes and numbers of channels, and
+    NaN."""
     frames = real_array("frames", given, "numbers (n, channels)")
     frames = frames[None] if frames.ndim == 1 else frames
     if frames.ndim != 2 or not frames.shape[1]:
@@ -197,13 +204,13 @@ def _scaled(weights: np.ndarray, frames: np.ndarray, scale: float | None) -> Sel
 
 
 def _started(frames: np.ndarray, key: Array, shape: tuple[int, int]) -> Float[np.ndarray, "R C M"]:
-    """Weights before any frame is shown: small, and random."""
+    """Initial weights: small, and random."""
     size = _SMALL * float(np.sqrt(np.mean(frames**2)))
     return size * np.asarray(jax.random.normal(key, (*shape, frames.shape[1])))
 
 
 def _order(key: Array, number: int, steps: int) -> Int[np.ndarray, " T"]:
-    """All of so many frames in one order after another, as many steps as there are."""
+    """Order of `number` frames, reordered after all were shown, for `steps` steps."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     rounds = [random.permutation(number) for _ in range(-(-steps // number))]
     return np.concatenate(rounds)[:steps]

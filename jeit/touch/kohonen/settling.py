@@ -1,4 +1,4 @@
-"""How a map's mean weight settles: its learning curves, and their time constants."""
+"""Measure how a map's mean weight converges: learning curves, and their time constants."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ def learning_curves(
     steps: int = 10_000,
     shape: tuple[int, int] = (32, 32),
 ) -> Float[np.ndarray, "r T"]:
-    """Mean of all weights after each of so many `steps`, from small ones, with each of the `rates` ε, which stay as
-    they are, as does the radius, half the map's longer side: (rates, steps), in the unit of frames (N, M).
+    """Mean of all weights after each of `steps`, with each of the `rates` ε: (rates, steps), in the unit of frames (N,
+    M).
 
-    Raises `ValueError` as `SelfOrganisingMap.fit` does.
+    Weights are small at first; the rates are constant, as is the radius, half the map's longer side. Raises
+    `ValueError` as `SelfOrganisingMap.fit` does.
     """
     radius = max(shape) / 2
     schedules = [Schedule(steps, 0, (float(rate), float(rate)), (radius, radius)) for rate in rates]
@@ -32,8 +33,10 @@ def learning_curves(
 
 
 def time_constant(curve: ArrayLike) -> float:
-    """Steps after which a curve (T,) that starts from zero has come 1 − 1/e of the way to where it ends, the mean of
-    its last tenth. Raises `ValueError` for what is no curve of ten steps or more."""
+    """Steps after which a curve (T,) has come 1 − 1/e of the way from zero to its end, the mean of its last tenth.
+
+    Raises `ValueError` for what is no curve of ten steps or more.
+    """
     values = real_array("curve", curve, "the means (T,) of a map's weights")
     if values.ndim != 1 or len(values) < 10 or not np.isfinite(values).all():
         raise ValueError(f"curve must be finite, (T,), of ten steps or more; it has shape {values.shape}.")

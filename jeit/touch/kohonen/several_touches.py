@@ -1,4 +1,4 @@
-"""Several touches at once, told by a map that has learnt of one at a time."""
+"""Detect several simultaneous touches with a map that was learnt from single touches."""
 
 from __future__ import annotations
 
@@ -11,16 +11,21 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.touch.kohonen.placed_map import PlacedMap
 
-# Of the strongest touch, what is believed at the least; of the extent of the map's places, how far touches are apart.
+# The least strength of a touch, relative to the strongest; the least distance between touches, relative to the extent
+# of the map's places.
 _LEAST, _APART = 0.08, 0.1
-# Variances by which the sum of squares that is left must fall for one more touch; touches looked for, at most.
+# The decrease of the residual sum of squares, in variances, that one more touch requires; the greatest number of
+# touches.
 _EVIDENCE, _MOST = 25.0, 6
 
 
 @dataclass(frozen=True)
 class MapTouch:
-    """One of several: its `place` (d,) and the root mean square distance `spread` of its neurons from there, metres;
-    its `strength`, 1 for a touch like those that were learnt."""
+    """One of several touches.
+
+    Its `place` (d,) and the root mean square distance `spread` of its neurons from there, metres; its `strength`, 1 for
+    a touch like those that were learnt.
+    """
 
     place: Float[np.ndarray, " d"]
     spread: float
@@ -28,12 +33,12 @@ class MapTouch:
 
 
 def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "R C"]:
-    """How much of each neuron's touch is in a frame (M,): shares (R, C), zero or more, whose neurons' changes from the
-    `reference` (M,), the untouched skin's, sum nearest to the frame's; 0 for neurons without a place.
+    """Shares (R, C) of each neuron's touch in a frame (M,), zero or more, by non-negative least squares.
 
-    Changes of small touches add up, and touches push one way only: of shares that may not be negative, few are needed
-    (non-negative least squares; Lawson and Hanson 1974). Raises `ValueError` for what is no map with places, more than
-    one frame, other numbers of channels, and NaN.
+    The neurons' changes from the `reference` (M,), the untouched skin's frame, times their shares, sum to the frame's
+    as nearly as possible; 0 for neurons without a place. Changes of small touches add up, and touches have one sign:
+    few of the non-negative shares are needed (Lawson and Hanson 1974). Raises `ValueError` for what is no map with
+    places, more than one frame, other numbers of channels, and NaN.
     """
     sum_of = _Sum.of(placed, frame, reference)
     shares = np.zeros(placed.learnt.shape)
@@ -49,14 +54,13 @@ def touches_reported(
     least: float = _LEAST,
     apart: float | None = None,
 ) -> list[MapTouch]:
-    """The touches in a frame (M,) of a skin whose untouched frame is `reference` (M,), the strongest first, six at
-    most.
+    """Detect the touches in a frame (M,) of a skin whose untouched frame is `reference` (M,).
 
-    Neurons with a share in the frame (`neuron_shares`) whose places are less than `apart` metres from each other, one
-    after another, may be of one touch; unless given a tenth of the extent of all places. Of these, touches are taken
-    one after another, as long as what they leave unexplained falls by five standard deviations of what the map leaves
-    of touches at any rate. Those of less than `least` of the strongest, or of a touch that was learnt, are left out.
-    Raises `ValueError` as `neuron_shares` does, and for a share or distance that cannot be.
+    Returns six touches at most, the strongest first. Neurons with a share in the frame (`neuron_shares`) whose places
+    are less than `apart` metres from each other, one after another, may be of one touch; unless given a tenth of the
+    extent of all places. Touches are added one after another, as long as the unexplained change decreases by five
+    standard deviations of the map's own residual. Touches of less than `least` of the strongest, or of a touch that was
+    learnt, are left out. Raises `ValueError` as `neuron_shares` does, and for a share or distance that cannot be.
     """
     if not (is_number(least) and 0 <= least < 1):
         raise ValueError(f"least must be a share, from 0 to below 1; it is {describe(least)}.")
@@ -81,8 +85,10 @@ def touches_reported(
 
 @dataclass(frozen=True)
 class _Sum:
-    """A frame's `change` (M,) as a sum of those of neurons, `changes` (k, M), at `places` (k, d); all in a unit in
-    which these are about 1, as is the `variance` that touches leave of a channel."""
+    """Model of a frame's `change` (M,) as a sum of those of neurons, `changes` (k, M), at `places` (k, d).
+
+    Changes are in a unit in which they are about 1, as is `variance`, the residual variance of a channel.
+    """
 
     change: Float[np.ndarray, " M"]
     changes: Float[np.ndarray, "k M"]
@@ -99,7 +105,7 @@ class _Sum:
         return cls((read - rest) / size, changes / size, own, (placed.missed / size) ** 2)
 
     def shares(self, some: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
-        """Shares (k,) of the neurons, those alone that are asked for, and the sum of squares that they leave."""
+        """Shares (k,) of some of the neurons, and the residual sum of squares."""
         from scipy.optimize import nnls
 
         found = np.zeros(len(some))
@@ -107,7 +113,7 @@ class _Sum:
         return found, float(distance) ** 2
 
     def groups(self, shares: Float[np.ndarray, " k"], apart: float) -> list[Bool[np.ndarray, " k"]]:
-        """Neurons (k,) near those of each cluster of shares, of the clusters that change the frame most."""
+        """Neurons (k,) near those of each cluster of shares, for the clusters that change the frame most."""
         from scipy.cluster.hierarchy import fcluster, linkage
 
         own = np.flatnonzero(shares)
@@ -123,7 +129,7 @@ class _Sum:
 
 
 def _needed(sum_of: _Sum, groups: list[np.ndarray], variance: float) -> list[Bool[np.ndarray, " k"]]:
-    """Groups of neurons that the frame cannot do without, the most telling first."""
+    """Groups of neurons that are needed to explain the frame, the most informative first."""
     chosen: list[np.ndarray] = []
     left = float(sum_of.change @ sum_of.change)
     rest = list(groups)

@@ -25,9 +25,9 @@ from jaxtyping import Array, Float, Int
 
 from jeit.arguments import describe, is_number, real_array
 
-# Frames after which weights are moved, in either phase.
+# The number of frames after which weights are moved, in either phase.
 _ORDERED, _TUNED = 16, 64
-# Of neurons that are there: an index that may lie outside costs a copy of all.
+# Of neurons that exist: an index that may lie outside costs a copy of all.
 _THERE = "promise_in_bounds"
 
 

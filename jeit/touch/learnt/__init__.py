@@ -1,1 +1,2 @@
-"""Skins that learn: from recorded presses to where, how hard and by what a skin is touched, without a model of it."""
+"""Estimate where, how hard and by what a skin is touched, by models learnt from recorded presses, without a physical
+model."""

@@ -1,4 +1,4 @@
-"""All that presses say, learnt from their changes: places, forces, labels and keys, and how well each is told."""
+"""Learn places, forces, labels and keys from the changes of recorded presses, and estimate the error of each."""
 
 from __future__ import annotations
 
@@ -22,8 +22,11 @@ METHODS = tuple(dict.fromkeys((*number_methods.METHODS, *label_methods.METHODS))
 
 @dataclass(frozen=True)
 class Standing:
-    """How well something was learnt: the `method` chosen, errors of all that were `tried` on presses held out, and what
-    the chosen one said of each press when it was held out; in the units of what was learnt."""
+    """How well a quantity was learnt.
+
+    The `method` chosen, the errors on held-out presses of all that were `tried`, and the chosen method's prediction for
+    each press when it was held out; in the units of the quantity.
+    """
 
     method: str
     tried: list[tuple[str, float]]
@@ -40,7 +43,10 @@ def learn_answers(
     imaged: Imaged | None,
     progress,
 ) -> tuple[dict[str, Any], dict[str, Standing], list[str]]:
-    """What was learnt of `place`, `force`, `label` and `keys`, None for what presses do not say; how well; notes."""
+    """Learn `place`, `force`, `label` and `keys`, each None if the presses do not have it.
+
+    Returns the models, how well each was learnt, and notes.
+    """
     notes, standing = [], {}
     found: dict[str, Any] = dict.fromkeys(("place", "force", "label", "keys"))
     every = np.arange(len(whole))
@@ -83,7 +89,7 @@ def learn_answers(
 
 
 def places_and_folds(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Rows of presses that have a place, the folds of those, and notes."""
+    """Rows of presses that have a place, their cross-validation folds, and notes."""
     positions = np.asarray(presses.positions)
     rows = np.flatnonzero(~np.isnan(positions).any(axis=1))
     folds, remarks = time_folds(presses.frames[rows], *_when(presses, rows), alike=positions[rows])
@@ -91,7 +97,7 @@ def places_and_folds(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[st
 
 
 def _numbers(whole, reference, targets, rows, folds, method, imaged, progress) -> tuple[LearntNumbers, Standing]:
-    """Numbers (n, d) learnt from the changes of some rows, and how well."""
+    """Learn numbers (n, d) from the changes of some rows; returns the model and how well it was learnt."""
     own, asked = None if reference is None else reference[rows], _asked(method, number_methods)
     learnt, tried = learn_numbers(whole[rows], own, targets, folds, method=asked, imaged=imaged, progress=progress)
     methods = [(one.name, one.error) for one in tried]

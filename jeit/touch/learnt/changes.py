@@ -1,22 +1,24 @@
-"""From frames to changes: less the untouched skin's reference, by session where sessions differ."""
+"""Compute changes from frames, by subtracting the untouched skin's reference, and standardise them by session."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-# Frames of a session, before it can be standardised by itself.
+# The least number of frames of a session that can be standardised by itself.
 _SESSION = 20
 
 
 def changes_of(frames: Float[np.ndarray, "n M"], reference: np.ndarray | None) -> Float[np.ndarray, "n M"]:
-    """Frames less their reference, if there is one."""
+    """Subtract the reference from frames, if there is one."""
     return frames if reference is None else frames - reference
 
 
 def standardised(changes: np.ndarray, group) -> np.ndarray:
-    """Changes (n, M) less their session's median, over their session's deviation; one session unless `group` (n,) says
-    otherwise. Raises `ValueError` for sessions of fewer than 20 frames."""
+    """Standardise changes (n, M): subtract their session's median, and divide by their session's deviation.
+
+    All are one session unless `group` (n,) is given. Raises `ValueError` for sessions of fewer than 20 frames.
+    """
     group = np.zeros(len(changes), int) if group is None else np.asarray(group)
     if group.shape != (len(changes),):
         raise ValueError(f"group has shape {group.shape}; give ({len(changes)},), the session of each frame.")
@@ -33,7 +35,7 @@ def standardised(changes: np.ndarray, group) -> np.ndarray:
 
 
 def mean_reference(reference: np.ndarray) -> np.ndarray:
-    """Of every channel; 0 where it has no reading at all."""
+    """Mean reference of every channel; 0 where it has no reading at all."""
     there = np.isfinite(reference)
     return np.where(there, reference, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
 
@@ -41,8 +43,10 @@ def mean_reference(reference: np.ndarray) -> np.ndarray:
 def reference_used(
     reference: np.ndarray | None, mean: np.ndarray | None, used: Bool[np.ndarray, " M"], number: int
 ) -> Float[np.ndarray, "n m"]:
-    """The reference (n, M) of the channels `used`, the `mean` (M,) of those learnt from where it has no reading; zeros
-    where there is none."""
+    """Reference (n, M) of the channels `used`; zeros if there is none.
+
+    Where it has no reading, the `mean` (M,) of the training set is used.
+    """
     if reference is None or mean is None:
         return np.zeros((number, int(used.sum())))
     return np.where(np.isnan(reference), mean, reference)[:, used]

@@ -1,4 +1,4 @@
-"""The few channels that tell most of what is asked."""
+"""Select the few channels that are most informative about the answers."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from jaxtyping import Float, Int
 def choose_channels(
     scaled: Float[np.ndarray, "N m"], answers: Float[np.ndarray, "N q"], number: int
 ) -> Int[np.ndarray, " n"]:
-    """Channels, the most telling first: each explains most of what those before leave of the answers, by least squares
-    (simultaneous orthogonal matching pursuit, Tropp et al. 2006).
+    """Select channels by simultaneous orthogonal matching pursuit (Tropp et al. 2006), the most informative first.
 
-    Answers are told from products too, as places are not linear in voltages: those of the answers with one another.
+    Each explains most of what the previous channels leave unexplained of the answers, by least squares. Products of the
+    answers with one another are explained too, since places are not linear in voltages.
     """
     products = [answers[:, i] * answers[:, j] for i in range(answers.shape[1]) for j in range(i + 1)]
     left = np.column_stack([answers, *(one - one.mean() for one in products[:20])])

@@ -1,9 +1,9 @@
-"""What channels do together, so that one that has died is noticed, and what it would have read is known.
+"""Model the joint variation of channels, to detect dead channels and to predict what they would have read.
 
-Changes of a skin's M channels are scores of a few patterns and noise, d = s (V z + n), with z and n normal. The scores
-of a frame of which some channels are missing are those most likely; a channel is dead where the others foretell it to
-be within so many deviations, and it is not. What it would have read is told from the covariance of all channels, which
-knows more than the patterns do: that reciprocal channels read the same, say.
+Changes of a skin's M channels are modelled by the scores of a few patterns and noise, d = s (V z + n), with z and n
+normal. The scores of a frame with missing channels are the most likely ones; a channel is dead if it differs from the
+others' prediction by more than so many deviations. Its reading is predicted from the covariance of all channels, which
+contains more than the patterns do: for example, that reciprocal channels read the same.
 """
 
 from __future__ import annotations
@@ -16,33 +16,34 @@ from jaxtyping import Bool, Float
 
 from jeit.touch.learnt.neighbourhood import Neighbourhood
 
-# Share of the variance that patterns leave to noise; patterns at most, and presses for each.
+# Share of the variance that patterns leave to noise; the greatest number of patterns; presses required for each.
 _LEFT, _MOST, _PRESSES_EACH = 1e-3, 60, 4
-# A channel is dead beyond so many times what all but a thousandth of the presses that taught had.
+# A channel is dead beyond this multiple of the given quantile of the residuals of training presses.
 _BEYOND, _QUANTILE = 2.0, 0.999
-# Of the span of a channel's changes, beyond it: no channel alive reads that.
+# A channel that is alive does not read beyond its training range by more than this multiple of its span; the greatest
+# share of channels that may do so before the frame counts as unusual instead.
 _SPANS, _FEW = 2.0, 0.1
-# Of the greatest change: what varies less is rounding.
+# Variation below this share of the greatest change is rounding.
 _ROUNDING = 1e-13
-# Added to the covariance, of channels whose variance is 1.
+# Values added to the diagonal of the covariance, of channels whose variance is 1.
 _DIAGONALS = np.logspace(-6, 0, 13)
-# Of channels, before a frame is given up instead.
+# The greatest share of dead channels; beyond it, the search for dead channels stops.
 _MOST_DEAD = 0.34
-# Frames one after the other that lack channels as no other does, before all are taken one by one.
+# The number of consecutive frames with unique sets of missing channels, before all are processed one by one.
 _ALONE = 8
-# Of the distance to the nearest press, in novelty.
+# The novelty of a frame at the usual distance between presses from the nearest one.
 _NEAR = 2 / 1.75
 
 
 @dataclass(frozen=True)
 class Channels:
-    """M channels, of which some are `used` (M,): neither constant nor without readings.
+    """Joint model of M channels, of which some are `used` (M,): those with readings that are not constant.
 
-    For those: `scale` (m,) of changes, `range` (2, m) in scales beyond which none reads that is alive; `patterns`
-    (m, k), `spread` (k,) of scores, `noise` (m,) in scales; `farthest` (m,): residuals that are still those of a
-    channel alive; `directions` (m, r) of the covariance, the `weight` (r,) of each beside a diagonal, and the variance
-    (m,) that channels have about all others, `unforetold`; `usual`: novelty of all but a hundredth of the presses;
-    `neighbourhood`: how near presses are to each other.
+    Of the channels used: `scale` (m,) of changes; `range` (2, m), in scales, beyond which no channel reads that is
+    alive; `patterns` (m, k), `spread` (k,) of scores, `noise` (m,) in scales; `farthest` (m,): the greatest residuals
+    of a channel that is alive; `directions` (m, r) of the covariance, the `weight` (r,) of each relative to a diagonal,
+    and the variance (m,) of channels that all others do not predict, `unforetold`; `usual`: the novelty that all but a
+    hundredth of the presses do not exceed; `neighbourhood`: how near presses are to each other.
     """
 
     used: Bool[np.ndarray, " M"]
@@ -60,7 +61,7 @@ class Channels:
 
     @classmethod
     def learn(cls, changes: Float[np.ndarray, "N M"]) -> "Channels":
-        """From changes (N, M), NaN where there was no reading. Raises `ValueError` where no channel changes."""
+        """Learn from changes (N, M), NaN where there was no reading. Raises `ValueError` where no channel changes."""
         missing = np.isnan(changes)
         used = missing.mean(axis=0) < 0.5
         deviation = np.zeros(changes.shape[1])
@@ -72,7 +73,8 @@ class Channels:
         scale = deviation[used]
         scaled = np.where(missing[:, used], 0.0, changes[:, used]) / scale
         there, half = ~missing[:, used], len(scaled) // 2
-        # What frames not learnt from leave, which is more than those learnt from do: each half by the other's patterns.
+        # Residuals of frames outside the training set are greater than of those in it: each half is evaluated with the
+        # patterns of the other.
         left, apart, misses = [], [], np.zeros((2, len(_DIAGONALS), int(used.sum())))
         for learnt, other in ((slice(None, half), slice(half, None)), (slice(half, None), slice(None, half))):
             variance, directions = _variances(scaled[learnt])
@@ -96,17 +98,20 @@ class Channels:
         return cls(used, scale, far, patterns, spread, noise, farthest, directions, weight, unforetold, usual, near)
 
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Changes (n, m) of the channels used, as foretold by the others where one is dead or has no reading; which
-        are alive (n, m); and novelty (n,), 1 where a frame is as far from those learnt from as the farthest of them."""
+        """Replace changes of dead or missing channels by their prediction from the other channels.
+
+        Returns changes (n, m) of the channels used; which are alive (n, m); and novelty (n,), 1 where a frame is as far
+        from the training set as the farthest frame in it.
+        """
         whole = changes[:, self.used] / self.scale
         given, far = ~np.isnan(whole), (whole < self.range[0]) | (whole > self.range[1])
-        # Where many are, it is the frame that is strange.
+        # Where many channels are out of range, the frame is unusual, not the channels.
         given &= ~far | (far.sum(axis=1, keepdims=True) > max(1, _FEW * whole.shape[1]))
         whole, alive = np.where(given, whole, 0.0), given.copy()
         scores, residual = self._explain_all(whole)
         left, alone = np.flatnonzero((np.abs(residual) > self.farthest).any(axis=1) | ~given.all(axis=1)), 0
         while left.size:
-            # Frames mostly lack the same channels: what one lacks is tried on all that are left.
+            # Most frames lack the same channels: the pattern found for one frame is tried on all that remain.
             pattern = self._alive(whole[left[0]], given[left[0]])
             some = left if alone < _ALONE else left[:1]
             beyond, some_scores, some_residual = self._beyond(whole[some], given[some], pattern)
@@ -123,8 +128,10 @@ class Channels:
         return whole * self.scale, alive, np.maximum(novelty, _NEAR * self.neighbourhood(scores))
 
     def _alive(self, frame: np.ndarray, given: np.ndarray) -> np.ndarray:
-        """Which channels of a frame the others bear out: those borne out least are left out, time and again, and those
-        that what is left bears out taken back."""
+        """Which channels of a frame agree with the prediction from the others.
+
+        Those that agree least are removed repeatedly; then those that agree with the remaining ones are restored.
+        """
         alive, fewest, back = given.copy(), (1 - _MOST_DEAD) * len(frame), False
         while alive.sum() > fewest:
             (beyond,) = self._beyond(frame[None], given[None], alive)[0]
@@ -138,25 +145,32 @@ class Channels:
         return alive
 
     def _beyond(self, whole, given, alive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """How far channels of frames (n, m) are from what those `alive` (m,) foretell, 1 where no farther than ever,
-        infinite where not `given` (n, m); the frames' scores (n, k) and residuals (n, m)."""
+        """Deviations of channels in frames (n, m) from the prediction by those `alive` (m,).
+
+        1 is the greatest deviation of a channel that is alive; infinite where not `given` (n, m). Also returns the
+        frames' scores (n, k) and residuals (n, m).
+        """
         weighted = self.patterns * (alive / self.noise**2)[:, None]
         gain = weighted @ np.linalg.inv(weighted.T @ self.patterns + np.diag(1 / self.spread**2))
         scores = whole @ gain
         residual = (whole - scores @ self.patterns.T) / self.noise
-        free = 1 - np.einsum("ij,ij->i", self.patterns, gain)  # the residual's variance; the rest, a channel explains
+        free = 1 - np.einsum(
+            "ij,ij->i", self.patterns, gain
+        )  # variance of the residual; the channel itself explains the rest
         beyond = np.where(given, np.abs(residual) / np.sqrt(np.maximum(free, 1e-6)) / self.farthest, np.inf)
         return beyond, scores, residual
 
     def _predicted(self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray) -> Float[np.ndarray, "n m-a"]:
-        """What channels that are not `alive` (m,) would most likely have read."""
+        """Predict the most likely readings of channels that are not `alive` (m,)."""
         dead = self.directions[~alive] * self.weight
         predicted = dead @ (alive_readings @ self.directions[alive]).T
         return np.linalg.solve(np.eye(len(dead)) - dead @ self.directions[~alive].T, predicted).T
 
     def unsure(self, alive: Bool[np.ndarray, "n m"], number: int) -> Float[np.ndarray, "q n m"]:
-        """By what the readings foretold may be off, of frames with some channels `alive`: the q ≤ `number` greatest
-        independent deviations, in the unit of changes."""
+        """Errors of predicted readings, of frames with some channels `alive`.
+
+        They are the q ≤ `number` greatest independent deviations, in the unit of changes.
+        """
         found = np.zeros((min(number, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
         patterns, kind = np.unique(alive, axis=0, return_inverse=True)
         for one, pattern in enumerate(patterns):
@@ -176,17 +190,17 @@ class Channels:
 
     @cached_property
     def _gain(self) -> Float[np.ndarray, "m k"]:
-        """From channels, all of them alive, to scores."""
+        """Matrix from channels, all of them alive, to scores."""
         weighted = self.patterns / self.noise[:, None] ** 2
         return np.linalg.solve(weighted.T @ self.patterns + np.diag(1 / self.spread**2), weighted.T).T
 
 
 def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "m r"]]:
-    """Variance of frames along each of the directions, principal ones, the greatest first."""
+    """Principal directions of frames, and the variance along each, the greatest first."""
     number, channels = scaled.shape
     if channels <= number:
         squares, directions = np.linalg.eigh(scaled.T @ scaled)
-    else:  # the fewer products
+    else:  # fewer products
         squares, combined = np.linalg.eigh(scaled @ scaled.T)
         directions = scaled.T @ combined / np.sqrt(np.maximum(squares, 1e-300))
     kept = np.flatnonzero(squares > _ROUNDING * squares[-1])[::-1]
@@ -194,7 +208,7 @@ def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"
 
 
 def _factors(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Patterns (m, k), deviations of their scores, and of the noise that they leave each channel."""
+    """Patterns (m, k), the deviations of their scores, and of the noise that they leave in each channel."""
     explained = np.cumsum(variance) / np.sum(variance)
     number = min(int(np.searchsorted(explained, 1 - _LEFT)) + 1, _MOST, max(1, len(scaled) // _PRESSES_EACH))
     number = min(number, max(1, scaled.shape[1] // 2))
@@ -205,8 +219,11 @@ def _factors(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _missed(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
-    """Mean squares, of covariances with each diagonal: first, of what each channel is missed by when others foretell
-    it; second, of that times its share `free` of the others, the variance that `unsure` takes."""
+    """Mean squared prediction errors of channels, for covariances with each diagonal.
+
+    First, of the error of each channel as predicted by the others; second, of that times the share `free` of the
+    others, the variance that `unsure` uses.
+    """
     scores, found = scaled @ directions, []
     for diagonal in _DIAGONALS:
         weight = variance / (variance + diagonal)
@@ -217,8 +234,10 @@ def _missed(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
 
 
 def _explain(whole, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:
-    """Most likely scores (n, k) of frames (n, m), and what they leave, in deviations of the noise; 0 for channels that
-    are not `alive` (n, m)."""
+    """Most likely scores (n, k) of frames (n, m), and residuals in deviations of the noise.
+
+    Residuals are 0 for channels that are not `alive` (n, m).
+    """
     weighted = patterns / noise[:, None] ** 2
     prior = np.diag(1 / spread**2)
     scores = np.linalg.solve(weighted.T @ patterns + prior, weighted.T @ whole.T).T
@@ -229,6 +248,6 @@ def _explain(whole, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndar
 
 
 def _novelty(scores, residual, alive, spread) -> np.ndarray:
-    """Root mean square of residuals and of scores, each in its own deviations: the larger of the two."""
+    """The greater of the root mean squares of residuals and of scores, each in its own deviations."""
     left = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(alive.sum(axis=1), 1))
     return np.maximum(left, np.sqrt(np.mean((scores / spread) ** 2, axis=1)))

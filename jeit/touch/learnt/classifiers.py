@@ -1,4 +1,4 @@
-"""The nine classifiers that Russo et al. (2017) compare, as scikit-learn has them, and the probabilities of each."""
+"""The nine classifiers that Russo et al. (2017) compare, from scikit-learn, and their class probabilities."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from jeit.touch.learnt.machine import Machine
 from jeit.touch.learnt.nearest import Nearest
 from jeit_solvers import number_of_cores
 
-# Of the paper's ensembles: members, and leaves of a boosted tree.
+# Of the paper's ensembles: numbers of members, and of leaves of a boosted tree.
 _MEMBERS, _LEAVES = 30, 21
-# How far covariances of classes with fewer presses than twice the features are shrunk; and their least variance, beside
-# their greatest.
+# Shrinkage of the covariances of classes with fewer presses than twice the features; and their least variance, relative
+# to their greatest.
 _SHRUNK, _LEAST = 0.1, 1e-4
 
 
 def tree(features, label) -> Any:
-    """A decision tree."""
+    """Fit a decision tree."""
     from sklearn.tree import DecisionTreeClassifier
 
     found = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(features, label)
@@ -30,20 +30,23 @@ def tree(features, label) -> Any:
 
 
 def linear_discriminant(features, label) -> Any:
-    """Normal classes with one covariance, shrunk as Ledoit and Wolf do."""
+    """Fit a linear discriminant: normal classes with one covariance, with Ledoit-Wolf shrinkage."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
     try:
         return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features, label)
     except np.linalg.LinAlgError:
-        # LAPACK's least squares give up on some covariances that are singular, finite as they are.
+        # LAPACK's least squares fail on some singular covariances, although they are finite.
         return LinearDiscriminantAnalysis(solver="eigen", shrinkage="auto").fit(features, label)
 
 
 @dataclass(frozen=True)
 class QuadraticDiscriminant:
-    """Normal classes with a mean (C, k) and a covariance each, of which `whiten` (C, k, k) is the inverse factor and
-    `offset` (C,) the logarithm of the density at the mean and of the class's share (Russo et al. 2017, eq. 1)."""
+    """A quadratic discriminant: normal classes with a mean (C, k) and a covariance each.
+
+    `whiten` (C, k, k) is the inverse factor of the covariance, and `offset` (C,) the logarithm of the density at the
+    mean and of the class's share (Russo et al. 2017, eq. 1).
+    """
 
     mean: Float[np.ndarray, "C k"]
     whiten: Float[np.ndarray, "C k k"]
@@ -52,7 +55,7 @@ class QuadraticDiscriminant:
 
     @classmethod
     def fit(cls, features, label) -> "QuadraticDiscriminant":
-        """Learn the classes; covariances are shrunk towards their mean variance where presses are too few for one."""
+        """Fit the classes; covariances are shrunk towards their mean variance where presses are too few for one."""
         classes, number = np.unique(label, return_inverse=True)
         shrunk, size = shrinkage_of(features, label), features.shape[1]
         everywhere = np.mean(np.var(features, axis=0))
@@ -77,21 +80,21 @@ class QuadraticDiscriminant:
 
 
 def linear_svm(features, label) -> Any:
-    """A support vector machine with linear borders."""
+    """Fit a support vector machine with a linear kernel."""
     from sklearn.svm import SVC
 
     return Machine.of(SVC(kernel="linear").fit(features, label))
 
 
 def quadratic_svm(features, label) -> Any:
-    """A support vector machine with quadratic borders."""
+    """Fit a support vector machine with a quadratic kernel."""
     from sklearn.svm import SVC
 
     return Machine.of(SVC(kernel="poly", degree=2, coef0=1.0).fit(features, label))
 
 
 def boosted_trees(features, label) -> Any:
-    """Trees boosted by AdaBoost, each with one vote, weighted."""
+    """Fit trees boosted by AdaBoost, with one weighted vote each."""
     from sklearn.ensemble import AdaBoostClassifier
     from sklearn.tree import DecisionTreeClassifier
 
@@ -102,7 +105,7 @@ def boosted_trees(features, label) -> Any:
 
 
 def bagged_trees(features, label) -> Any:
-    """Trees on resampled presses, learnt side by side."""
+    """Fit trees to resampled presses, independently of each other."""
     from joblib import parallel_config
     from sklearn.ensemble import BaggingClassifier
     from sklearn.tree import DecisionTreeClassifier
@@ -117,7 +120,7 @@ def bagged_trees(features, label) -> Any:
 
 
 def subspace_discriminant(features, label) -> Any:
-    """Linear discriminants, each on half of the features."""
+    """Fit linear discriminants, each to half of the features."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     from sklearn.ensemble import BaggingClassifier
 
@@ -128,7 +131,8 @@ def subspace_discriminant(features, label) -> Any:
 
 @dataclass(frozen=True)
 class LinearEnsemble:
-    """The mean probability by T linear classifiers, with `weights` (T, C, k) and `intercepts` (T, C)."""
+    """An ensemble of T linear classifiers, with `weights` (T, C, k) and `intercepts` (T, C), whose probabilities are
+    averaged."""
 
     weights: Float[np.ndarray, "T C k"]
     intercepts: Float[np.ndarray, "T C"]
@@ -136,12 +140,12 @@ class LinearEnsemble:
 
     @classmethod
     def of(cls, bagged, number: int) -> "LinearEnsemble":
-        """Of scikit-learn's linear discriminants on some of `number` features each."""
+        """Convert scikit-learn's linear discriminants, each on some of `number` features."""
         members = bagged.estimators_
         weights = np.zeros((len(members), len(bagged.classes_), number))
         intercepts = np.zeros(weights.shape[:2])
         for one, some, weight, intercept in zip(members, bagged.estimators_features_, weights, intercepts, strict=True):
-            binary = len(one.coef_) == 1  # the odds of the second class, of two
+            binary = len(one.coef_) == 1  # two classes: the odds of the second
             weight[-1 if binary else slice(None), some] = one.coef_[0] if binary else one.coef_
             intercept[-1 if binary else slice(None)] = one.intercept_[0] if binary else one.intercept_
         return cls(weights, intercepts, bagged.classes_)
@@ -155,7 +159,7 @@ class LinearEnsemble:
 
 
 def _renumbered(tree, among=None):
-    """A tree whose classes are the numbers of its leaves' shares among all `classes_`."""
+    """Convert a tree so that its classes are indices of its leaves' shares among all `classes_`."""
     tree.classes_ = np.arange(len(tree.classes_)) if among is None else np.searchsorted(among.classes_, tree.classes_)
     return tree
 
@@ -174,14 +178,16 @@ CLASSIFIERS: dict[str, Callable[..., Any]] = {
 
 
 def shrinkage_of(features, label) -> float:
-    """How far covariances of classes are shrunk, 0 where every class has twice as many presses as features."""
+    """Shrinkage of the covariances of classes, 0 where every class has twice as many presses as features."""
     fewest = np.unique(label, return_counts=True)[1].min()
     return _SHRUNK if fewest < 2 * features.shape[1] else 0.0
 
 
 def log_odds(model, features) -> Float[np.ndarray, "n C"]:
-    """What a classifier says for each class (n, C): logarithms of probabilities, alone or beside every other class, or
-    distances from borders."""
+    """A classifier's scores for each class (n, C).
+
+    They are logarithms of probabilities, alone or relative to every other class, or distances from decision boundaries.
+    """
     if hasattr(model, "predict_proba"):
         return np.log(np.maximum(model.predict_proba(features), 1e-6))
     if hasattr(model, "pair_odds"):
@@ -191,14 +197,14 @@ def log_odds(model, features) -> Float[np.ndarray, "n C"]:
 
 
 def probabilities(odds: np.ndarray, sharpness: float) -> Float[np.ndarray, "n C"]:
-    """Of each class (n, C)."""
+    """Probabilities of each class (n, C), from its log-odds times the `sharpness`."""
     scaled = sharpness * odds
     powers = np.exp(scaled - scaled.max(axis=1, keepdims=True))
     return powers / powers.sum(axis=1, keepdims=True)
 
 
 def sharpness_of(odds: np.ndarray, right: np.ndarray) -> float:
-    """With which presses held out, of classes `right` (N,), are likeliest."""
+    """The sharpness that maximises the likelihood of held-out presses, of classes `right` (N,)."""
     candidates = np.geomspace(0.02, 50, 60)
     rows = np.arange(len(right))
     likely = [np.mean(np.log(np.maximum(probabilities(odds, one)[rows, right], 1e-9))) for one in candidates]

@@ -1,4 +1,4 @@
-"""How much of the machine learning takes."""
+"""Control how much of the machine learning uses: threads and memory."""
 
 from __future__ import annotations
 
@@ -14,24 +14,27 @@ from jeit_solvers import number_of_cores
 
 
 def one_thread() -> AbstractContextManager:
-    """Within it libraries keep to one thread: on presses by the thousand, more wait for each other longer than they
-    work."""
+    """Return a context within which libraries use one thread.
+
+    With thousands of presses, more threads wait for each other longer than they work.
+    """
     from threadpoolctl import threadpool_limits
 
-    import_module("sklearn.ensemble")  # only what is loaded is kept to it
+    import_module("sklearn.ensemble")  # only libraries that are loaded are limited
 
     return threadpool_limits(1)
 
 
 def in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
-    """`function` of some rows at a time, joined: what it makes on the way stays small."""
+    """Apply `function` to some rows at a time and concatenate the results, to keep intermediate results small."""
     return np.concatenate([function(rows[some]) for some in _parts(len(rows), at_once)])
 
 
 def over_threads(
     function: Callable[..., dict[str, np.ndarray]], *arrays: np.ndarray, at_once: int
 ) -> dict[str, np.ndarray]:
-    """`function` of some rows of `arrays` at a time, side by side where there are many; the arrays it gives, joined."""
+    """Apply `function` to some rows of `arrays` at a time, in parallel where there are many, and concatenate the
+    arrays."""
     parts = _parts(len(arrays[0]), at_once)
     if len(parts) < 4:
         found = [function(*(one[some] for one in arrays)) for some in parts]
@@ -42,7 +45,7 @@ def over_threads(
 
 
 def over_folds(function: Callable[[int], Any], number: int) -> list[Any]:
-    """`function` of 0 … `number` - 1, side by side, each of them with one thread: OpenMP counts each thread's own."""
+    """Apply `function` to 0 … `number` - 1 in parallel, each with one thread: OpenMP counts each thread's own."""
 
     def alone(fold: int) -> Any:
         with one_thread():

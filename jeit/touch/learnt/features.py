@@ -1,4 +1,4 @@
-"""What a method learns from: changes of the channels in one of several forms, as scores of principal components."""
+"""Compute features from changes of the channels, in one of several forms, as scores of principal components."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jeit.touch.learnt.imaged import Contacts, Imaged, Images
 from jeit.touch.learnt.whitening import Whitened, are_repeated
 
-# Components at most, and presses for each.
+# The greatest number of components, and presses required for each.
 _MOST, _PRESSES_EACH = 60, 3
 
 
@@ -40,7 +40,7 @@ def _shapes(changes, reference, unit):
     return np.hstack([changes / size, np.log(size)])
 
 
-# Changes (n, m), the reference (n, m), and a unit (m,) for each channel, to features.
+# Functions of changes (n, m), the reference (n, m), and a unit (m,) for each channel, that return features.
 FORMS = {
     "differences": _differences,
     "ratios": _ratios,
@@ -48,14 +48,16 @@ FORMS = {
     "normalised": _normalised,
     "shapes": _shapes,
 }
-# What makes a form that is learnt itself, from changes (N, m) and answers (N, d).
+# Functions that fit a learnt form to changes (N, m) and answers (N, d).
 Maker = Callable[[np.ndarray, np.ndarray], Whitened | Contacts | Images]
 
 
 @dataclass(frozen=True)
 class Features:
     """Features of one `form`: standardised by `mean` and `deviation` (p,), then scores of any `components` (p, k).
-    `made`, of a form that is learnt itself, makes them; for others there is a `unit` (m,) of each channel."""
+
+    `made` computes the features of a learnt form; other forms have a `unit` (m,) of each channel.
+    """
 
     form: str
     unit: Float[np.ndarray, " m"]
@@ -74,7 +76,7 @@ class Features:
         made: Whitened | Contacts | Images | None = None,
         rotated: bool = True,
     ) -> "Features":
-        """From changes and their reference; of many numbers components, unless not `rotated`."""
+        """Learn from changes and their reference; many numbers are reduced to components, unless not `rotated`."""
         if made is None:
             unit, values, mean, deviation = standardisation(form, changes, reference)
         else:
@@ -87,15 +89,18 @@ class Features:
         return cls(form, unit, mean, deviation, components, made)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
-        """Scores (n, k) of changes (n, m)."""
+        """Compute the scores (n, k) of changes (n, m)."""
         values = FORMS[self.form](changes, reference, self.unit) if self.made is None else self.made(changes)
         standard = (values - self.mean) / self.deviation
         return standard if self.components is None else standard @ self.components
 
 
 def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of changes (N, m): each channel's unit, its usual size; features (N, p) of the `form`, their mean and deviation,
-    infinite where one never changes."""
+    """Compute how features of a `form` are standardised, from changes (N, m).
+
+    Returns each channel's unit, its usual size; features (N, p) of the form, and their mean and deviation, infinite
+    where one never changes.
+    """
     size = np.abs(changes)
     unit = np.median(size, axis=0)
     unit = np.where(unit > 0, unit, np.mean(size, axis=0))
@@ -110,15 +115,15 @@ def _or_infinite(deviation: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Forms:
-    """The `names` of forms that features can take, and the `makers` of those that are learnt: of frames that repeat
-    others, and of images."""
+    """The `names` of the available forms of features, and the `makers` of learnt forms: of repeated frames, and of
+    images."""
 
     names: tuple[str, ...]
     makers: dict[str, Maker]
 
     @classmethod
     def of(cls, answers: Float[np.ndarray, "N d"], imaged: Imaged | None, *, has_reference: bool) -> "Forms":
-        """Those that can be made, by what is known."""
+        """Select the forms that can be computed from what is known."""
         makers: dict[str, Maker] = {"whitened": Whitened.learn} if are_repeated(answers) else {}
         if imaged is not None:
             makers |= {"contacts": lambda changes, answers: Contacts(imaged)}
@@ -127,6 +132,6 @@ class Forms:
         return cls((*plain, *makers), makers)
 
     def learn(self, form: str, changes, reference, answers, *, rotated: bool = True) -> Features:
-        """Features of one form, see `Features.learn`."""
+        """Learn features of one form, see `Features.learn`."""
         made = self.makers[form](changes, answers) if form in self.makers else None
         return Features.learn(form, changes, reference, made=made, rotated=rotated)

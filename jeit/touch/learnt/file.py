@@ -1,4 +1,4 @@
-"""Learnt skins as files: arrays and scikit-learn's estimators as skops keeps them, never a pickle."""
+"""Read and write learnt skins: arrays and scikit-learn's estimators in skops' format, never a pickle."""
 
 from __future__ import annotations
 
@@ -62,16 +62,16 @@ _OURS = {
 
 
 def write_skin(skin: LearntSkin, path: str | Path) -> None:
-    """Write a learnt skin to one file, without how well it was learnt. Raises `ValueError` for a folder."""
+    """Write a learnt skin to one file, without its `standing`. Raises `ValueError` for a folder."""
     own = {one.name: getattr(skin, one.name) for one in fields(skin) if one.name != "standing"}
     write_plain(path, _KIND, _VERSION, own, "skin.skops")
 
 
 def read_skin(path: str | Path) -> LearntSkin:
-    """The skin of a file, or of the folder that `jeit touch fit` made.
+    """Read a learnt skin from a file, or from the folder that `jeit touch fit` made.
 
     Nothing in the file is executed: it holds numbers, and estimators of scikit-learn. Raises `FileNotFoundError`, and
-    `ValueError` for files of another kind, and such as hold anything else.
+    `ValueError` for files of another kind, and those that hold anything else.
     """
     path = Path(path)
     if path.is_dir():
@@ -82,8 +82,10 @@ def read_skin(path: str | Path) -> LearntSkin:
 
 
 def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], example: str) -> None:
-    """Write what an object holds, by name, to one file: arrays, estimators, and objects of this room's classifiers.
-    Raises `ValueError` for a folder; `example`: a file's name, that is told then."""
+    """Write the fields of an object, by name, to one file: arrays, estimators, and objects of our own classifiers.
+
+    Raises `ValueError` for a folder; `example`: a file name that the message suggests.
+    """
     need_extra("learn", "a file of a learnt skin")
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
@@ -92,8 +94,11 @@ def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], 
 
 
 def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[dict[str, Any]], Any]) -> Any:
-    """Undo `write_plain`: what `make` makes of it. Nothing in the file is executed. Raises `ValueError`, which says
-    that it is no such thing as is `said`, for files of another kind, and such as hold anything else."""
+    """Read a file that `write_plain` wrote, and return what `make` makes of its fields.
+
+    Nothing in the file is executed. Raises `ValueError`, which states that it is not what `said` names, for files of
+    another kind, and those that hold anything else.
+    """
     need_extra("learn", "a file of a learnt skin")
     from skops.io import get_untrusted_types, load
 
@@ -110,12 +115,12 @@ def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[d
         check_seal(path)
         own: Any = _whole(content["skin"])
         return make(own)
-    except Exception as error:  # of any kind: classes of many packages are made of what the file says
+    except Exception as error:  # of any kind: classes of many packages are made from the file
         raise ValueError(f"'{path}' is not a {said} that can be read ({reason(error)}); fit it again.") from None
 
 
 def _plain(value):
-    """Our own objects as dictionaries of what they hold."""
+    """Convert objects of our own classes to dictionaries of their fields."""
     if type(value).__name__ in _OURS and type(value) is _OURS[type(value).__name__]:
         return {"jeit": type(value).__name__, **{one.name: _plain(getattr(value, one.name)) for one in fields(value)}}
     if isinstance(value, dict):
@@ -126,7 +131,7 @@ def _plain(value):
 
 
 def _whole(value):
-    """And back."""
+    """Undo `_plain`."""
     if isinstance(value, dict):
         held = {key: _whole(one) for key, one in value.items() if key != "jeit"}
         return _OURS[value["jeit"]](**held) if "jeit" in value else held

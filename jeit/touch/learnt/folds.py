@@ -1,4 +1,4 @@
-"""Folds of cross-validation for skins that drift: stretches of time, groups and repeated frames never split."""
+"""Cross-validation folds for skins that drift: intervals of time, which never split groups and repeated frames."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 NUM_FOLDS = 5
-# Presses held out may be so many times farther from the others' places than presses of a random fold.
+# The greatest ratio of the distance of held-out presses from the others' places to that of a random fold.
 _FARTHER = 2.0
-# Places are repeated where there are fewer, beside the presses.
+# Places are repeated if the ratio of their number to that of the presses is lower.
 _REPEATED = 0.7
 
 
@@ -22,13 +22,13 @@ def time_folds(
     kinds: np.ndarray | None = None,
     number: int = NUM_FOLDS,
 ) -> tuple[Int[np.ndarray, " N"], tuple[str, ...]]:
-    """The fold (N,) that each press is held out in, and notes.
+    """Assign each press to the fold (N,) in which it is held out; returns folds and notes.
 
-    Presses in order of `time`, or as recorded, are cut into `number` stretches. Where that leaves out places (`alike`,
-    numbers (N, d)) or `kinds` (N,) or (N, K) altogether, as when one was pressed after the other, into more and shorter
-    ones, dealt out in turn. With a `group`, groups in order of their mean time. Presses with one and the same frame,
-    and at one and the same place (d > 1), go to one fold: they would tell each other's answer, as no press between
-    places could.
+    Presses in order of `time`, or as recorded, are cut into `number` intervals. If these leave out places (`alike`,
+    numbers (N, d)) or `kinds` (N,) or (N, K) altogether, as when one was pressed after the other, presses are cut into
+    more and shorter intervals, which are assigned to the folds in turn. With a `group`, groups are taken in order of
+    their mean time. Presses with the same frame, and at the same place (d > 1), are in one fold: otherwise the answer
+    of one would be known from the other, as is never the case for presses between places.
     """
     count = len(frames)
     order = np.arange(count) if time is None else np.argsort(time, kind="stable")
@@ -72,7 +72,7 @@ def time_folds(
 
 
 def _dealt(unit: np.ndarray, rank: np.ndarray, number: int, stretches: int) -> Int[np.ndarray, " N"]:
-    """Folds of units of presses: stretches of their order, dealt out in turn."""
+    """Assign units of presses to folds: intervals of their order, in turn."""
     sizes = np.bincount(unit)
     by_time = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
     middles = np.cumsum(sizes[by_time]) - sizes[by_time] / 2
@@ -82,7 +82,7 @@ def _dealt(unit: np.ndarray, rank: np.ndarray, number: int, stretches: int) -> I
 
 
 def _dealt_by_kind(rank: np.ndarray, kinds: np.ndarray, number: int) -> Int[np.ndarray, " N"]:
-    """Folds of presses of each kind in turn, where some kinds are rare."""
+    """Assign presses of each kind to folds in turn, where some kinds are rare."""
     fold = np.empty(len(kinds), int)
     for kind in np.unique(kinds):
         own = np.flatnonzero(kinds == kind)
@@ -91,7 +91,7 @@ def _dealt_by_kind(rank: np.ndarray, kinds: np.ndarray, number: int) -> Int[np.n
 
 
 def _covered(fold: np.ndarray, alike: np.ndarray | None, kinds: np.ndarray | None) -> bool:
-    """Whether what is held out is like what is not."""
+    """Whether held-out presses are similar to those in the training set."""
     if kinds is not None and kinds.ndim == 2:
         return all(_covered(fold, None, column) for column in kinds.T)
     if kinds is not None:
@@ -103,13 +103,13 @@ def _covered(fold: np.ndarray, alike: np.ndarray | None, kinds: np.ndarray | Non
 
 
 def _farthest(alike: np.ndarray, fold: np.ndarray) -> float:
-    """Mean distance of what is held out from what is not, of the fold where it is greatest."""
+    """Mean distance of held-out presses from the others, in the fold where it is greatest."""
     unit = alike.std(axis=0).max() or 1.0
     return max(KDTree(alike[fold != one]).query(alike[fold == one])[0].mean() + 1e-3 * unit for one in np.unique(fold))
 
 
 def _joined(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Numbers of the sets that hang together, where two are one if they share either number."""
+    """Number the connected sets, where two elements are connected if they share either number."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

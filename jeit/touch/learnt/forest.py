@@ -1,4 +1,4 @@
-"""Decision trees as arrays, all walked down side by side, where scikit-learn takes milliseconds for one frame."""
+"""Decision trees as arrays, all evaluated in parallel: scikit-learn takes milliseconds for one frame."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ from jaxtyping import Float, Int
 
 from jeit.touch.learnt.extras import in_parts
 
-# Frames walked down at once: what they look up stays in the cache.
+# The number of frames evaluated at once, so that the data stay in the cache.
 _AT_ONCE = 128
 
 
 @dataclass(frozen=True)
 class Forest:
-    """T trees of up to n nodes: the `feature` (T, n) that each node asks for, its `threshold`; the nodes to go on to,
-    `left` where it is not above that, else `right`, leaves to themselves; and the `value` (T, n, d) of leaves, of which
-    the sum and `start` (d,) are the answer. `depth` steps lead to a leaf. `classes_` (d,), for classifiers."""
+    """T decision trees of up to n nodes.
+
+    `feature` (T, n) and `threshold` (T, n) of each node; `left` and `right` (T, n): the next nodes where the feature is
+    not above the threshold, and where it is; leaves lead to themselves. `value` (T, n, d) of leaves: the sum of these
+    and `start` (d,) are the answer. `depth`: the number of steps to a leaf. `classes_` (d,), for classifiers.
+    """
 
     feature: Int[np.ndarray, "T n"]
     threshold: Float[np.ndarray, "T n"]
@@ -30,15 +33,15 @@ class Forest:
     classes_: np.ndarray
 
     def __post_init__(self):
-        """Raises `ValueError` for a depth that trees of so many nodes do not have."""
+        """Check the depth. Raises `ValueError` for a depth that trees of so many nodes do not have."""
         if not 0 <= self.depth <= self.value.shape[1]:
             raise ValueError(f"depth is {self.depth}, of trees of {self.value.shape[1]} nodes.")
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """What the trees add up to."""
+        """Sum of the trees' values."""
         trees, size, targets = self.value.shape
         first_node = size * np.arange(trees)
-        # Nodes are numbered throughout, and all arrays flat: `take` is quicker than indices of two axes.
+        # Nodes are numbered throughout, and all arrays flat: `take` is faster than indexing two axes.
         feature, threshold = self.feature.ravel(), self.threshold.ravel()
         below, above = ((one + first_node[:, None]).ravel() for one in (self.left, self.right))
         value = self.value.reshape(-1, targets)
@@ -60,7 +63,7 @@ class Forest:
 
     @classmethod
     def of_boosted(cls, models: list[Any]) -> "Forest":
-        """Of scikit-learn's histogram gradient boosting, one model for each of d targets."""
+        """Convert scikit-learn's histogram gradient boosting, one model for each of d targets."""
         trees = []
         for target, model in enumerate(models):
             for (one,) in model._predictors:
@@ -74,8 +77,10 @@ class Forest:
 
     @classmethod
     def of_boosted_classes(cls, model: Any) -> "Forest":
-        """Of scikit-learn's classifier of that kind: log-odds of its classes; of two, those of the second halved, and
-        the first's the same, negative."""
+        """Convert scikit-learn's histogram gradient boosting classifier, to log-odds of its classes.
+
+        Of two classes, the second has half of the model's log-odds, and the first the same with a negative sign.
+        """
         trees, number = [], len(model.classes_)
         for one in model._predictors:
             for target, tree in enumerate(one):
@@ -90,7 +95,7 @@ class Forest:
 
     @classmethod
     def of_averaged(cls, models: list[Any]) -> "Forest":
-        """Of scikit-learn's regression trees: their mean."""
+        """Convert scikit-learn's regression trees, whose mean is taken."""
         trees = []
         for model in models:
             one = model.tree_
@@ -102,7 +107,7 @@ class Forest:
 
     @classmethod
     def of_trees(cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool) -> "Forest":
-        """Of scikit-learn's classification trees: their leaves' shares of the classes, or whole `votes`, weighted."""
+        """Convert scikit-learn's classification trees: their leaves' class shares, or whole `votes`, weighted."""
         trees = []
         for model, weight in zip(models, weights, strict=True):
             one = model.tree_
@@ -117,7 +122,7 @@ class Forest:
 
     @classmethod
     def of_stumps(cls, model: Any) -> "Forest":
-        """Of a `LogitBoostClassifier`: a tree for each stump, what each adds to all classes."""
+        """Convert a `LogitBoostClassifier`: a tree for each stump, with its contribution to all classes."""
         rounds, number = model.feature_.shape
         trees = []
         for one, kind in np.ndindex(rounds, number):

@@ -1,4 +1,4 @@
-"""Gaussian-process regression: smooth functions of the features, by few centres where presses are many."""
+"""Gaussian-process regression: smooth functions of the features, with few centres where presses are many."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from scipy.spatial.distance import cdist
 
 from jeit.touch.learnt.extras import in_parts
 
-# Presses that length and noise are found on; centres at most (all presses, if there are no more).
+# The number of presses from which length and noise are estimated; the greatest number of centres (all presses, if there
+# are no more).
 _TUNED_ON, _CENTRES = 400, 640
 _AT_ONCE = 512
 
 
 @dataclass(frozen=True)
 class GaussianProcess:
-    """Σ `weights` (m, d) × kernel of the distance from `centres` (m, k), in `length`s: Matérn's of order 3/2,
-    (1 + √3 r) e^(−√3 r).
+    """A Gaussian process: Σ `weights` (m, d) × kernel of the distance from `centres` (m, k), in `length`s.
 
-    Length and noise are those of the greatest marginal likelihood, Rasmussen and Williams (2006), eq. 5.8; centres,
-    where they are fewer than presses, those of the subset of regressors, section 8.3.1.
+    The kernel is Matérn's of order 3/2, (1 + √3 r) e^(−√3 r). Length and noise maximise the marginal likelihood,
+    Rasmussen and Williams (2006), eq. 5.8; where there are fewer centres than presses, the method is the subset of
+    regressors, section 8.3.1.
     """
 
     centres: Float[np.ndarray, "m k"]
@@ -32,7 +33,7 @@ class GaussianProcess:
 
     @classmethod
     def fit(cls, features, targets) -> "GaussianProcess":
-        """Learn standardised `targets` (N, d) from `features` (N, k)."""
+        """Fit standardised `targets` (N, d) to `features` (N, k)."""
         order = np.random.default_rng(0).permutation(len(features))
         some = order[:_TUNED_ON]
         length, noise = _tuned(features[some], targets[some])
@@ -48,7 +49,7 @@ class GaussianProcess:
         return cls(centres, cho_solve(cho_factor(matrix), load), length)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Targets (n, d)."""
+        """Predict targets (n, d)."""
         scaled = self.centres / self.length
         squares = np.sum(scaled**2, axis=1)
 
@@ -66,7 +67,8 @@ def _kernel(distance: np.ndarray) -> np.ndarray:
 
 
 def _tuned(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
-    """Length, and variance of the noise beside that of the function, whose own variance is solved for."""
+    """Estimate the length, and the ratio of the noise's variance to that of the function, whose own variance is solved
+    for."""
     apart = cdist(features, features)
     usual = float(np.sqrt(np.mean(apart**2))) or 1.0
 

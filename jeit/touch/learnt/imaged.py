@@ -1,4 +1,4 @@
-"""What the model of a skin makes of changes of its voltages: a linear image, and the strongest contact in it."""
+"""Compute linear images from changes of voltages with a model of the skin, and the strongest contact in each."""
 
 from __future__ import annotations
 
@@ -15,17 +15,19 @@ from jeit.mesh import centroids, measures
 from jeit.touch.learnt.extras import in_parts
 from jeit_solvers.engines import as_array
 
-# A contact is what exceeds this share of its peak, among so many of all cells, those nearest to the peak.
+# A contact is the region above this share of its peak, among the cells nearest to the peak, this share of all.
 _LEVEL, _ROUND = 0.7, 0.2
-# Beside the image, where all cells weigh one, each number that tells the contact weighs so much.
+# The weight of each number that describes the contact, where each cell of the image weighs one.
 _WEIGHT = 3.0
 _AT_ONCE = 128
 
 
 @dataclass(frozen=True)
 class Imaged:
-    """Images in c cells of changes of m channels, `matrix` (m, c), touches positive; the cells' `centres` (c, d) metres
-    and `sizes` (c,); `around` (c, k), the cells nearest to each."""
+    """Linear images in c cells of changes of m channels, by `matrix` (m, c); touches are positive.
+
+    `centres` (c, d), metres, and `sizes` (c,) of the cells; `around` (c, k): the cells nearest to each.
+    """
 
     matrix: Float[np.ndarray, "m c"]
     centres: Float[np.ndarray, "c d"]
@@ -36,11 +38,14 @@ class Imaged:
     def create(
         cls, model: ForwardModel, changes: Float[np.ndarray, "N m"], used: Bool[np.ndarray, " M"], reference
     ) -> tuple["Imaged", list[str]]:
-        """One-step images by a model calibrated on the `reference` (M,), if there is one, of the channels `used`; with
-        notes. Which sign touches have is taken from the changes of presses."""
+        """Create one-step images of the channels `used`, with a model calibrated on the `reference` (M,), if there is
+        one.
+
+        Also returns notes. The sign of touches is determined from the changes of presses.
+        """
         notes, conductivity, mask = [], 1.0, as_array(used)
         if reference is not None and np.abs(reference[used]).max() > 0:
-            turned = np.sign(np.where(used, model.voltages(1.0), 0.0) @ reference)  # -1 where polarity is
+            turned = np.sign(np.where(used, model.voltages(1.0), 0.0) @ reference)  # -1 where the polarity is reversed
             found = calibrate(model, as_array(turned * reference), mask=mask, contact="fixed")
             if np.isfinite(found.misfit):
                 model, conductivity = found.model, found.conductivity
@@ -53,7 +58,8 @@ class Imaged:
         return cls(sign * matrix, centres, sizes, np.reshape(around, (len(centres), -1))), notes
 
     def contacts(self, images: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d+3"]:
-        """Of the strongest contact of each image: its centroid (d), and the logarithms of peak, integral and size."""
+        """Describe the strongest contact of each image: its centroid (d), and the logarithms of peak, integral and
+        size."""
         row = np.arange(len(images))[:, None]
         cells = self.around[images.argmax(axis=1)]
         near, sizes = images[row, cells], self.sizes[cells]
@@ -72,22 +78,22 @@ class Contacts:
     imaged: Imaged
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
-        """Features (n, p) of changes (n, m)."""
+        """Compute the features (n, p) of changes (n, m)."""
         return in_parts(lambda some: self.imaged.contacts(some @ self.imaged.matrix), changes, _AT_ONCE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """What one of each feature is: its own deviation."""
+        """The unit of each feature: its own deviation."""
         return values.std(axis=0)
 
 
 @dataclass(frozen=True)
 class Images:
-    """Features: the strongest contact, and the image relative to its own size, with the logarithm of that."""
+    """Features: the strongest contact, and the image relative to its own size, with the logarithm of that size."""
 
     imaged: Imaged
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
-        """Features (n, p) of changes (n, m)."""
+        """Compute the features (n, p) of changes (n, m)."""
 
         def features(some: np.ndarray) -> np.ndarray:
             image = some @ self.imaged.matrix
@@ -97,7 +103,7 @@ class Images:
         return in_parts(features, changes, _AT_ONCE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """What one of each feature is: of the contact a part of its own deviation, of cells that of all."""
+        """The unit of each feature: for the contact a share of its own deviation, for cells that of all."""
         number = values.shape[1] - len(self.imaged.sizes)
         own = values.std(axis=0)
         return np.concatenate([own[:number] / _WEIGHT, np.full(len(own) - number, np.sqrt(np.mean(own[number:] ** 2)))])

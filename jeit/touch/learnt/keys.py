@@ -1,4 +1,4 @@
-"""Which keys are pressed, several at once: a classifier for each key, the one that errs least on presses held out."""
+"""Classify which keys are pressed, several at once: each key by the classifier most accurate on held-out presses."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from jeit.touch.learnt.forest import Forest
 
 _STRENGTHS = (1e-3, 1e-2, 1e-1, 1.0)
 _FORMS = ("differences", "compressed")
-# Channels that tell one key from the others best, for methods that take few.
+# The number of channels that best separate one key from the others, for methods that use few; the number of trees.
 _FEW, _TREES = 200, 150
 _TREE: dict[str, Any] = {"max_features": 0.3, "min_samples_leaf": 2, "random_state": 0}
 
 
 @dataclass(frozen=True)
 class Standardised:
-    """Features of one `form` in their own units: all of them, or those numbered `chosen`."""
+    """Standardised features of one `form`: all of them, or those numbered `chosen`."""
 
     form: str
     unit: Float[np.ndarray, " m"]
@@ -33,12 +33,12 @@ class Standardised:
 
     @classmethod
     def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "Standardised":
-        """From changes (N, m) and their reference."""
+        """Learn from changes (N, m) and their reference."""
         unit, _, mean, deviation = standardisation(form, changes, reference)
         return cls(form, unit, mean, deviation)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """Features (n, p) of changes (n, m)."""
+        """Compute the features (n, p) of changes (n, m)."""
         values = (FORMS[self.form](changes, reference, self.unit) - self.mean) / self.deviation
         return values if self.chosen is None else values[:, self.chosen]
 
@@ -50,7 +50,7 @@ class LearntKeys:
     members: list[tuple[Standardised, Any, float]]
 
     def predict(self, changes, reference) -> tuple[Bool[np.ndarray, "n K"], Float[np.ndarray, "n K"]]:
-        """Which keys are pressed, and how probable it is that each is."""
+        """Predict which keys are pressed, and the probability of each."""
         odds = [log_odds(model, features(changes, reference)) for features, model, _ in self.members]
         said = [probabilities(one, sharp)[:, 1] for one, (_, _, sharp) in zip(odds, self.members, strict=True)]
         probability = np.column_stack(said)
@@ -59,7 +59,7 @@ class LearntKeys:
 
 @dataclass(frozen=True)
 class TriedKeys:
-    """Methods, one for each key, and what they said of presses held out (N, K)."""
+    """Methods, one for each key, and their predictions for held-out presses (N, K)."""
 
     methods: list[str]
     held_out: Bool[np.ndarray, "N K"]
@@ -74,7 +74,8 @@ def learn_keys(
     *,
     progress: Callable[[str], None] = lambda said: None,
 ) -> tuple[LearntKeys, TriedKeys]:
-    """Learn which of K keys are pressed from changes (N, m); each by the method that errs least on `folds` held out."""
+    """Learn to classify which of K keys are pressed from changes (N, m); each by the method with the least error on
+    `folds`."""
     reference = np.zeros_like(changes) if reference is None else reference
     number, keys = touched.shape
     odds = {name: np.empty((number, keys)) for name in _candidates()}
@@ -84,11 +85,11 @@ def learn_keys(
         for form in _FORMS:
             features = Standardised.learn(form, changes[~out], reference[~out])
             learnt, asked = features(changes[~out], reference[~out]), features(changes[out], reference[out])
-            rotation = np.linalg.svd(learnt, full_matrices=False)[2].T  # nothing linear is lost, and much time won
+            rotation = np.linalg.svd(learnt, full_matrices=False)[2].T  # loses nothing linear, and saves much time
             linear = learnt @ rotation, asked @ rotation
             for key in range(keys):
                 answers = touched[~out, key].astype(int)
-                if answers.min() == answers.max():  # all its presses, or all without, are held out
+                if answers.min() == answers.max():  # all presses of the key, or all without it, are held out
                     for name in odds:
                         odds[name][out, key] = 2.0 * answers[0] - 1
                     continue
@@ -99,7 +100,7 @@ def learn_keys(
                         model = _logistic(linear[0], answers, strength)
                         odds[name][out, key] = model.decision_function(linear[1])
                     else:
-                        few = _telling(learnt, answers)
+                        few = _discriminative(learnt, answers)
                         model = _METHODS[needs](learnt[:, few], answers)
                         said = log_odds(model, asked[:, few])
                         odds[name][out, key] = said[:, 1] - said[:, 0]
@@ -109,7 +110,7 @@ def learn_keys(
     members, methods, held_out = [], [], np.empty((number, keys), bool)
     for key in range(keys):
         right = touched[:, key]
-        # The most likely answers, not the fewest errors, which many share.
+        # The method with the greatest likelihood, not the fewest errors, of which many have the same number.
         name = min(odds, key=lambda name: _loss(odds[name][:, key], right))
         methods.append(name)
         held_out[:, key] = odds[name][:, key] > 0
@@ -119,7 +120,7 @@ def learn_keys(
 
 
 def _candidates() -> dict[str, tuple[str, float]]:
-    """Methods by name: what they are, and how strongly they fit."""
+    """Candidate methods by name: their kind, and the strength of the fit."""
     found = {}
     for form in _FORMS:
         found |= {f"logistic, C = {strength:g} on {form}": ("linear", strength) for strength in _STRENGTHS}
@@ -135,13 +136,13 @@ def _member(name: str, changes, reference, answers, odds) -> tuple[Standardised,
     sharp = sharpness_of(np.column_stack([np.zeros(len(odds)), odds]), answers)
     if needs == "linear":
         return features, _unrotated(values, answers, strength), sharp
-    few = _telling(values, answers)
+    few = _discriminative(values, answers)
     chosen = Standardised(features.form, features.unit, features.mean, features.deviation, few)
     return chosen, _METHODS[needs](values[:, few], answers), sharp
 
 
 def _unrotated(values, answers, strength):
-    """Logistic regression in the rotated features, told for those given."""
+    """Fit logistic regression to rotated features, and convert its coefficients to the given features."""
     rotation = np.linalg.svd(values, full_matrices=False)[2].T
     model = _logistic(values @ rotation, answers, strength)
     model.coef_ = model.coef_ @ rotation.T
@@ -171,15 +172,15 @@ def _trees(values, answers):
 _METHODS = {"discriminant": _discriminant, "trees": _trees}
 
 
-def _telling(values: np.ndarray, answers: np.ndarray) -> np.ndarray:
-    """Features that differ most between the two answers, beside their spread within each."""
+def _discriminative(values: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Select the features that differ most between the two answers, relative to their spread within each."""
     one, other = values[answers == 1], values[answers == 0]
     within = np.sqrt((one.var(axis=0) * len(one) + other.var(axis=0) * len(other)) / len(values))
     return np.sort(np.argsort(-np.abs(one.mean(axis=0) - other.mean(axis=0)) / np.maximum(within, 1e-12))[:_FEW])
 
 
 def _loss(odds: np.ndarray, right: np.ndarray) -> float:
-    """Errors, and by a little the unlikelihood of the answers with their best sharpness."""
+    """Error rate, plus a small multiple of the negative log-likelihood of the answers at the best sharpness."""
     columns = np.column_stack([np.zeros(len(odds)), odds])
     sharp = sharpness_of(columns, right.astype(int))
     likely = probabilities(columns, sharp)[np.arange(len(right)), right.astype(int)]

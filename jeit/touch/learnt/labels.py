@@ -1,4 +1,4 @@
-"""Labels learnt from frames: the classifier that is right most often on presses held out."""
+"""Learn labels of frames, by the classifier most accurate on held-out presses."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ _QUICK = "linear-discriminant"
 
 @dataclass(frozen=True)
 class TriedLabels:
-    """A `method` on a `form` of the features: what it held for right (N,) of presses held out, its log-odds (N, C), and
-    the share of errors."""
+    """A `method` on a `form` of the features, and its results on held-out presses.
+
+    They are the predicted labels (N,), the log-odds (N, C), and the share of errors.
+    """
 
     method: str
     form: str
@@ -41,7 +43,7 @@ class LearntLabels:
     notes: list[str]
 
     def predict(self, changes, reference) -> tuple[np.ndarray, Float[np.ndarray, " n"]]:
-        """Labels (n,) and how probable each is (n,)."""
+        """Predict labels (n,) and the probability of each (n,)."""
         odds = log_odds(self.model, self.features(changes, reference))
         return self.classes[odds.argmax(axis=1)], probabilities(odds, self.sharpness).max(axis=1)
 
@@ -56,11 +58,11 @@ def learn_labels(
     imaged: Imaged | None = None,
     progress: Callable[[str], None] = lambda said: None,
 ) -> tuple[LearntLabels, list[TriedLabels]]:
-    """Learn `label` (N,) from changes (N, m), their reference, and images of them where there are any, by `method`, or
-    the one of the nine that errs least.
+    """Learn `label` (N,) from changes (N, m), their reference, and images of them where there are any.
 
-    Of every one tried, in order of its errors on `folds` (N,) held out: what it said. The form of the features is the
-    one that suits the linear discriminant best.
+    By `method`, or by the one of the nine with the least error. Also returns the predictions of every method that was
+    tried, in order of their errors on `folds` (N,). The form of the features is the one that suits the linear
+    discriminant best.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference

@@ -1,4 +1,4 @@
-"""Whether frames were recorded some rows before or after the presses that they are of."""
+"""Detect whether frames were recorded some rows before or after the presses that they belong to."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from scipy.spatial import KDTree
 from jeit.touch.learnt.features import Features
 
 _MOST, _NEIGHBOURS, _COMPONENTS = 2, 8, 12
-# Places told from frames as they are must be no better than a guess, and by one lag better than that, and than by any
-# other, by so many standard errors.
+# A lag is found if the error of places estimated without one is at least this share of that of a guess, that with the
+# lag is less, and that with any other lag is greater by this many standard errors.
 _GUESS, _STANDARD_ERRORS = 0.95, 4.0
 
 
 def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tuple[int, float, float]:
-    """By how many rows frames come after their presses, 0 unless that is plain; and the mean error of places told by
-    the nearest frames with none and with that lag, metres."""
+    """Estimate by how many rows frames come after their presses, 0 unless there is clear evidence.
+
+    Also returns the mean error of places estimated from the nearest frames without a lag and with it, metres.
+    """
     features = Features.learn("normalised", changes, np.zeros_like(changes))
     scores = features(changes, np.zeros_like(changes))[:, :_COMPONENTS]
     errors = {lag: _errors(scores, positions, folds, lag) for lag in range(-_MOST, _MOST + 1)}
@@ -29,7 +31,7 @@ def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tup
 
 
 def shifted(number: int, lag: int) -> tuple[slice, slice]:
-    """Rows of frames, and of what touched in them, of `number` that were recorded with a lag."""
+    """Rows of frames, and of their presses, among `number` rows that were recorded with a lag."""
     return slice(max(lag, 0), number + min(lag, 0)), slice(max(-lag, 0), number - max(lag, 0))
 
 

@@ -1,4 +1,4 @@
-"""A skin that has learnt, from recorded presses, to tell where, how hard and by what it is touched."""
+"""`LearntSkin`: a model learnt from recorded presses that estimates where, how hard and by what a skin is touched."""
 
 from __future__ import annotations
 
@@ -28,25 +28,27 @@ from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.presses import NO_TOUCH, Presses, check_frames, check_reference
 from jeit.touch.learnt.touches import Touches
 
-# A frame is unlike any learnt from beyond so many times the novelty of the farthest of them, or with fewer channels.
+# A frame is unlike the training set beyond this novelty, 1 for the farthest frame in it; or if a smaller share of its
+# channels is alive.
 _UNLIKE, _FEWEST = 2.0, 0.66
 _AT_ONCE = 256
-# Ways in which readings that are foretold may be off, whose effect is looked at: those that matter most.
+# The number of error directions of predicted readings whose effect is computed, the greatest first.
 _UNSURE = 4
-# Touched frames in which a channel that is alive does not read the same.
+# The number of touched frames in which a channel that is alive does not read the same.
 _MANY = 20
-# A reference is another skin's if it is less like those learnt from than this, or of another size.
+# A reference is another skin's if it is less similar to those of the training set, or if its size differs by this
+# factor.
 _ALIKE, _SIZES = 0.8, 5.0
 
 
 @dataclass(frozen=True)
 class LearntSkin:
-    """What was learnt, each None if presses did not say it; make it with `LearntSkin.fit`.
+    """Models learnt from presses, each None if the presses do not have the quantity; make it with `LearntSkin.fit`.
 
-    `channels`: what they do together. `place`, `force`, `label`, `keys`: what tells each. `quiet`: frames whose changes
-    are smaller, of the channels' scales, are of an untouched skin. `mean_reference` (M,). `lag`: rows by which frames
-    came after their presses in the recording. `per_session`: changes are standardised by session. `standing`: how well
-    each was learnt, on presses held out; `notes`: what was mended.
+    `channels`: their joint model. `place`, `force`, `label`, `keys`: the models of each quantity. `quiet`: frames with
+    smaller changes, in the channels' scales, are of an untouched skin. `mean_reference` (M,). `lag`: rows by which
+    frames came after their presses in the recording. `per_session`: whether changes are standardised by session.
+    `standing`: how well each was learnt, on held-out presses; `notes`: what was corrected.
     """
 
     channels: Channels
@@ -75,12 +77,12 @@ class LearntSkin:
     ) -> "LearntSkin":
         """Learn from recorded presses.
 
-        `method`: "auto" takes what errs least on presses held out, in stretches of time; or one of `METHODS`, for what
-        it can learn. `model` of the skin, if one is known, of some hundred nodes: its images of the changes, and the
-        contacts in them, are learnt from too. `num_channels`: only so many, those that tell most, are used.
-        `per_session`: changes of each `group` are standardised by themselves, against drift. `progress` is called with
-        what is being tried. Raises `ValueError` for another method, one that cannot learn what the presses say, presses
-        that nothing can be learnt from, and a model of another number of channels.
+        `method`: "auto" chooses what has the least error on held-out presses, in intervals of time; or one of
+        `METHODS`, for what it can learn. `model` of the skin, if one is known, of some hundred nodes: its images of the
+        changes, and the contacts in them, are used as features too. `num_channels`: only so many channels, the most
+        informative, are used. `per_session`: changes of each `group` are standardised by themselves, against drift.
+        `progress` is called with what is being tried. Raises `ValueError` for another method, one that cannot learn
+        what the presses have, presses that nothing can be learnt from, and a model of another number of channels.
         """
         _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
@@ -134,12 +136,12 @@ class LearntSkin:
         )
 
     def predict(self, frames: ArrayLike, reference: ArrayLike | None = None, group: ArrayLike | None = None) -> Touches:
-        """Touches of frames (n, M), with the `reference` (M,) or (n, M) if there was one in the presses learnt from,
-        and the session of each (`group`) if sessions are standardised.
+        """Predict the touches of frames (n, M).
 
-        Channels that have died since are found and done without; frames unlike any learnt from are said to be, and
-        nothing else of them. Raises `ValueError` for frames of another number of channels, a reference that is missing,
-        superfluous or another skin's.
+        `reference` (M,) or (n, M) is required if the training presses had one, and the session of each frame (`group`)
+        if sessions are standardised. Channels that have died since are detected and replaced; frames unlike the
+        training set are marked, and have no other prediction. Raises `ValueError` for frames of another number of
+        channels, a reference that is missing, superfluous or another skin's.
         """
         frames = self._check(frames)
         reference = self._reference(frames, reference)
@@ -157,8 +159,10 @@ class LearntSkin:
         return Touches(**said, notes=self._doubts(found["alive"], found["unlike"]))
 
     def _stuck(self, frames: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Channels (M,) that read the same in all of many touched frames, though others change; when nothing touches, a
-        coarse converter may read the same for long."""
+        """Detect channels (M,) that read the same in all of many touched frames, though others change.
+
+        Untouched frames do not count, since a coarse converter may read the same for long.
+        """
         same = (frames == frames[0]).all(axis=0)
         if same.all() or not same.any() or len(frames) < _MANY:
             return np.zeros_like(same)
@@ -166,10 +170,10 @@ class LearntSkin:
         return same & (np.count_nonzero(np.sqrt(np.mean(scaled**2, axis=1)) > self.quiet) >= _MANY)
 
     def _predict(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
-        """What `Touches` say of some frames, as far as it was learnt."""
+        """Predict the fields of `Touches` for some frames, as far as they were learnt."""
         whole, alive, novelty = self.channels.complete(changes)
         touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
-        # Small changes are no touch, but missing ones may be any.
+        # Small changes are no touch, but frames with missing channels may be any.
         unlike = (novelty > _UNLIKE) & touching | (alive.mean(axis=1) < _FEWEST)
         found = {"novelty": novelty, "unlike": unlike, "alive": np.zeros(changes.shape, bool)}
         found["alive"][:, self.channels.used] = alive
@@ -194,7 +198,7 @@ class LearntSkin:
         return found
 
     def _numbers(self, learnt: LearntNumbers, whole, reference, alive) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (n, d) told, and their deviations, also by what readings foretold may be off."""
+        """Predict numbers (n, d) and their deviations, which include the error of predicted readings."""
         said, std = learnt.predict(whole, reference)
         lacking = np.flatnonzero(~alive.all(axis=1))
         if not lacking.size:
@@ -230,7 +234,7 @@ class LearntSkin:
             raise ValueError(
                 "reference has no finite reading of a channel that is used; give that of the untouched skin."
             )
-        if not learnt.any():  # frames that were learnt from were changes already
+        if not learnt.any():  # the frames of the training set were changes already
             return reference
         alike = float(own @ learnt / np.sqrt((own @ own) * (learnt @ learnt))) if own.any() else 0.0
         size = np.sqrt((own @ own) / (learnt @ learnt))
@@ -283,7 +287,7 @@ def _check_fit(presses: Presses, method: str, model, num_channels: int | None, p
 
 
 def _usable(presses: Presses) -> tuple[Presses, list[str]]:
-    """Presses of which at least two thirds of the channels that ever have readings have one."""
+    """Select presses in which at least two thirds of the channels that ever have readings have one."""
     changes = changes_of(presses.frames, presses.reference)
     there = np.isfinite(changes)
     ever = there.any(axis=0)
@@ -308,7 +312,7 @@ def _fewer(channels: Channels, changes: np.ndarray, presses: Presses, number: in
 
 
 def _answers(presses: Presses) -> np.ndarray:
-    """All that presses say (N, q), standardised; 0 where it is not known."""
+    """All answers of presses (N, q), standardised; 0 where not known."""
     columns = []
     if presses.positions is not None:
         columns.append(presses.positions)
@@ -324,8 +328,10 @@ def _answers(presses: Presses) -> np.ndarray:
 
 
 def _quiet(scaled: np.ndarray, presses: Presses) -> float:
-    """Between the sizes of changes of untouched frames and of touched ones; half of the least size of a touch where
-    none was untouched."""
+    """Threshold between the sizes of changes of untouched and of touched frames.
+
+    If none was untouched, it is half of the least size of a touch.
+    """
     still = np.zeros(len(scaled), bool)
     if presses.positions is not None:
         still |= np.isnan(presses.positions).any(axis=1)
@@ -337,13 +343,16 @@ def _quiet(scaled: np.ndarray, presses: Presses) -> float:
     if still.sum() < 5:
         return 0.5 * float(np.quantile(size[~still], 0.01))
     sizes = np.sort(size)
-    # The threshold with the fewest mistakes, each kind counted by its share.
+    # The threshold with the fewest errors, each kind counted by its share.
     wrong = [np.mean(size[still] > at) + np.mean(size[~still] <= at) for at in sizes]
     return float(sizes[int(np.argmin(wrong))])
 
 
 def _in_step(whole: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
-    """Frames with the presses that they are of, where they were plainly recorded some rows late; by how many; notes."""
+    """Align frames with their presses where they were clearly recorded some rows late.
+
+    Returns frames, presses, the number of rows, and notes.
+    """
     if presses.positions is None:
         return whole, presses, 0, []
     rows, folds, _ = places_and_folds(presses)

@@ -1,5 +1,8 @@
-"""Support vector machines as arrays: a border for each pair of classes, whose sums are taken class by class, as
-thousands of pairs would take scikit-learn a hundredth of a second for one frame."""
+"""Support vector machines as arrays, with one decision boundary for each pair of classes.
+
+The sums are taken class by class: with thousands of pairs scikit-learn would take a hundredth of a second for one
+frame.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,12 @@ from jaxtyping import Float, Int
 
 @dataclass(frozen=True)
 class Machine:
-    """`support` (S, k), sorted by class, those of class c from `start` (C + 1,) c to c + 1; their `weights` (C - 1, S)
-    for the borders with every other class; `intercepts` (P,) of the pairs (0, 1), (0, 2), …; and the kernel,
-    (gain x·y + offset)^degree. A linear one has its borders' own `slopes` (P, k)."""
+    """A support vector machine.
+
+    `support` (S, k): the support vectors sorted by class, those of class c from `start` (C + 1,) c to c + 1; `weights`
+    (C - 1, S): their weights for the boundaries with every other class; `intercepts` (P,) of the pairs (0, 1), (0, 2),
+    …; and the kernel, (gain x·y + offset)^degree. A linear machine has the boundaries' own `slopes` (P, k).
+    """
 
     support: Float[np.ndarray, "S k"]
     weights: Float[np.ndarray, "D S"]
@@ -27,10 +33,10 @@ class Machine:
 
     @classmethod
     def of(cls, machine) -> "Machine":
-        """Of scikit-learn's, with a linear or a polynomial kernel."""
+        """Convert scikit-learn's machine, with a linear or a polynomial kernel."""
         linear = machine.kernel == "linear"
         start = np.concatenate([[0], np.cumsum(machine.n_support_)])
-        # Of two classes scikit-learn tells for the second, of more against every other in turn.
+        # Of two classes, positive values mean the second in scikit-learn; of more, the first of each pair.
         sign = -1.0 if len(machine.classes_) == 2 else 1.0
         return cls(
             machine.support_vectors_,
@@ -45,21 +51,24 @@ class Machine:
         )
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Borders won by each class (n, C), and less than a half more by how far."""
+        """Number of pairwise decisions won by each class (n, C), plus less than a half from the distances."""
         pairs, side = self._borders(features)
         votes = (pairs > 0) @ (side > 0).astype(float) + (pairs <= 0) @ (side < 0).astype(float)
         sure = pairs @ side
         return votes + sure / (3 * (np.abs(sure) + 1))
 
     def pair_odds(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Logarithms of how likely each class is beside every other in turn, summed (n, C): beside one, 1 / (1 +
-        exp(-2 d)) at a distance d from their border, in units of its margin. Unlike votes it says how sure that is."""
+        """Sums of the log-probabilities of each class relative to every other (n, C).
+
+        Relative to one other, the probability is 1 / (1 + exp(-2 d)) at a distance d from their boundary, in units of
+        its margin. Unlike votes, it is a measure of confidence.
+        """
         pairs, side = self._borders(features)
         won, lost = -np.logaddexp(0.0, -2 * pairs), -np.logaddexp(0.0, 2 * pairs)
         return won @ (side > 0).astype(float) + lost @ (side < 0).astype(float)
 
     def _borders(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n P"], Float[np.ndarray, "P C"]]:
-        """Distances from the borders of all pairs of classes, and which class is on which side."""
+        """Distances from the boundaries of all pairs of classes, and which class is on which side."""
         count = len(self.classes_)
         first, second = np.triu_indices(count, 1)
         if self.slopes is not None:

@@ -1,4 +1,4 @@
-"""Nearest presses by plain products: for one frame, threads of a library wait longer for each other than they work."""
+"""Nearest-neighbour prediction by plain products: for one frame, a library's threads wait longer than they work."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ from jaxtyping import Float, Int
 
 from jeit.touch.learnt.extras import in_parts
 
-# Frames whose distances from all presses are worked out at once.
+# The number of frames whose distances from all presses are computed at once.
 _AT_ONCE = 128
 _COUNTS = (3, 5, 8, 12)
-# Of a comb: distances that are compared before any are ordered.
+# The number of distances in a comb, which are compared before any are sorted.
 _TEETH = 16
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """The mean of what is known of the `count` presses whose `features` (N, k) are nearest, by inverse distance:
-    `known` (N, d), numbers, or 1 for the class of each; `classes_` (d,)."""
+    """Mean of the known values of the `count` presses whose `features` (N, k) are nearest, weighted by inverse
+    distance.
+
+    `known` (N, d): numbers, or 1 for the class of each; `classes_` (d,).
+    """
 
     features: Float[np.ndarray, "N k"]
     known: Float[np.ndarray, "N d"]
@@ -29,7 +32,7 @@ class Nearest:
 
     @classmethod
     def of_numbers(cls, features, targets) -> "Nearest":
-        """Of targets (N, d), with the count that errs least when each press is left out."""
+        """Learn targets (N, d), with the count that has the least leave-one-out error."""
         count = min(max(_COUNTS), len(features) - 1)
         every = cls(features, targets, count + 1, np.arange(targets.shape[1]))
         distance, number = (one[:, 1:] for one in every._near(features))
@@ -41,18 +44,18 @@ class Nearest:
 
     @classmethod
     def of_classes(cls, features, label) -> "Nearest":
-        """Of the one nearest press's class."""
+        """Learn classes, with the single nearest press."""
         classes = np.unique(label)
         return cls(features, (np.asarray(label)[:, None] == classes).astype(float), 1, classes)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Means (n, d)."""
+        """Predict means (n, d)."""
         distance, number = self._near(features)
         weight = 1 / np.maximum(distance, 1e-12)
         return np.einsum("nc,ncd->nd", weight / weight.sum(axis=1, keepdims=True), self.known[number])
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Shares of the classes (n, C)."""
+        """Predict shares of the classes (n, C)."""
         return self.predict(features)
 
     def _near(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
@@ -60,7 +63,7 @@ class Nearest:
 
         def near(some: np.ndarray) -> np.ndarray:
             squared = (-2 * some) @ self.features.T
-            squared += self._squares  # less the frame's own, the same for all
+            squared += self._squares  # without the frame's own square, which is the same for all
             number = _least(squared, self.count)
             apart = np.linalg.norm(self.features[number] - some[:, None], axis=2)
             order = np.argsort(apart, axis=1, kind="stable")
@@ -76,7 +79,7 @@ class Nearest:
 
 
 def _least(values: Float[np.ndarray, "n N"], count: int) -> Int[np.ndarray, "n c"]:
-    """Where the least of each row are, in any order: in those of its combs whose own least is least."""
+    """Indices of the least values of each row, in any order: found in the combs whose own least value is least."""
     if count == 1:
         return values.argmin(axis=1)[:, None]
     width = values.shape[1] // _TEETH

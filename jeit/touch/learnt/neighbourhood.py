@@ -1,5 +1,7 @@
-"""How far a frame is from all that were learnt from: two touches at once, or one of the other sign, are made of the
-same patterns, but like no press that was recorded."""
+"""Measure how far a frame is from all presses of the training set.
+
+Two touches at once, or one of the opposite sign, are made of the same patterns, but are unlike any recorded press.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +12,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-# Scores looked at, presses kept, and of the usual size, below which distances are not relative to the frame's own.
+# The number of scores used, the greatest number of presses kept, and the share of the usual size that is added to the
+# size that distances are relative to.
 _SCORES, _MOST, _SMALL = 8, 4000, 0.5
 _QUANTILE = 0.99
 
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """Leading `scores` (N, k) of presses, their usual `size`, and the distance from one to the next, relative to its
-    size, that is `usual`: that of all but a hundredth is less."""
+    """Leading `scores` (N, k) of presses, their usual `size`, and the `usual` distance between neighbours.
+
+    Distances are relative to the size; all but a hundredth of the presses are nearer to their neighbour than `usual`.
+    """
 
     scores: Float[np.ndarray, "N k"]
     size: float
@@ -26,7 +31,7 @@ class Neighbourhood:
 
     @classmethod
     def learn(cls, scores: Float[np.ndarray, "N K"]) -> "Neighbourhood":
-        """From scores of presses (N, K)."""
+        """Learn from scores of presses (N, K)."""
         kept = scores[:: -(-len(scores) // _MOST), :_SCORES]
         size = float(np.median(np.linalg.norm(kept, axis=1))) or 1.0
         found = cls(kept, size, 1.0)
@@ -34,7 +39,7 @@ class Neighbourhood:
         return cls(kept, size, max(float(np.quantile(apart, _QUANTILE)), 1e-6))
 
     def __call__(self, scores: Float[np.ndarray, "n K"]) -> Float[np.ndarray, " n"]:
-        """Relative distances (n,) of frames with these scores, 1 for the farthest of those learnt from."""
+        """Relative distances (n,) of frames with these scores, 1 at the `usual` distance."""
         return self._relative(scores[:, :_SCORES]) / self.usual
 
     def _relative(self, scores: np.ndarray, *, second: bool = False) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A small fully connected network, trained with equinox and optax, asked in NumPy, where a frame takes microseconds."""
+"""A small fully connected network, trained with equinox and optax, evaluated in NumPy within microseconds per frame."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 _WIDTH, _BATCH, _EPOCHS, _RATE, _DECAY = 64, 64, 150, 3e-3, 1e-2
-# Of features' scale, added anew in every batch.
+# Noise added to features in every batch, relative to their scale.
 _NOISE = 0.1
 
 
@@ -24,7 +24,7 @@ class Network:
     scale: Float[np.ndarray, " k"]
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Targets (n, d)."""
+        """Predict targets (n, d)."""
         values = features / self.scale
         for number, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             values = values @ weight.T + bias
@@ -33,7 +33,7 @@ class Network:
 
     @classmethod
     def train(cls, features, targets) -> "Network":
-        """By Adam with decaying weights and steps, from batches with noise on their features."""
+        """Train by Adam with weight decay and decreasing steps, on batches with noise added to their features."""
         import jax
         import jax.numpy as jnp
 
@@ -42,7 +42,8 @@ class Network:
         steps = _EPOCHS * max(1, -(-len(features) // _BATCH))
         rng = np.random.default_rng(0)
         order = np.concatenate([rng.permutation(len(features)) for _ in range(_EPOCHS)])
-        # Rows up to the next batch, of which none is asked for: folds of about one size share what is compiled.
+        # Rows that pad to the next batch, none of which is used: folds of about the same size share the compiled
+        # function.
         more = ((0, -len(features) % _BATCH), (0, 0))
         layers = _training(steps)(
             jnp.asarray(np.pad(features / scale, more), jnp.float32),
@@ -56,8 +57,10 @@ class Network:
 
 @functools.cache
 def _training(steps: int) -> Callable[..., Any]:
-    """What trains a network in so many steps, compiled once for each shape: its layers, from features, targets, the
-    rows of each batch, and two keys."""
+    """Return a function that trains a network in `steps` steps, compiled once for each shape.
+
+    It returns the layers, from features, targets, the rows of each batch, and two keys.
+    """
     import equinox as eqx
     import jax
     import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Numbers learnt from frames, places or forces: the method that errs least on presses held out, and by how much."""
+"""Learn numbers, places or forces, from frames, by the method with the least error on held-out presses."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from jeit.touch.learnt.spread import Spread
 
 BLEND = "blend"
 METHODS = ("auto", *REGRESSORS, BLEND)
-# Methods that are blended at most, and by how much better a blend must be than the best alone.
+# The greatest number of methods that are blended; the error that a blend must be below, relative to the best alone.
 _BLENDED, _BETTER = 3, 0.98
 
 
 @dataclass(frozen=True)
 class Tried:
-    """A `method` on a `form` of the features, and what it said of presses that were held out (N, d)."""
+    """A `method` on a `form` of the features, and its predictions for held-out presses (N, d)."""
 
     method: str
     form: str
@@ -32,14 +32,17 @@ class Tried:
 
     @property
     def name(self) -> str:
-        """The method and the form; of a blend, those it is of."""
+        """The method and the form; of a blend, those that it consists of."""
         return f"{self.method}: {self.form}" if self.method == BLEND else f"{self.method} on {self.form}"
 
 
 @dataclass(frozen=True)
 class LearntNumbers:
-    """`members`, each features and a model whose means are the answer, standardised: targets are `mean` + `scale` ×
-    that; `spread` says how far off it is."""
+    """An average of models, with standard deviations of its predictions.
+
+    `members`, each features and a model, whose mean is the standardised answer: targets are `mean` + `scale` × that;
+    `spread` estimates its standard deviation.
+    """
 
     members: list[tuple[Features, Any]]
     mean: Float[np.ndarray, " d"]
@@ -47,7 +50,7 @@ class LearntNumbers:
     spread: Spread
 
     def predict(self, changes, reference) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-        """Numbers (n, d) and their standard deviations (n, d)."""
+        """Predict numbers (n, d) and their standard deviations (n, d)."""
         said = 0.0
         for features, model in self.members:
             said = said + np.asarray(model.predict(features(changes, reference))).reshape(len(changes), -1)
@@ -65,11 +68,11 @@ def learn_numbers(
     imaged: Imaged | None = None,
     progress: Callable[[str], None] = lambda said: None,
 ) -> tuple[LearntNumbers, list[Tried]]:
-    """Learn `targets` (N, d) from changes (N, m), their reference, and images of them where there are any, by
-    `method`, or the best of all.
+    """Learn `targets` (N, d) from changes (N, m), their reference, and images of them where there are any.
 
-    Of every method tried, in order of its mean error on `folds` (N,) held out: what it said. Quick methods are tried on
-    all forms of the features, the others on the two forms that suited those best.
+    By `method`, or by the best of all. Also returns the predictions of every method that was tried, in order of its
+    mean error on `folds` (N,). Quick methods are tried on all forms of the features, the others on the two forms that
+    suited those best.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
@@ -105,7 +108,7 @@ def learn_numbers(
 
 
 def _chosen(tried: list[Tried], targets: np.ndarray, *, blend: bool) -> list[Tried]:
-    """The best alone, or the best of each method together where that is better, or asked for."""
+    """The best alone, or the best of each method together where that is better, or required."""
     own = list({one.method: one for one in reversed(tried)}.values())
     own = sorted(own, key=_error)[:_BLENDED]
     together = [own[:number] for number in range(2, len(own) + 1)]
@@ -119,12 +122,12 @@ def _error(one: Tried) -> float:
 
 
 def _off(said: np.ndarray, targets: np.ndarray) -> float:
-    """Mean distance."""
+    """Mean distance of predictions from targets."""
     return float(np.linalg.norm(said - targets, axis=1).mean())
 
 
 class _Cut:
-    """Presses cut into folds, with the features of each form once for all methods."""
+    """Presses cut into folds, with the features of each form computed once for all methods."""
 
     def __init__(self, changes, reference, targets, folds, forms: Forms):
         self.changes, self.reference, self.targets, self.folds = changes, reference, targets, folds

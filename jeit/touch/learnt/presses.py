@@ -1,4 +1,4 @@
-"""Recorded presses: frames of a skin, and what touched it in each; checked, and read from NPZ files."""
+"""Recorded presses: frames of a skin, and what touched it in each; validated, and read from NPZ files."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 from jeit.arguments import readings
 from jeit.files import need, npz_arrays
 
-# No skin is known that is longer: its coordinates would be in millimetres.
+# No known skin is longer: its coordinates would be in millimetres.
 _LONGEST = 5.0  # m
 # No press is harder: forces would be in grams or millinewtons.
 _HARDEST = 2000.0  # N
 _FEWEST, _FEWEST_OF_A_KIND = 10, 4
-# Labels and positions of a frame of an untouched skin.
+# The label of a frame of an untouched skin.
 NO_TOUCH = "none"
 _NO_TOUCH = ("none", "no touch", "no-touch", "no_touch", "notouch")
 _ROWS = ("positions", "force", "label", "touched", "group", "time")
@@ -64,7 +64,7 @@ class Presses:
         time: ArrayLike | None = None,
         name: str = "presses",
     ) -> "Presses":
-        """Check what was recorded; shapes and units as of the fields, `reference` also (M,) for all.
+        """Validate recorded presses; shapes and units as of the fields, `reference` also (M,) for all.
 
         Raises `ValueError` for shapes that disagree, fewer than ten presses, positions in millimetres, nothing to
         learn, and values that cannot be.
@@ -91,22 +91,23 @@ class Presses:
         return replace(cls(frames, reference, name=name), **given)
 
     def rows(self, index: ArrayLike | slice) -> "Presses":
-        """The presses with these numbers, or of a slice."""
+        """Select presses by number, or by a slice."""
         kept = {key: getattr(self, key) for key in ("frames", "reference", *_ROWS)}
         return replace(self, **{key: None if values is None else values[index] for key, values in kept.items()})
 
 
 def read_presses(path: str | Path) -> Presses:
-    """Presses of an NPZ file with arrays named as the fields of `Presses`: `frames`, and any of the others.
+    """Read presses from an NPZ file with arrays named as the fields of `Presses`: `frames`, and any of the others.
 
-    Raises `FileNotFoundError`, and `ValueError` for what is no such file and as of `Presses.create`.
+    Raises `FileNotFoundError`, and `ValueError` for what is no such file and as `Presses.create` does.
     """
     with _naming(path):
         return Presses.create(**_arrays(path, "frames", "reference", *_ROWS), name=Path(path).name)
 
 
 def read_frames(path: str | Path) -> dict[str, np.ndarray]:
-    """What `LearntSkin.predict` takes, of an NPZ file: `frames`, and `reference` and `group` if it has them.
+    """Read the arguments of `LearntSkin.predict` from an NPZ file: `frames`, and `reference` and `group` if it has
+    them.
 
     Raises `FileNotFoundError`, and `ValueError` for what is no such file.
     """
@@ -116,7 +117,7 @@ def read_frames(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
-    """Those that a file has of the arrays named, `frames` at least."""
+    """Read the named arrays that a file has, `frames` at least."""
     if Path(path).is_dir():
         raise ValueError("it is a folder; give an NPZ file.")
     if not Path(path).is_file():
@@ -128,7 +129,7 @@ def _arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
 
 @contextmanager
 def _naming(path: str | Path) -> Iterator[None]:
-    """Errors say which file they are about."""
+    """Add the name of the file to errors."""
     try:
         yield
     except ValueError as error:
@@ -136,8 +137,10 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 
 def check_frames(name: str, given) -> Float[np.ndarray, "N M"]:
-    """Frames (N, M) as numbers, infinite ones and those beyond any instrument as NaN; raises `ValueError` for what is
-    none."""
+    """Convert frames (N, M) to numbers; infinite ones and those beyond any instrument become NaN.
+
+    Raises `ValueError` for what is none.
+    """
     try:
         frames = np.asarray(given)
     except ValueError:
@@ -151,7 +154,8 @@ def check_frames(name: str, given) -> Float[np.ndarray, "N M"]:
 
 
 def check_reference(given, frames) -> Float[np.ndarray, "N M"]:
-    """A reference (N, M) for each of the `frames`; raises `ValueError` for other shapes, and where it is not finite."""
+    """Return a reference (N, M) for each of the `frames`; raises `ValueError` for other shapes, and where it is not
+    finite."""
     reference = np.asarray(given)
     if reference.dtype.kind not in "fiu" or reference.shape not in (frames.shape, frames.shape[1:]):
         raise ValueError(

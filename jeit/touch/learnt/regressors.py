@@ -1,6 +1,6 @@
-"""Methods that learn numbers, places or forces, from features.
+"""Regressors of numbers, places or forces, from features.
 
-Each takes features (N, k) and standardised targets (N, d), and gives what has `predict(features)`.
+Each takes features (N, k) and standardised targets (N, d), and returns an object with `predict(features)`.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from jeit.touch.learnt.network import Network
 
 _ALPHAS = np.logspace(-2, 5, 15)
 _TREES = 100
-# Times that each of few presses is shown to a map, in each phase.
+# The number of times that each of few presses is presented to a map, in each phase.
 _SHOWN = 50
 
 
 def ridge(features, targets) -> Any:
-    """Linear, with the penalty that generalised cross-validation chooses."""
+    """Fit ridge regression, with the penalty that generalised cross-validation chooses."""
     from sklearn.linear_model import RidgeCV
 
     return RidgeCV(_ALPHAS).fit(features, targets)
 
 
 def trees(features, targets) -> Any:
-    """Gradient-boosted trees, a sequence for each target."""
+    """Fit gradient-boosted trees, a sequence for each target."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
     options = {"max_iter": 100, "max_leaf_nodes": 15, "min_samples_leaf": 8, "l2_regularization": 1.0}
@@ -41,7 +41,7 @@ def trees(features, targets) -> Any:
 
 
 def forest(features, targets) -> Any:
-    """Trees with random splits, averaged (Geurts et al. 2006)."""
+    """Fit trees with random splits, averaged (Geurts et al. 2006)."""
     from sklearn.ensemble import ExtraTreesRegressor
 
     targets = targets[:, 0] if targets.shape[1] == 1 else targets
@@ -50,7 +50,7 @@ def forest(features, targets) -> Any:
 
 
 def som(features, targets) -> Any:
-    """Kohonen's map, whose neurons know the targets of the presses that each won, and what lies between them."""
+    """Fit Kohonen's map, whose neurons have the targets of the presses that each won, and values between them."""
     import jax
 
     shown = min(Schedule().ordering, _SHOWN * len(features))
@@ -67,7 +67,7 @@ REGRESSORS: dict[str, Callable[..., Any]] = {
     "network": Network.train,
     "som": som,
 }
-# Quick enough to be tried on every form of the features.
+# Methods that are quick enough to be tried on every form of the features.
 QUICK = ("ridge", "neighbours")
-# Those that look for the few channels that tell: asked of channels, not of their principal components.
+# Methods that select few informative channels: they are applied to channels, not to their principal components.
 OF_CHANNELS = ("forest",)

@@ -1,7 +1,7 @@
-"""Archives of scikit-learn's estimators, as skops keeps them: the same bytes for the same content, and a seal.
+"""Archives of scikit-learn's estimators in skops' format: the same bytes for the same content, and a checksum.
 
-skops numbers objects by where they happen to lie in memory, and dates its members; here they are numbered in their
-order, without dates. The seal, a checksum, tells a file that was changed from one that jeit wrote; it is no secret.
+skops numbers objects by their address in memory, and dates its members; here they are numbered in their order, without
+dates. The seal, a checksum, distinguishes a file that was changed from one that jeit wrote; it is no secret.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 _SCHEMA = "schema.json"
-# An object's number, or the file that is named for it.
+# The number of an object, or the file that is named after it.
 _NUMBER = re.compile(r'("__id__": |"file": ")(\d+)')
 
 

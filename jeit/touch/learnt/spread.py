@@ -1,4 +1,4 @@
-"""Standard deviations of what is learnt: errors of presses held out that were like it, made to hold as they say."""
+"""Estimate standard deviations of predictions, from the errors of similar held-out presses, and calibrate them."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 
 _LIKE, _SHARES = 40, ((1.0, 0.6827), (1.96, 0.95))
-# Of the weight of a frame's size beside its place, and of the mean of all errors beside those alike.
+# The weight of a frame's size relative to its place, and of the mean of all errors relative to those of similar
+# presses.
 _SIZE, _ALL = 0.3, 0.15
-# Presses that say how often a deviation holds.
+# The least number of presses from which the coverage of a deviation is estimated.
 _ENOUGH = 30
-# Of the spread of all that was learnt: nothing is known better.
+# The least standard deviation, as a share of the spread of the training set.
 _LEAST = 1e-4
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Squared errors (N, d) of presses held out, at `where` (N, d + 1) they lay; `unit` (d + 1,) of those."""
+    """Squared errors (N, d) of held-out presses, at their places `where` (N, d + 1); `unit` (d + 1,) of these."""
 
     where: Float[np.ndarray, "N e"]
     squares: Float[np.ndarray, "N d"]
@@ -30,16 +31,16 @@ class Spread:
 
     @classmethod
     def learn(cls, said: np.ndarray, changes: np.ndarray, errors: np.ndarray, last: np.ndarray) -> "Spread":
-        """From what was said (N, d) of presses held out, their changes (N, m), and how far off it was (N, d).
+        """Learn from predictions (N, d) for held-out presses, their changes (N, m), and their errors (N, d).
 
-        `last` (N,): which came before or after all others when they were held out, as presses to come do: deviations
-        are made to hold for those, where they are enough to tell.
+        `last` (N,): presses that came before or after all others when they were held out, as future presses do:
+        deviations are calibrated on those, if there are enough.
         """
         where = np.column_stack([said, _size(changes)])
         low, unit = where.mean(axis=0), where.std(axis=0)
         unit = np.where(unit > 0, unit, 1.0)
         unit[-1] /= _SIZE
-        most = np.quantile(np.abs(errors), 0.99, axis=0)  # one that is far off says little of its neighbours
+        most = np.quantile(np.abs(errors), 0.99, axis=0)  # one large error is not representative of its neighbours
         squares = np.minimum(np.abs(errors), most) ** 2
         found = cls((where - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
         local = found._local(found.where, own=True)
@@ -48,12 +49,12 @@ class Spread:
         return cls(found.where, squares, low, unit, np.array(factor))
 
     def __call__(self, said: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "n d"]:
-        """Standard deviations (n, d) of what is said (n, d) of frames with these changes."""
+        """Standard deviations (n, d) of predictions (n, d) for frames with these changes."""
         where = (np.column_stack([said, _size(changes)]) - self.low) / self.unit
         return self.factor * self._local(where)
 
     def held_out(self, said: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "N d"]:
-        """The same of the presses that it was learnt from, each without its own error."""
+        """Standard deviations of the presses of the training set, each without its own error."""
         where = (np.column_stack([said, _size(changes)]) - self.low) / self.unit
         return self.factor * self._local(where, own=True)
 
@@ -74,7 +75,7 @@ def _size(changes: np.ndarray) -> np.ndarray:
 
 
 def _factor(ratios: np.ndarray) -> float:
-    """By what to multiply so that one deviation and 1.96 hold as nearly as can be in their share of presses."""
+    """The factor by which the coverage of one deviation and of 1.96 is nearest to that of a normal variable."""
     candidates = np.geomspace(0.2, 5, 200)
     missed = [
         max(abs(np.mean(ratios <= times * candidate) - share) for times, share in _SHARES) for candidate in candidates

@@ -1,7 +1,7 @@
-"""A small network on the course of a touch: convolutions in time, pooled, beside features of the whole.
+"""A small network on the course of a touch: convolutions over time, pooled, with features of the whole touch.
 
-Trained with equinox and optax, a few at once from different starts, whose probabilities are averaged; asked in NumPy,
-where a touch takes a fraction of a millisecond.
+A few networks are trained at once with equinox and optax from different initial weights, and their probabilities are
+averaged; they are evaluated in NumPy, where a touch takes a fraction of a millisecond.
 """
 
 from __future__ import annotations
@@ -16,17 +16,19 @@ from jaxtyping import Float
 
 _HIDDEN, _DENSE, _WIDE = 24, 32, 5
 _MEMBERS, _BATCH, _EPOCHS, _RATE, _DECAY = 2, 64, 45, 3e-3, 2e-2
-# Of features' scale, added anew in every batch; how far from certain the labels are taken to be; the share of what is
-# pooled that each batch does without.
+# Noise added to features in every batch, relative to their scale; label smoothing; the share of the pooled values that
+# is dropped in each batch.
 _NOISE, _SMOOTHED, _DROPPED = 0.15, 0.05, 0.2
 
 
 @dataclass(frozen=True)
 class TemporalNetwork:
-    """Features (n, k) are `whole` numbers, then a course of T places with c values each, place by place.
+    """An ensemble of s networks that classify the course of a touch.
 
-    **Fields**: weights of the `first` (s, h, 5 c) and `second` (s, h, 5 h) convolution, of the `dense` layer
-    (s, d, whole + 2 h) and the `last` (s, C, d), of s networks, with a `..._bias` each; `whole`; `classes_` (C,).
+    Features (n, k) are `whole` numbers, then a course of T places with c values each, place by place.
+
+    **Fields**: weights of the `first` (s, h, 5 c) and `second` (s, h, 5 h) convolution, of the `dense` layer (s, d,
+    whole + 2 h) and the `last` (s, C, d), of s networks, with a `..._bias` each; `whole`; `classes_` (C,).
     """
 
     first: Float[np.ndarray, "s h i"]
@@ -41,7 +43,7 @@ class TemporalNetwork:
     classes_: np.ndarray
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Probabilities (n, C) of the classes: the mean of all networks'."""
+        """Probabilities (n, C) of the classes, averaged over the networks."""
         course = features[:, self.whole :].reshape(len(features), -1, self.first.shape[2] // _WIDE)
         said = np.zeros((len(features), len(self.classes_)))
         for one in range(len(self.first)):
@@ -58,7 +60,7 @@ class TemporalNetwork:
     def fit(
         cls, features: Float[np.ndarray, "n k"], label: np.ndarray, *, whole: int, values: int
     ) -> "TemporalNetwork":
-        """Learn classes `label` (n,); `values`: c, a place's. By AdamW from batches with noise on their features."""
+        """Learn classes `label` (n,), by AdamW on batches with noise added to the features; `values`: c, a place's."""
         import jax
         import jax.numpy as jnp
 
@@ -66,7 +68,8 @@ class TemporalNetwork:
         steps = _EPOCHS * max(1, -(-len(features) // _BATCH))
         rng = np.random.default_rng(0)
         order = np.concatenate([rng.permutation(len(features)) for _ in range(_EPOCHS)])
-        # Rows up to the next batch, of which none is asked for: folds of about one size share what is compiled.
+        # Rows that pad to the next batch, none of which is used: folds of about the same size share the compiled
+        # function.
         more = -len(features) % _BATCH
         trained = _training(steps, whole, values, len(classes))(
             jnp.asarray(np.pad(features, ((0, more), (0, 0))), jnp.float32),
@@ -90,8 +93,11 @@ def _windows(course, engine):
 
 @functools.cache
 def _training(steps: int, whole: int, values: int, classes: int) -> Callable[..., Any]:
-    """What trains networks in so many steps, compiled once for each shape: their weights and biases, in order, from
-    features, numbers of classes, the rows of each batch, and a key for each."""
+    """Return a function that trains networks in `steps` steps, compiled once for each shape.
+
+    It returns their weights and biases, in order, from features, numbers of classes, the rows of each batch, and a key
+    for each network.
+    """
     import jax
     import jax.numpy as jnp
     import optax

@@ -1,4 +1,4 @@
-"""What a learnt skin says of frames."""
+"""The predictions of a learnt skin for frames."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from jaxtyping import Bool, Float
 
 @dataclass(frozen=True)
 class Touches:
-    """Of n frames; what was not learnt is None.
+    """Predictions for n frames; what was not learnt is None.
 
     **Fields**
 
     - `position` (n, 2 or 3) metres with standard deviations `position_std`; `force` (n,) N with `force_std`; `label`
       (n,) text with `probability`; `touched` (n, K), which keys are pressed, with `key_probability`. NaN, "" and false
-      where nothing touches, and in frames that are unlike any that were learnt from.
-    - `unlike` (n,): frames unlike any learnt from, by their `novelty` (n,), 1 for the farthest of those.
-    - `alive` (n, M): channels that were believed.
-    - `notes`: what was mended.
+      where nothing touches, and in frames that are unlike the training set.
+    - `unlike` (n,): frames unlike the training set, by their `novelty` (n,), 1 for the farthest frame in it.
+    - `alive` (n, M): channels that were used.
+    - `notes`: what was corrected.
     """
 
     position: Float[np.ndarray, "n d"] | None

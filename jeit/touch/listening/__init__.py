@@ -1,8 +1,9 @@
-"""What is heard: kinds of touch, or of anything that sounds, told by the sound of microphones, every 0.1 s.
+"""Classify touches, or any other sounds, from microphone recordings, every 0.1 s.
 
-`read_clips` reads clips in folders, one a class; `Listener.fit` learns them by a network, by trees on hand-made
-features or by a linear discriminant, whichever is right most often of what is held out; `Listener.hear` says what a
-recording is made of. Beneath: `sound_images`, feature images as Park et al. (2022) have them, and `sound_features`.
+`read_clips` reads clips from folders, one per class. `Listener.fit` trains a classifier on them: a network, boosted
+trees on hand-made features, or a linear discriminant, whichever is most accurate on held-out clips. `Listener.hear`
+classifies the windows of a recording. The features are those of `sound_images`, feature images after Park et al.
+(2022), and `sound_features`.
 """
 
 from __future__ import annotations

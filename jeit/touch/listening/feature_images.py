@@ -1,12 +1,12 @@
-"""Feature images of sound: how loud every microphone is in time, over the spectrogram of the loudest one.
+"""Feature images of sound: the intensity of every microphone over time, above the spectrogram of the loudest one.
 
-As Park et al. (2022) have it: in a window of 0.5 s, 41 times 12 ms apart; M rows of intensity, one a microphone, and 64
-of the spectrogram, so that 25 microphones give 89 × 41. Sampled at 10 kHz a frame is 128 samples under a Hann window,
-120 samples after the one before, and its transform's bins 1 to 64 are the 64 bands.
+They follow Park et al. (2022): a window of 0.5 s has 41 frames, 12 ms apart; an image has M rows of intensity, one for
+each microphone, and 64 rows of the spectrogram, so that 25 microphones give 89 × 41. Sampled at 10 kHz, a frame is 128
+samples under a Hann window, 120 samples after the one before, and bins 1 to 64 of its transform are the 64 bands.
 
-At any other rate frames are as long in time, and bands are made of bins by their frequency: nothing is resampled. Up to
-`highest` = 5 kHz all bands are as wide as a bin, 78 Hz; where sound is to be told up to a higher frequency, the lowest
-stays as wide, and each is wider than the one below it by one and the same factor.
+At any other rate, frames have the same duration, and bands are made of bins by their frequency: nothing is resampled.
+Up to `highest` = 5 kHz all bands are as wide as a bin, 78 Hz; for a higher `highest`, the lowest band keeps this width,
+and each band is wider than the one below it by the same factor.
 """
 
 from __future__ import annotations
@@ -24,21 +24,25 @@ from jeit.acoustic import Recording
 from jeit.arguments import check_kind, describe, is_number
 
 BANDS, FRAMES = 64, 41
-# Seconds: of a frame, from frame to frame, from window to window.
+# Seconds: duration of a frame, from frame to frame, from window to window.
 FRAME, HOP, EVERY = 0.0128, 0.012, 0.1
 LENGTH = FRAME + (FRAMES - 1) * HOP
 """Seconds of a window."""
-# Hertz: bands that are all as wide as a bin reach as far. A lower highest frequency leaves less than 8 bins.
+# Hertz: the highest frequency at which all bands are as wide as a bin; the least `highest`, below which fewer than 8
+# bins are left.
 EVEN, LOWEST = 5000.0, 625.0
-# Windows of which images are made at once.
+# The number of windows whose images are made at once.
 _AT_ONCE = 128
 
 
 @dataclass(frozen=True)
 class SoundImages:
-    """W windows of one recording: `times` (W,), seconds, their middles; `intensity` (W, M, 41), the power of each
-    microphone, and `spectrum` (W, 64, 41), that of the `strongest` one (W,) in each band, per bin; both in the square
-    of the samples' unit. `known` (W,): whether more than half of a window's samples are numbers."""
+    """Feature images of W windows of one recording.
+
+    `times` (W,): the middles of the windows, in seconds; `intensity` (W, M, 41): the power of each microphone;
+    `spectrum` (W, 64, 41): the power of the `strongest` microphone (W,) in each band, per bin. Powers are in the square
+    of the samples' unit. `known` (W,): whether more than half of a window's samples are finite.
+    """
 
     times: Float[np.ndarray, " W"]
     intensity: Float[np.ndarray, "W M 41"]
@@ -51,28 +55,28 @@ class SoundImages:
         return len(self.times)
 
     def __getitem__(self, some) -> "SoundImages":
-        """Some of the windows: a slice, or numbers or truth values of them."""
+        """Select windows by a slice, indices or a boolean mask."""
         return SoundImages(*(getattr(self, name)[some] for name in self.__dataclass_fields__))
 
     @property
     def loudness(self) -> Float[np.ndarray, " W"]:
-        """Power of the loudest frame of each window, all microphones together."""
+        """Power of the loudest frame of each window, summed over the microphones."""
         return self.intensity.sum(axis=1).max(axis=1)
 
     @property
     def levelled(self) -> "SoundImages":
-        """The same, all windows equally loud: powers over the `loudness` of each; silence stays as it is."""
+        """The same windows with powers divided by the `loudness` of each; silent windows stay as they are."""
         least = np.where(self.loudness > 0, self.loudness, 1.0)[:, None, None]
         return replace(self, intensity=self.intensity / least, spectrum=self.spectrum / least)
 
     @classmethod
     def joined(cls, parts: "list[SoundImages]") -> "SoundImages":
-        """The windows of several, one after the other; those of each begin at their own zero."""
+        """Concatenate the windows of several recordings; the times of each recording begin at its own zero."""
         return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in cls.__dataclass_fields__))
 
 
 def check_highest(highest: float) -> float:
-    """Raises `ValueError` for what is no highest frequency of sound images, Hz."""
+    """Check the highest frequency of sound images, Hz. Raises `ValueError` for what is none."""
     if not (is_number(highest) and LOWEST <= highest < np.inf):
         raise ValueError(
             f"highest must be a frequency in Hz, {LOWEST:g} or more, of the features; it is {describe(highest)}."
@@ -81,7 +85,7 @@ def check_highest(highest: float) -> float:
 
 
 def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
-    """Where the 64 bands begin and end, Hz; `highest` is the middle of the last where all are even."""
+    """Edges of the 64 bands, Hz; where all bands are even, `highest` is the middle of the last."""
     bin_width = 1 / FRAME
     if highest <= EVEN:
         return bin_width * (0.5 + np.arange(BANDS + 1))
@@ -92,9 +96,9 @@ def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
 
 
 def sound_images(recording: Recording, highest: float = EVEN) -> SoundImages:
-    """Images of all windows of a recording, every 0.1 s.
+    """Compute the feature images of all windows of a recording, every 0.1 s.
 
-    Sound above `highest` Hz is left out; bands above half the rate are empty. A recording shorter than 0.5 s is taken
+    Sound above `highest` Hz is left out; bands above half the rate are empty. A recording shorter than 0.5 s is padded
     with 0.3 s of silence before and after it. Samples that are not finite count as zero. Raises `ValueError` for what
     is no recording of samples, rates below 1250 Hz, and no frequency.
     """
@@ -102,7 +106,10 @@ def sound_images(recording: Recording, highest: float = EVEN) -> SoundImages:
 
 
 def image_blocks(recording: Recording, highest: float = EVEN) -> Iterator[SoundImages]:
-    """The same for recordings of any length, some windows at a time. Raises `ValueError` as `sound_images`."""
+    """Compute the images of `sound_images` in blocks of windows, for recordings of any length.
+
+    Raises `ValueError` as `sound_images`.
+    """
     check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
     check_highest(highest)
     if recording.rate < 2 * LOWEST:
@@ -124,7 +131,7 @@ def _blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
         samples = np.pad(samples, ((0, 0), (before, after)))
     frames = 1 + (samples.shape[1] - length) // hop
     number = 1 + int((frames - FRAMES + 0.5) * hop / (EVERY * rate))
-    # Windows begin with a frame: the one nearest to their time.
+    # Each window begins with the frame nearest to its time.
     starts = np.minimum(np.round(EVERY * rate * np.arange(number) / hop).astype(int), frames - FRAMES)
     weights = _weights(length, rate, highest)
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
@@ -146,9 +153,9 @@ def _blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
 
 
 def _powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarray) -> Float[np.ndarray, "F 64"]:
-    """Power in each band and frame, before it is scaled."""
+    """Power in each band and frame, before scaling."""
     frames = sliding_window_view(channel, len(taper))[::hop]
-    # What is constant would leak into the lowest band.
+    # A constant offset would leak into the lowest band.
     spectrum = np.fft.rfft((frames - frames.mean(axis=1, keepdims=True)) * taper)
     return (np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ weights
 
@@ -159,8 +166,10 @@ def _per_frame(finite: np.ndarray, length: int, hop: int) -> np.ndarray:
 
 
 def _weights(length: int, rate: float, highest: float) -> Float[np.ndarray, "K 64"]:
-    """The part of each bin's own stretch of frequency, (k ± 1/2) rate / length, that lies in each band; none of bin 0,
-    nor of what is above half the rate or `highest`."""
+    """Share of each bin's interval of frequency, (k ± 1/2) rate / length, that lies in each band.
+
+    Bin 0, and frequencies above half the rate or above `highest`, have no share.
+    """
     edges = band_edges(highest)
     width = rate / length
     low = (np.arange(length // 2 + 1) - 0.5) * width

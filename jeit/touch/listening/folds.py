@@ -1,4 +1,4 @@
-"""Which clips are held out together: never windows of one clip on both sides, nor clips of one person where known."""
+"""Assign clips to cross-validation folds: all windows of a clip, and all clips of a person where known, together."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from jaxtyping import Int
 
 
 def held_out_folds(right: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], most: int) -> Int[np.ndarray, " N"]:
-    """The fold (N,) that each of N clips is held out in, with all of its group; -1 for clips that are always learnt
-    from, since their class has no other group.
+    """Assign each of N clips to the fold (N,) in which it is held out, together with all of its group.
 
-    Groups are dealt in turn, those of each class by themselves, the largest first: at most `most` folds, so that every
-    class is learnt from in each.
+    The fold is -1 for clips that are always in the training set, since their class has no other group. Groups are
+    assigned in turn, class by class, the largest first, to at most `most` folds, so that every class is in the training
+    set of each.
     """
     fold = np.full(len(right), -1)
     of_group: dict[int, int] = {}
@@ -27,7 +27,7 @@ def held_out_folds(right: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], 
                 counts[of_group[group]] += int((groups == group).sum())
     for group, number in of_group.items():
         fold[groups == group] = number
-    # A class all of whose groups are in one fold would be asked for where it was never learnt.
+    # A class all of whose groups are in one fold would be tested where it was never learnt.
     for one in np.unique(right):
         own = right == one
         if len(np.unique(fold[own])) < 2:

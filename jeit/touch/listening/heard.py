@@ -1,4 +1,4 @@
-"""What was heard in a recording: a name for every tenth of a second, and the events that follow each other."""
+"""The classified sounds of a recording: a name for every 0.1 s, and events of consecutive windows of one name."""
 
 from __future__ import annotations
 
@@ -12,8 +12,11 @@ from jeit.touch.listening.feature_images import EVERY
 
 @dataclass(frozen=True)
 class Event:
-    """What was heard from `start` to `end`, seconds: `name`, "" for quiet; its mean `probability`; `place` (2,) or (3,)
-    metres, the mean of where it was located, None where it was not."""
+    """A sound from `start` to `end`, seconds.
+
+    `name`: its class, "" for quiet; `probability`: the mean over its windows; `place` (2,) or (3,): the mean estimated
+    place, metres, None where there is none.
+    """
 
     start: float
     end: float
@@ -24,11 +27,14 @@ class Event:
 
 @dataclass(frozen=True)
 class Heard:
-    """What a listener said of W windows: `times` (W,), seconds, their middles; `probabilities` (W, C) of its `names`
-    (C,); `quiet` (W,), windows quieter than any that was learnt from, of which what is said does not count; `known`
-    (W,), whether a window is of numbers; the `strongest` microphone of each (W,); `loud` (W,), windows no more than 20
-    dB below the recording's loudest, which `whole` goes by. `position` (W, d), metres, and `position_std`, where it was
-    located, NaN where not, None without a calibration. `name` of the recording, and `notes` on it."""
+    """The classification of W windows of a recording by a listener.
+
+    `times` (W,): the middles of the windows, in seconds; `probabilities` (W, C) of the classes `names` (C,); `quiet`
+    (W,): windows quieter than any in the training set, whose probabilities do not count; `known` (W,): whether a
+    window's samples are finite; `strongest` (W,): the loudest microphone; `loud` (W,): windows no more than 20 dB below
+    the recording's loudest, which `whole` uses. `position` (W, d), metres, and `position_std`: the estimated place, NaN
+    where there is none, None without a calibration. `name`: the name of the recording; `notes`: notes on it.
+    """
 
     times: Float[np.ndarray, " W"]
     probabilities: Float[np.ndarray, "W C"]
@@ -48,20 +54,22 @@ class Heard:
 
     @property
     def named(self) -> np.ndarray:
-        """The likeliest name of each window (W,), "" where it is quiet or of no numbers."""
+        """The likeliest name of each window (W,), "" where it is quiet or not finite."""
         likeliest = np.array([*self.names, ""])[self.probabilities.argmax(axis=1)]
         return np.where(self.quiet | ~self.known, "", likeliest)
 
     @property
     def probability(self) -> Float[np.ndarray, " W"]:
-        """How probable the likeliest name of each window is."""
+        """Probability of the likeliest name of each window."""
         return self.probabilities.max(axis=1)
 
     @property
     def whole(self) -> tuple[str, float]:
-        """The recording as one sound: the name that is likeliest of its loud windows together, and how probable it is
-        (the geometric mean of the windows', so that windows which overlap do not count as many); "" where all
-        are quiet."""
+        """Classify the recording as one sound: the likeliest name of its loud windows together, and its probability.
+
+        The probability is the geometric mean over the windows, so that overlapping windows are not counted as
+        independent; the name is "" where all are quiet.
+        """
         some = self.loud & self.known & ~self.quiet
         if not some.any():
             return "", 0.0
@@ -71,9 +79,9 @@ class Heard:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Stretches of one name, one after the other."""
+        """Intervals of consecutive windows of the same name."""
         names, found = self.named, []
-        # A name holds to half way to the next window.
+        # A name extends half way to the next window.
         steps = [self.times[:1] - EVERY / 2, (self.times[1:] + self.times[:-1]) / 2, self.times[-1:] + EVERY / 2]
         edges = np.maximum(np.concatenate(steps), 0).tolist()
         cuts = np.flatnonzero(names[1:] != names[:-1]) + 1

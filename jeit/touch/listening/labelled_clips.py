@@ -1,4 +1,4 @@
-"""Labelled clips of sound: a folder for each class, and what is read of them."""
+"""Labelled clips of sound, read from a folder with one sub-folder for each class."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from jeit.acoustic import Intensities, Recording, read_recording
 from jeit.arguments import check_kind, counted
 from jeit.touch.listening.feature_images import LOWEST
 
-# Files that were not read, told by name at most.
-_TOLD = 4
-# Shares of a second: rates that differ by less are one.
+# The greatest number of unread files that a note names.
+_NAMED = 4
+# Relative difference of sampling rates below which they are taken as equal.
 _SAME_RATE = 1e-3
 
 
 class _Files(Sequence):
-    """Recordings of files, read when they are asked for: all of them at once need not fit into memory."""
+    """Recordings read from files on access, so that they need not all fit into memory at once."""
 
     def __init__(self, paths: list[Path]):
         self.paths = paths
@@ -35,9 +35,12 @@ class _Files(Sequence):
 
 @dataclass(frozen=True)
 class LabelledClips:
-    """n clips: `recordings`, a sequence of `Recording`; their `labels` (n,), names of classes; `groups` (n,), names of
-    who or what they are held out with; `channels`, how many all of them have, 1 where they are mixed; `highest`, Hz, up
-    to which all of them have sound. `notes` on them."""
+    """n labelled clips of sound.
+
+    `recordings`: a sequence of `Recording`; `labels` (n,): their classes; `groups` (n,): names of the people or things
+    that they are held out with; `channels`: the number of channels of all, 1 where they are mixed; `highest`: the
+    frequency, Hz, up to which all of them have sound; `notes`: notes on them.
+    """
 
     recordings: Sequence[Recording]
     labels: np.ndarray
@@ -57,10 +60,11 @@ class LabelledClips:
         notes: Sequence[str] = (),
         name: str = "clips",
     ) -> "LabelledClips":
-        """Clips `recordings` of classes `labels`: each is a group of its own unless `groups` are given.
+        """Create labelled clips from `recordings` of classes `labels`; each is a group of its own unless `groups` are
+        given.
 
-        Clips of various numbers of channels are mixed to one. `notes` are kept with what is noted here. Raises
-        `ValueError` for numbers that do not match, what is no recording of samples, and fewer than two classes.
+        Clips with different numbers of channels are mixed to one. `notes` are kept, together with those made here.
+        Raises `ValueError` for numbers that do not match, what is no recording of samples, and fewer than two classes.
         """
         check_kind("recordings", recordings, Sequence, "a list of Recording, as of read_recording(path)")
         named = np.asarray(labels)
@@ -94,7 +98,7 @@ class LabelledClips:
         return cls(recordings, named.astype(str), own, width, low / 2, tuple(said), name)
 
     def clip(self, number: int) -> Recording:
-        """One of them, mixed where all are."""
+        """Return one clip, mixed to one channel where all are."""
         return self.recordings[number] if self.channels > 1 else mixed(self.recordings[number])
 
     def __len__(self) -> int:
@@ -103,13 +107,13 @@ class LabelledClips:
 
 
 def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = None) -> LabelledClips:
-    """Read labelled clips: every sub-folder of `folder` is a class, and every file in it a clip of that class: WAV,
-    NPZ, or what `soundfile` reads where it is installed.
+    """Read labelled clips: every sub-folder of `folder` is a class, and every file in it a clip of that class.
 
-    Clips in a folder within a class's, such as of a person or a day, are one group, together with those of the other
-    classes in a folder of that name; else every file is. Files that cannot be read are left out, and told of in
-    `notes`; hidden ones are not looked at. `progress` is called with how far it is. Raises `ValueError` where there is
-    no such folder, fewer than two classes, or a class none of whose clips can be read.
+    Files are WAV, NPZ, or what `soundfile` reads where it is installed. Clips in a folder within a class's folder, such
+    as of a person or a day, are one group, together with those of the other classes in a folder of the same name;
+    otherwise every file is a group. Files that cannot be read are left out and listed in `notes`; hidden files are
+    ignored. `progress` is called with a description of the progress. Raises `ValueError` where there is no such folder,
+    fewer than two classes, or a class none of whose clips can be read.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -145,19 +149,19 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
 
 
 def _not_read(failed: list[tuple[str, str]]) -> str:
-    """How many files were not read, and why: one of each kind first."""
+    """Describe how many files were not read, and why: one of each kind first."""
     seen: dict[str, int] = {}
     order = []
     for place, (kind, why) in enumerate(failed):
         seen[kind] = seen.get(kind, -1) + 1
         order.append((seen[kind], place, why))
     said = [why for *_, why in sorted(order)]
-    more = f"; and {len(said) - _TOLD} more" if len(said) > _TOLD else ""
-    return f"{counted(len(said), 'file')} not read: {'; '.join(said[:_TOLD])}{more}"
+    more = f"; and {len(said) - _NAMED} more" if len(said) > _NAMED else ""
+    return f"{counted(len(said), 'file')} not read: {'; '.join(said[:_NAMED])}{more}"
 
 
 def _check_clip(clip: Recording | Intensities, name: str) -> None:
-    """Raise `ValueError` for what cannot be learnt from."""
+    """Raise `ValueError` for a clip that cannot be learnt from."""
     if not isinstance(clip, Recording):
         raise ValueError(f"{name}: it holds intensities, not samples.")
     known = clip.samples[np.isfinite(clip.samples)]
@@ -170,7 +174,7 @@ def _check_clip(clip: Recording | Intensities, name: str) -> None:
 
 
 def mixed(recording: Recording) -> Recording:
-    """All channels of a recording as one, their mean."""
+    """Mix all channels of a recording to one, their mean."""
     if len(recording.samples) == 1:
         return recording
     mean = recording.samples.mean(axis=0, keepdims=True)

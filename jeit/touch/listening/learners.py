@@ -1,7 +1,7 @@
-"""What learns windows of sound: the network, trees on hand-made features, and linear discriminants, on them alone or
-with the spectrum in all its bands.
+"""Classifiers of sound windows: the network, boosted trees on hand-made features, and linear discriminants.
 
-Each is a class with `learn`, `log_odds` of the classes 0 … C − 1, and arrays that a file keeps.
+The discriminants use the hand-made features alone, or with the spectrum in all its bands. Each learner is a class with
+`learn`; what it gives has `log_odds` of the classes 0 … C − 1, and arrays that a file stores.
 """
 
 from __future__ import annotations
@@ -24,20 +24,24 @@ from jeit.touch.listening.modality_network import ModalityNetwork, NetworkAnswer
 from jeit.touch.listening.window_features import sound_features, spectrum_features
 from jeit.touch.training import Plan
 
-# Rounds of boosting, leaves of a tree, and presses in a leaf at least, of sets that are large enough.
+# Rounds of boosting, leaves of a tree, and the least number of windows in a leaf, for sets that are large enough.
 _ROUNDS, _LEAVES, _IN_A_LEAF = 100, 15, 10
 BATCHES = 1500
-"""Batches of a training at most, unless told otherwise."""
-# Times through the windows of a small set, at most, and batches that are done all the same.
+"""The greatest number of training batches, by default."""
+# The greatest number of passes through the windows of a small set, and the least number of batches.
 _THROUGH, _FEWEST = 40, 100
-# Of the groups of each class one in so many is held out to stop the network's training.
+# Of the groups of each class, one in this number is held out for early stopping of the network's training.
 _STOPPING = 6
 
 
 class Lesson(NamedTuple):
-    """What is learnt: windows `images`, their classes `right` (W,), 0 … C − 1 of `classes`, and their `groups` (W,),
-    numbers of what was recorded together; by which `key` networks are drawn, how many `batches` they are trained for at
-    most, the file in which a training is kept on its way, and who is told how far it is."""
+    """A training set of windows, and the settings of a training.
+
+    `images`: the windows; `right` (W,): their classes, 0 … C − 1 of `classes`; `groups` (W,): numbers of what was
+    recorded together; `key`: draws the networks' weights; `batches`: the greatest number of training batches;
+    `checkpoint`: the file in which an unfinished training is stored; `progress`: is called with a description of the
+    progress.
+    """
 
     images: SoundImages
     right: Int[np.ndarray, " W"]
@@ -51,7 +55,7 @@ class Lesson(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkListener:
-    """A trained network, and the `levels` that its images are of."""
+    """A trained network, and the `levels` that scale its images."""
 
     network: ModalityNetwork
     levels: Levels
@@ -59,7 +63,7 @@ class NetworkListener:
 
     @classmethod
     def of(cls, network: ModalityNetwork, levels: Levels) -> "NetworkListener":
-        """One that is trained."""
+        """Create a listener from a trained network."""
         return cls(network, levels, NetworkAnswers(network))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
@@ -67,19 +71,19 @@ class NetworkListener:
         return self.answers.log_odds(self.levels(images))
 
     def kept(self) -> tuple[dict[str, Any], Any]:
-        """A head and arrays."""
+        """Header and arrays to store."""
         levels = {name: getattr(self.levels, name).tolist() for name in Levels.__dataclass_fields__}
         return {"levels": levels}, self.network
 
 
 @dataclass(frozen=True)
 class NetworkLearner:
-    """What trains a network, by the schedule of `plan(windows, batches=)`."""
+    """Trains a network, by the schedule of `plan(windows, batches=)`."""
 
     plan: Callable[..., Plan]
 
     def learn(self, lesson: Lesson) -> NetworkListener:
-        """Train one, stopped by the loss of groups held out: one in six of each class, where there are as many."""
+        """Train a network, stopped by the loss on held-out groups: one in six of each class, where there are enough."""
         held = stopping_rows(lesson.right, lesson.groups)
         levels = Levels.of(lesson.images[~held])
         shown = levels(lesson.images)
@@ -107,19 +111,19 @@ class NetworkLearner:
 
     @staticmethod
     def made(head: dict[str, Any], arrays: Any) -> NetworkListener:
-        """Undo `NetworkListener.kept`."""
+        """Restore a listener from what `NetworkListener.kept` returned."""
         return NetworkListener.of(arrays, Levels(**{name: np.array(value) for name, value in head["levels"].items()}))
 
 
 @dataclass(frozen=True)
 class TreesListener:
-    """Trees boosted by scikit-learn's `HistGradientBoostingClassifier`, on `sound_features`."""
+    """Boosted trees, scikit-learn's `HistGradientBoostingClassifier`, on `sound_features`."""
 
     forest: Forest
 
     @classmethod
     def learn(cls, lesson: Lesson) -> "TreesListener":
-        """Grow them; in small sets leaves may be smaller."""
+        """Fit the trees; leaves may be smaller in small sets."""
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         fewest = int(np.bincount(lesson.right, minlength=lesson.classes).min())
@@ -141,7 +145,7 @@ class TreesListener:
         return self.forest.decision_function(sound_features(images))
 
     def kept(self) -> tuple[dict[str, Any], Any]:
-        """A head and arrays."""
+        """Header and arrays to store."""
         own = self.forest
         head = {"trees": own.value.shape[0], "nodes": own.value.shape[1], "depth": own.depth}
         arrays = [own.feature, own.left, own.right, own.threshold, own.value, own.start]
@@ -160,7 +164,7 @@ class TreesListener:
 
     @classmethod
     def made(cls, head: dict[str, Any], arrays: Any) -> "TreesListener":
-        """Undo `kept`. Raises `ValueError` for trees that no features lead down."""
+        """Restore a listener from what `kept` returned. Raises `ValueError` for trees that no features lead down."""
         feature, left, right, threshold, value, start = (np.asarray(one) for one in arrays)
         nodes = value.shape[1]
         sound = (feature >= 0).all() and (feature < num_features()).all() and 0 < int(head["depth"]) < 1000
@@ -182,8 +186,10 @@ class TreesListener:
 
 @dataclass(frozen=True)
 class LinearListener:
-    """A linear discriminant, its covariance shrunk as Ledoit and Wolf do, on `features` of images: `weights` (k, C) and
-    `offset` (C,) of features less their `mean` (k,) over their `deviation` (k,)."""
+    """A linear discriminant with Ledoit-Wolf shrinkage of its covariance, on `features` of images.
+
+    `weights` (k, C) and `offset` (C,) apply to features standardised by their `mean` (k,) and `deviation` (k,).
+    """
 
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
     mean: Float[np.ndarray, " k"]
@@ -196,21 +202,21 @@ class LinearListener:
         return (self.features(images) - self.mean) / self.deviation @ self.weights + self.offset
 
     def kept(self) -> tuple[dict[str, Any], Any]:
-        """A head and arrays."""
+        """Header and arrays to store."""
         return {}, [np.asarray(one, np.float32) for one in (self.mean, self.deviation, self.weights, self.offset)]
 
 
 @dataclass(frozen=True)
 class LinearLearner:
-    """What fits a `LinearListener` to `features` of images."""
+    """Fits a `LinearListener` to `features` of images."""
 
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
 
     def learn(self, lesson: Lesson) -> LinearListener:
-        """Fit it; all classes are as likely beforehand, however many windows they have."""
+        """Fit the discriminant; all classes have the same prior probability, however many windows they have."""
         features = self.features(lesson.images)
         mean, deviation = features.mean(axis=0), features.std(axis=0)
-        # What is constant but for rounding tells nothing, and leaves a covariance that cannot be solved with.
+        # Features that are constant but for rounding carry no information, and make the covariance singular.
         varies = deviation > 1e-5
         deviation = np.where(varies, deviation, 1.0)
         model = CLASSIFIERS["linear-discriminant"](((features - mean) / deviation)[:, varies], lesson.right)
@@ -218,7 +224,7 @@ class LinearLearner:
         weights = np.zeros((len(mean), len(model.coef_)))
         weights[varies] = model.coef_.T
         offset = model.intercept_ - (share if len(share) > 2 else share[1] - share[0])
-        if weights.shape[1] == 1:  # of two classes, the odds of the second
+        if weights.shape[1] == 1:  # two classes: the odds of the second
             weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
         return LinearListener(self.features, mean, deviation, weights, offset)
 
@@ -228,7 +234,7 @@ class LinearLearner:
         return [jax.numpy.zeros(one, np.float32) for one in ((number,), (number,), (number, classes), (classes,))]
 
     def made(self, head: dict[str, Any], arrays: Any) -> LinearListener:
-        """Undo `LinearListener.kept`."""
+        """Restore a listener from what `LinearListener.kept` returned."""
         return LinearListener(self.features, *(np.asarray(one, float) for one in arrays))
 
 
@@ -239,12 +245,12 @@ LEARNERS: dict[str, Any] = {
     "spectrum": LinearLearner(spectrum_features),
     "linear": LinearLearner(sound_features),
 }
-"""By name; the network by the schedule of the paper, and by our own. Of those that are right as often the last is
-taken, which is the plainest."""
+"""Learners by name; the network by the schedule of the paper, and by our own. Of those that are equally accurate the
+last is taken, which is the simplest."""
 
 
 def num_features() -> int:
-    """How many hand-made features there are."""
+    """Number of hand-made features."""
     return sound_features(_NOTHING).shape[1]
 
 
@@ -252,8 +258,10 @@ _NOTHING = SoundImages(np.zeros(0), np.zeros((0, 1, 41)), np.zeros((0, 64, 41)),
 
 
 def stopping_rows(right: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -> np.ndarray:
-    """Which windows (W,) tell a training when to stop: whole groups, spread over the classes; none of a class that has
-    fewer than three."""
+    """Choose the windows (W,) that are held out for early stopping: whole groups, spread over the classes.
+
+    None is taken of a class that has fewer than three groups.
+    """
     held = np.zeros(len(right), bool)
     chosen: set[int] = set()
     for one in np.unique(right):
@@ -264,5 +272,5 @@ def stopping_rows(right: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -
         order = np.random.default_rng(int(one)).permutation(len(rest))
         chosen |= {rest[place] for place in order[: max(0, wanted - len(already))]}
     held = np.isin(groups, sorted(chosen))
-    # Whoever is held out, every class is learnt from.
+    # Every class must remain in the training set.
     return held if set(right[~held].tolist()) == set(right.tolist()) else np.zeros(len(right), bool)

@@ -1,4 +1,4 @@
-"""Powers as levels on a common scale: what a network is shown."""
+"""Convert powers to levels on a common scale, as input of a network."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ from jaxtyping import Float
 
 from jeit.touch.listening.feature_images import SoundImages
 
-# Decibels below the loudest in which differences are told; and the share of powers that are no louder than that.
+# Decibels below the loudest that are resolved; and the share of powers that are no louder than that.
 _RANGE, _LOUDEST = 60.0, 0.999
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Decibels, no less than 60 below the `loudest` (2,) of what was learnt from (all but a thousandth of it is no
-    louder), less their `mean` (2,), over their `deviation` (2,): first of intensities, then of spectrograms. So one
-    scale holds for all rows, and a window that is louder than another looks louder."""
+    """Scale from powers to standardised levels in decibels, first of intensities, then of spectrograms.
+
+    Levels are clipped at 60 dB below the `loudest` (2,) of the training set (all but a thousandth of it is no louder),
+    then standardised by their `mean` (2,) and `deviation` (2,). One scale holds for all rows, so that a louder window
+    has greater values.
+    """
 
     loudest: Float[np.ndarray, " 2"]
     mean: Float[np.ndarray, " 2"]
@@ -25,7 +28,7 @@ class Levels:
 
     @classmethod
     def of(cls, images: SoundImages) -> "Levels":
-        """Those of windows that are learnt from."""
+        """Compute the scale from windows of the training set."""
         loudest, mean, deviation = [], [], []
         for power in (images.intensity, images.spectrum):
             top = _decibels(np.quantile(power, _LOUDEST), -np.inf)
@@ -36,10 +39,10 @@ class Levels:
         return cls(np.array(loudest), np.array(mean), np.array(deviation))
 
     def __call__(self, images: SoundImages) -> Float[np.ndarray, "W rows 41"]:
-        """Feature images (W, M + 64, 41), single precision: the M rows of intensity, then 64 of the spectrogram.
+        """Feature images (W, M + 64, 41), single precision: M rows of intensity, then 64 of the spectrogram.
 
-        The microphone that is loudest in the window comes first, then the next: the paper does not say in which order
-        they stand, and so a touch looks the same wherever it is.
+        Microphones are sorted by their loudness in the window, the loudest first: the paper does not state their order,
+        and so a touch looks the same wherever it is.
         """
         order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
         intensity = np.take_along_axis(images.intensity, order[..., None], axis=1)
@@ -51,5 +54,5 @@ class Levels:
 
 
 def _decibels(power, least: float) -> np.ndarray:
-    """Of powers, no less than `least`; silence, which has no level, is 300 dB below full scale."""
+    """Decibels of powers, no less than `least`; silence, which has no level, is 300 dB below full scale."""
     return np.maximum(10 * np.log10(np.maximum(power, 1e-30)), least)

@@ -1,4 +1,4 @@
-"""`Listener`: learns to name sounds from labelled clips, and says every 0.1 s of a recording what is heard."""
+"""`Listener`: a sound classifier, trained on labelled clips, that names the sound in a recording every 0.1 s."""
 
 from __future__ import annotations
 
@@ -26,27 +26,30 @@ from jeit.touch.listening.windows import LOUD, Windows
 from jeit.touch.training import read_model, write_model
 
 METHODS = ("auto", *LEARNERS)
-# What "auto" tries: our own schedule gives a network that is as good for less.
+# Methods that "auto" tries: our own schedule gives an equally good network in fewer batches.
 _TRIED = tuple(name for name in LEARNERS if name != "paper-network")
-# Folds in which it is chosen, at most. Windows whose power is this of the quietest that was learnt from are quiet.
+# The greatest number of folds by which the method is chosen. Windows whose power is below this share of that of the
+# quietest in the training set are quiet.
 _FOLDS, _QUIET = 3, 0.25
-# Of the softest clip's power what a recording of lower gain has at least; windows from which on a network is tried.
+# The least loudness of a recording with lower gain, as a share of the softest clip's power; the number of windows from
+# which on a network is tried.
 _SOFTER, _FOR_NETWORKS = 1 / 16, 3000
-# Samples in which a microphone that works has moved.
+# Samples within which a working microphone has changed its reading.
 _LOOKED_AT = 100_000
 _KIND, _VERSION = "a jeit listener", 2
 
 
 @dataclass(frozen=True)
 class Listener:
-    """What names sounds.
+    """A trained classifier of sounds.
 
-    **Fields**: `names` (C,); the `method` and what learnt, `model`; of how many `channels`, 1 where they are mixed; up
-    to which frequency `highest`, Hz; whether `loudness` counts, or all windows are made equally loud; the `quietest`
-    loudness that was learnt from, that of the softest and of the loudest clip, `clips_loudness`; the `sharpness` of its
-    probabilities, and the share of each that is dealt to all names alike, `doubt`, 1 / (n + 2) of n clips held out:
-    nothing is surer than they can show. `standing`: what was said of each clip when it was held out, and the errors of
-    all that was tried, the best first, None of a listener that was read; `notes` on it.
+    **Fields**: `names` (C,): the classes; `method` and the trained `model`; `channels`: the number of microphones, 1
+    where they are mixed; `highest`: the highest frequency used, Hz; `loudness`: whether loudness is a feature, or all
+    windows are made equally loud; `quietest`: the least loudness in the training set; `clips_loudness`: that of the
+    softest and of the loudest clip; `sharpness` of the probabilities; `doubt`: the share of each probability that is
+    spread evenly over all names, 1 / (n + 2) for n held-out clips, which limits the confidence to what these can
+    support. `standing`: the prediction for each held-out clip, and the errors of all methods that were tried, the best
+    first, None for a listener read from a file; `notes` on it.
     """
 
     names: tuple[str, ...]
@@ -75,15 +78,16 @@ class Listener:
         folder: str | Path | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> "Listener":
-        """Learn labelled clips, by a `method` of `METHODS`: of "auto", what is right most often of clips held out.
+        """Train on labelled clips by one of `METHODS`, or by "auto", the method most accurate on held-out clips.
 
-        Clips are held out in three folds, with all of their group; a clip counts as right where it is named right as a
-        whole. Of every clip those windows are learnt from that are no more than 20 dB below its loudest: the rest of it
-        is not what it is labelled; of clips longer than 4 s every sound counts as a clip. `loudness`: whether it tells
-        classes apart; unless given it does where a linear discriminant names more clips right by it, and more than by
-        chance. "auto" leaves out the network where windows are few. `key` draws networks, each trained for `batches` at
-        most; `folder`: where trainings are kept, so that one that was killed goes on. `progress` is called with how far
-        it is. Raises `ValueError` for what are no clips, key, or method; `ImportError` without the extra `learn`.
+        Clips are held out in three folds, with all of their group; a clip counts as right if it is classified correctly
+        as a whole. The training windows of a clip are those no more than 20 dB below its loudest, since the rest is not
+        what the label describes; in clips longer than 4 s every sound counts as a clip. `loudness`: whether it is used
+        as a feature; unless given, it is used if a linear discriminant classifies more clips correctly with it, by more
+        than chance. "auto" leaves out the network where windows are few. `key` draws the networks' weights, each
+        trained for `batches` at most; `folder`: where checkpoints are stored, so that an interrupted training can
+        resume. `progress` is called with a description of the progress. Raises `ValueError` for what are no clips, key,
+        or method; `ImportError` without the extra `learn`.
         """
         need_extra("learn", "learning what is heard")
         check_kind("clips", clips, LabelledClips, "clips as of read_clips(folder)")
@@ -116,7 +120,7 @@ class Listener:
         for name in names:
             found.append((name, _held_out(name, windows, fold, key, batches, folder, report)))
         kept = [(windows.errors(odds), place, name, odds) for place, (name, odds) in enumerate(found)]
-        # Of those that err as often the last, the plainest.
+        # Of methods with equal errors, the last is the simplest.
         kept.sort(key=lambda one: (*one[0], -one[1]))
         (_, _, chosen, odds) = kept[0]
         report(f"{chosen}, all clips")
@@ -132,7 +136,8 @@ class Listener:
             notes.append(
                 "no class has clips of two groups: nothing could be held out, and nobody knows how good it is."
             )
-        # Few clips that all are told right would make it as sure as can be; by the rule of succession the next is not.
+        # If all of a few clips are classified correctly, the fitted confidence has no bound; the rule of succession
+        # limits it.
         sharpness = min(1.0, sharpness_of(odds[out], windows.right[out])) if out.any() else 1.0
         asked = 0 if standing is None else len(standing.right)
         return cls(
@@ -152,12 +157,12 @@ class Listener:
         )
 
     def hear(self, recording: Recording, *, calibration: Calibration | None = None) -> Heard:
-        """Name what is heard in every window of a recording, 0.5 s long and 0.1 s after the one before.
+        """Classify every window of a recording, 0.5 s long and 0.1 s after the one before.
 
-        A recording shorter than that is taken with silence about it. With a `calibration` of the microphones, places
-        are told where the localiser finds one. A listener of one channel mixes those of a recording. Raises
-        `ValueError` for what is no recording of samples, another number of microphones, sound that does not reach up to
-        `highest`, and as `locate_touches` does.
+        A shorter recording is padded with silence. With a `calibration` of the microphones, places are estimated where
+        the localiser finds one. A listener of one channel mixes those of a recording. Raises `ValueError` for what is
+        no recording of samples, another number of microphones, sound that does not reach up to `highest`, and as
+        `locate_touches` does.
         """
         check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
         notes = []
@@ -213,14 +218,20 @@ class Listener:
         )
 
     def _quiet(self, loudest: float) -> float:
-        """Below which loudness windows of a recording are quiet, whose loudest is `loudest`. Where loudness does not
-        count, its gain may be another than that of the clips: up to 12 dB less, or any more."""
+        """Loudness below which windows are quiet, in a recording whose loudest window is `loudest`.
+
+        Where loudness is not a feature, the gain may differ from that of the clips: up to 12 dB lower, or any amount
+        higher.
+        """
         softest, greatest = self.clips_loudness
         gain = 1.0 if self.loudness else float(np.clip(loudest / softest, _SOFTER, 1)) * max(1.0, loudest / greatest)
         return _QUIET * self.quietest * gain
 
     def write(self, path: str | Path) -> None:
-        """Write it to one file, without how it stood: a head of JSON, and arrays. Raises `ValueError` for a folder."""
+        """Write the listener to one file, without its `standing`: a JSON header, and arrays.
+
+        Raises `ValueError` for a folder.
+        """
         own, arrays = self.model.kept()
         head = {
             "names": list(self.names),
@@ -240,8 +251,10 @@ class Listener:
 
     @classmethod
     def read(cls, path: str | Path) -> "Listener":
-        """Undo `write`, also of the folder that `jeit listen fit` made; nothing in the file is executed. Raises
-        `FileNotFoundError`, and `ValueError` for files of another kind."""
+        """Read a listener that `write` wrote, also from the folder that `jeit listen fit` made.
+
+        Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for files of another kind.
+        """
         path = Path(path)
         if path.is_dir():
             path = path / "listener.jeit"
@@ -279,7 +292,7 @@ class Listener:
 
 
 def _held_out(name: str, windows: Windows, fold: np.ndarray, key: Array, batches: int, folder, report) -> np.ndarray:
-    """Log-odds (W, C) of windows when their clip's fold was held out; NaN of those that never were."""
+    """Log-odds (W, C) of windows, by the model fitted without their clip's fold; NaN for those never held out."""
     odds = np.full((len(windows.images), windows.classes), np.nan)
     for number in range(int(fold.max()) + 1):
         report(f"{name}, fold {number + 1} of {int(fold.max()) + 1}")
@@ -290,8 +303,10 @@ def _held_out(name: str, windows: Windows, fold: np.ndarray, key: Array, batches
 
 
 def _loudness_counts(windows: Windows, fold: np.ndarray, key: Array, report) -> bool:
-    """Whether a discriminant that knows how loud windows are names more clips right, by more than a standard deviation
-    of chance. Where nothing can be held out, what several microphones hear is of one gain, and it does."""
+    """Determine whether loudness improves a discriminant, by more than a standard deviation of chance.
+
+    Where nothing can be held out, loudness counts if there are several microphones, which share one gain.
+    """
     if fold.max() < 0:
         return windows.images.intensity.shape[1] > 1
     right = []
@@ -307,8 +322,10 @@ def _file(folder: str | Path | None, name: str) -> Path | None:
 
 
 def _places(recording: Recording, calibration: Calibration, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where it was touched (W, d), and standard deviations, by the smoothed track's frames about each window's middle;
-    NaN where there are none."""
+    """Estimate the touched places (W, d) and their standard deviations, metres, around the middle of each window.
+
+    They are from the frames of the smoothed track; NaN where there are none.
+    """
     found = locate_touches(recording, calibration)
     place, spread = found.track.position, np.sqrt(np.diagonal(found.track.covariance, axis1=1, axis2=2))
     near = np.abs(found.locations.times - times[:, None]) <= EVERY / 2

@@ -1,9 +1,10 @@
-"""The network of Park et al. (2022) that tells touch by its sound: trained with equinox and optax, asked in NumPy.
+"""The network of Park et al. (2022) that classifies touch by its sound: trained with equinox and optax, run in NumPy.
 
-A convolution of 5 × 5 to 32 channels, unpadded, normalised over the batch, rectified, pooled by greatest values; again,
-3 × 3 to 64; a dense layer and softmax. Adam with a rate of 2e-4, a tenth of it after every five epochs, batches of 64;
-held-out loss looked at every 50 batches, and an end after 20 looks without a decrease. The size of the second
-convolution and of the pools, 3 × 3 and 2 × 2, is this library's choice; so is the noise that images are augmented by.
+Two layers, each a convolution without padding, batch normalisation, rectification and max-pooling: 5 × 5 to 32
+channels, then 3 × 3 to 64; then a dense layer and softmax. Training uses Adam with a rate of 2e-4, divided by ten after
+every five epochs, and batches of 64; the held-out loss is evaluated every 50 batches, and training ends after 20
+evaluations without a decrease. The size of the second convolution and of the pools, 3 × 3 and 2 × 2, is this library's
+choice; so is the noise that images are augmented by.
 """
 
 from __future__ import annotations
@@ -23,20 +24,23 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from jeit.touch.training import Objective, Plan, Trained, fit
 
-# Of both layers: pixels of kernels and of pools, and channels.
+# Of both layers: sizes of kernels and of pools, in pixels, and numbers of channels.
 _KERNELS, _POOLS, _CHANNELS = (5, 3), (3, 2), (32, 64)
-# Of each batch's mean and variance, what running ones take over; added to variances.
+# The weight of each batch's mean and variance in the running ones; the constant added to variances.
 _TAKEN, _LITTLE = 0.05, 1e-5
 NOISE, COPIES = 0.2, 5
-"""The deviation of the normal noise added to images, whose own is 1; and how many noisy copies of each image are an
-epoch, as in the paper."""
-# Windows that are asked at once.
+"""The standard deviation of the normal noise added to images, whose own is 1; and the number of noisy copies of each
+image in an epoch, as in the paper."""
+# The number of windows evaluated at once.
 _AT_ONCE = 32
 
 
 class ModalityNetwork(eqx.Module):
-    """Weights, single precision: kernels `first` (5, 5, 1, 32) and `second` (3, 3, 32, 64); after each a `gain` and a
-    `shift`, and running `mean` and `variance`, a pair of each; `dense` (n, C) and `bias` (C,)."""
+    """Weights of the network, in single precision.
+
+    Kernels `first` (5, 5, 1, 32) and `second` (3, 3, 32, 64); after each a `gain` and a `shift`, and running `mean` and
+    `variance`, a pair of each; `dense` (n, C) and `bias` (C,).
+    """
 
     first: Float[Array, "5 5 1 32"]
     second: Float[Array, "3 3 32 64"]
@@ -49,7 +53,8 @@ class ModalityNetwork(eqx.Module):
 
     @classmethod
     def draw(cls, key: Array, rows: int, columns: int, classes: int) -> "ModalityNetwork":
-        """Untrained, for images (rows, columns): kernels normal with the variance of He et al. (2015)."""
+        """Create an untrained network for images (rows, columns): normal kernels, the variance as in He et al.
+        (2015)."""
         for size, pool in zip(_KERNELS, _POOLS, strict=True):
             rows, columns = ((side - size + 1) // pool for side in (rows, columns))
         keys = jax.random.split(key, 3)
@@ -65,11 +70,11 @@ class ModalityNetwork(eqx.Module):
         return cls(first, second, ones, zeros, zeros, ones, dense, bias)
 
     def answer(self, images: Float[Array, "b rows columns"]) -> Float[Array, "b C"]:
-        """Log-odds of the classes, with the running means."""
+        """Log-odds of the classes, normalised by the running means and variances."""
         return self._through(images, self.mean, self.variance)[0]
 
     def learn(self, images: Float[Array, "b rows columns"]) -> tuple[Float[Array, "b C"], "ModalityNetwork"]:
-        """Log-odds with the batch's own means and variances, and the network with running ones that took from them."""
+        """Log-odds normalised by the batch's own means and variances, and the network with updated running ones."""
         said, means, variances = self._through(images, None, None)
         kept = jax.tree.map(
             lambda old, new: (1 - _TAKEN) * old + _TAKEN * jax.lax.stop_gradient(new),
@@ -98,7 +103,7 @@ class ModalityNetwork(eqx.Module):
 
 
 def _pooled(values, size: int, namespace):
-    """The greatest of every `size` × `size` (b, h, w, c); rows and columns that are left over are left out."""
+    """Maximum of every `size` × `size` block (b, h, w, c); rows and columns that do not fill a block are left out."""
     height, width = (side // size * size for side in values.shape[1:3])
     values = values[:, :height, :width]
     taller = reduce(namespace.maximum, [values[:, row::size] for row in range(size)])
@@ -106,11 +111,11 @@ def _pooled(values, size: int, namespace):
 
 
 class NetworkAnswers:
-    """A trained network asked in NumPy, where one window takes a few milliseconds, and no compiler is waited for."""
+    """A trained network evaluated in NumPy, where one window takes a few milliseconds, without compilation."""
 
     def __init__(self, network: ModalityNetwork):
         whole = jax.tree.map(np.asarray, network)
-        # The normalisation is one factor and one offset a channel: they go into the kernels.
+        # The normalisation is one factor and one offset for each channel, which are merged into the kernels.
         factors = [gain / np.sqrt(own + _LITTLE) for gain, own in zip(whole.gain, whole.variance, strict=True)]
         self.kernels = [
             np.ascontiguousarray((kernel * factor).transpose(2, 0, 1, 3).reshape(-1, kernel.shape[-1]))
@@ -137,10 +142,10 @@ class NetworkAnswers:
 
 
 def paper_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
-    """The paper's schedule for a training of so many windows, `batches` at most, but one time through the windows.
+    """The paper's schedule for a training set of `windows` windows: at most `batches`, but at least one pass.
 
-    Noise is drawn anew in every batch, so that nothing is seen twice; `COPIES` times through the windows is what was
-    one epoch of copies.
+    Noise is drawn anew in every batch, so that no image is repeated; `COPIES` passes through the windows correspond to
+    one epoch of noisy copies.
     """
     least = min(batch, windows)
     return Plan(
@@ -155,7 +160,7 @@ def paper_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
 
 
 def plan_of(windows: int, *, batches: int, batch: int = 64) -> Plan:
-    """Our own schedule, which learns as much of small sets in fewer batches: a rate of 1e-3, a tenth of it in the last
+    """Our own schedule, which learns small sets as well in fewer batches: a rate of 1e-3, a tenth of it in the last
     third."""
     plan = paper_plan(windows, batches=batches, batch=batch)
     return replace(plan, rate=1e-3, decay_epochs=max(1, round(2 * plan.epochs / 3)))
@@ -173,10 +178,10 @@ def train_network(
     checkpoint: str | Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Trained:
-    """Train a network on images of the classes `right`, until its loss on images `held` out falls no more.
+    """Train a network on images of the classes `right`, until its loss on the images `held` out no longer decreases.
 
-    The same `key` gives the same bits. `plan`: as of `plan_of`; `noise`: the deviation of what is added to images;
-    `checkpoint` and `progress` as of `jeit.touch.training.fit`, whose errors are raised.
+    The same `key` gives the same bits. `plan`: as from `plan_of`; `noise`: the standard deviation of the noise added to
+    images; `checkpoint` and `progress` as in `jeit.touch.training.fit`, whose errors are raised.
     """
     drawn, trained = jax.random.split(key)
     network = ModalityNetwork.draw(drawn, images.shape[1], images.shape[2], classes)

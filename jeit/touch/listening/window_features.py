@@ -1,4 +1,4 @@
-"""Hand-made features of a window of sound: its loudness and rhythm, its colour, and how microphones share it."""
+"""Hand-made features of a window of sound: loudness and rhythm, spectral shape, and distribution over microphones."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ from jaxtyping import Float
 
 from jeit.touch.listening.feature_images import BANDS, FRAMES, HOP, SoundImages
 
-# Decibels: below the loudest of a window nothing more is told; a peak stands out by so many from what is beside it.
+# Decibels: the dynamic range below the loudest frame of a window; the least prominence of a peak.
 _RANGE, _PROMINENT = 60.0, 6.0
-# Bands of the mean spectrum, and of those that are followed in time; frames after the loudest in which it dies away.
+# Numbers of bands of the mean spectrum, and of those that are followed in time; frames after the loudest by which the
+# decay is measured.
 _COLOURS, _FEW, _AFTER = 16, 4, 8
 _MODULATIONS = 8
 
 
 def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
-    """Features (W, k) of windows, the same k for any number of microphones.
+    """Compute features (W, k) of windows, with the same k for any number of microphones.
 
     Of loudness in decibels (mean, greatest, spread, how long it stays near its greatest, its peaks and their intervals,
-    rise and decay, modulation up to 16 Hz); of the spectrogram (mean colour in 16 bands, middle, width, flatness, flux,
-    decay in 4 bands); of the microphones (share of the loudest, evenness, whether they rise and fall together, whether
-    what they share moves).
+    rise and decay, modulation up to 16 Hz); of the spectrogram (mean spectrum in 16 bands, centroid, width, flatness,
+    flux, decay in 4 bands); of the microphones (share of the loudest, evenness, whether they rise and fall together,
+    whether their distribution moves).
     """
     if not len(images):
         return np.zeros((0, len(_time(np.zeros((1, FRAMES)))[0]) + _COLOURS + 2 * _FEW + 8 + 8))
@@ -30,8 +31,11 @@ def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
 
 
 def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
-    """The `sound_features` and, of each of the 64 bands, its level under the loudest of the window, decibels: mean,
-    greatest and spread over the window; in the loudest frame and the two after it, and in the next five."""
+    """Compute the `sound_features`, and statistics of the level in each of the 64 bands.
+
+    Levels are in decibels relative to the loudest of the window: mean, greatest and spread over the window; the mean
+    over the loudest frame and the two after it, and over the next five.
+    """
     level = _level(images.spectrum.astype(float))
     level -= level.max(axis=(1, 2), keepdims=True, initial=-np.inf)
     at = images.intensity.sum(axis=1).argmax(axis=1)
@@ -42,7 +46,7 @@ def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
 
 
 def _level(power: np.ndarray) -> np.ndarray:
-    """Decibels (W, …), no less than 60 below the greatest of each window."""
+    """Levels in decibels (W, …), clipped at 60 below the greatest of each window."""
     level = 10 * np.log10(np.maximum(power, 1e-30))
     return np.maximum(level, level.max(axis=tuple(range(1, level.ndim)), keepdims=True) - _RANGE)
 
@@ -87,12 +91,15 @@ def _time(loud: Float[np.ndarray, "W 41"]) -> np.ndarray:
 
 
 def _peaks(loud: np.ndarray) -> np.ndarray:
-    """Which frames (W, 41) are peaks: the loudest of five, and 6 dB above the quietest of the ten before and after."""
+    """Find the frames (W, 41) that are peaks.
+
+    A peak is the loudest of five frames, and 6 dB above the quietest of the ten before and after.
+    """
     padded = np.pad(loud, ((0, 0), (10, 10)), mode="edge")
     near = np.lib.stride_tricks.sliding_window_view(padded, 21, axis=1)
     top = near[..., 8:13].max(axis=-1)
     low = np.maximum(near[..., :11].min(axis=-1), near[..., 10:].min(axis=-1))
-    # Of equal ones the first.
+    # Of equal frames, the first.
     return (loud >= top) & (loud > np.pad(loud, ((0, 0), (1, 0)), mode="constant")[:, :-1]) & (loud - low >= _PROMINENT)
 
 
@@ -127,7 +134,7 @@ def _microphones(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
     even = -(share * np.log(share)).sum(axis=1) / np.log(max(share.shape[1], 2))
     level = _level(intensity)
     own = level - level.mean(axis=2, keepdims=True)
-    # How much each microphone's history is like that of the loudest one.
+    # Correlation of each microphone's level over time with that of the loudest one.
     loudest = own[np.arange(len(own)), share.argmax(axis=1)]
     size = np.sqrt((own**2).sum(axis=2) * (loudest**2).sum(axis=1)[:, None]) + 1e-9
     alike = np.einsum("wmt,wt->wm", own, loudest) / size

@@ -1,6 +1,6 @@
-"""Windows of labelled clips, with which clip and class each is of, and what is told of whole clips.
+"""Windows of labelled clips with their clips and classes, and the classification of whole clips from their windows.
 
-A long recording, many taps one after the other, counts as many clips: it is cut into pieces where it is quiet.
+A long recording, such as many taps one after the other, counts as many clips: it is cut into pieces where it is quiet.
 """
 
 from __future__ import annotations
@@ -18,19 +18,22 @@ from jeit.touch.listening.labelled_clips import LabelledClips
 from jeit.touch.listening.learners import Lesson
 
 LOUD = 0.01
-"""A recording sounds like those of its windows whose loudest frame has this share of its loudest one's power."""
-# Windows of one piece that are learnt from, at most, spread evenly: more of one sound teach little.
+"""Least loudness of a window that is used, as a share of the power of the recording's loudest frame."""
+# The greatest number of training windows of one piece, spread evenly: more of one sound add little.
 _OF_A_PIECE = 40
-# Seconds: clips that are longer are cut into pieces; so long is a piece of a sound that does not end.
+# Seconds: clips longer than this are cut into pieces; the length of a piece of a sound that does not end.
 _LONG, _PIECE = 4.0, 2.0
-# Pieces of one clip, at most, and parts of a class's only clip that are held out by themselves.
+# The greatest number of pieces of one clip, and of parts of a class's only clip that are held out by themselves.
 _PIECES, _PARTS = 60, 6
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Windows that are learnt from: `images`, of which `clip` (W,) each, or piece of a longer one, and `right` (W,),
-    numbers of the `names`; of each clip the class, `right_of_clip`, and the group, `group_of_clip`. `notes` on them."""
+    """Windows of a training set.
+
+    `images`: the windows; `clip` (W,): the clip, or piece of a longer one, that each is from; `right` (W,): its class,
+    an index of `names`; `right_of_clip` and `group_of_clip`: the class and the group of each clip; `notes` on them.
+    """
 
     images: SoundImages
     clip: np.ndarray
@@ -42,7 +45,7 @@ class Windows:
 
     @classmethod
     def of(cls, clips: LabelledClips, report: Callable[[str], None]) -> "Windows":
-        """Of clips: those near the loudest of each. Raises `ValueError` for clips without numbers."""
+        """Take the windows near the loudest of each clip. Raises `ValueError` for clips without numbers."""
         names, right = np.unique(clips.labels, return_inverse=True)
         group = np.unique(clips.groups, return_inverse=True)[1]
         alone = {one for one in range(len(names)) if len(np.unique(group[right == one])) < 2}
@@ -77,21 +80,21 @@ class Windows:
 
     @property
     def levelled(self) -> "Windows":
-        """The same, all of them equally loud."""
+        """The same windows, all of them equally loud."""
         return replace(self, images=self.images.levelled)
 
     @property
     def classes(self) -> int:
-        """C."""
+        """The number of classes, C."""
         return len(self.names)
 
     def lesson(self, rows: np.ndarray, key: Array, batches: int, checkpoint: Path | None, report) -> Lesson:
-        """What some windows (W,) teach."""
+        """Create a training set from some of the windows (W,)."""
         groups = self.group_of_clip[self.clip[rows]]
         return Lesson(self.images[rows], self.right[rows], groups, self.classes, key, batches, checkpoint, report)
 
     def named(self, odds: Float[np.ndarray, "W C"]) -> tuple[np.ndarray, np.ndarray]:
-        """What is said of every clip that was held out, as a whole, and its class."""
+        """The predicted class of every held-out clip as a whole, and its true class."""
         out = np.isfinite(odds).all(axis=1)
         share = odds[out] - np.logaddexp.reduce(odds[out], axis=1, keepdims=True)
         clips, own = np.unique(self.clip[out], return_inverse=True)
@@ -100,7 +103,7 @@ class Windows:
         return total.argmax(axis=1), self.right_of_clip[clips]
 
     def errors(self, odds: Float[np.ndarray, "W C"]) -> tuple[float, float]:
-        """Shares of clips, and of windows, that were held out and named wrong."""
+        """Error rates of held-out clips, and of held-out windows."""
         out = np.isfinite(odds).all(axis=1)
         if not out.any():
             return 0.0, 0.0
@@ -109,8 +112,11 @@ class Windows:
 
 
 def _pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
-    """Which of the loud windows, at `times`, are pieces of their own: no sample is in two. Those without a gap of a
-    window's length between them are one sound, which is cut every 2 s, and what is on both sides of a cut left out."""
+    """Split the loud windows, at `times`, into pieces that share no samples.
+
+    Windows without a gap of a window's length between them are one sound, which is cut every 2 s; windows that extend
+    over a cut are left out.
+    """
     pieces, every = [], _PIECE + LENGTH
     for sound in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > LENGTH) + 1):
         since = times[sound] - times[sound[0]]

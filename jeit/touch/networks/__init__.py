@@ -1,8 +1,8 @@
-"""Networks that image: from a skin's voltages to a map of how deep it is indented, learnt from simulated touches.
+"""Networks that estimate a map of indentation depth from a skin's voltages, learnt from simulated touches.
 
-`learn_images` makes the touches of a described skin, trains a network, and keeps it; `read_network` reads it again, and
-`ImageNetwork.depth` images frames. Two designs: "three-stages", that of Park et al. 2022, and "unrolled", which is
-trained through the skin's forward model.
+`learn_images` simulates the touches of a described skin, trains a network, and stores it; `read_network` reads it, and
+`ImageNetwork.depth` images frames. There are two designs: "three-stages", that of Park et al. 2022, and "unrolled",
+which is trained through the skin's forward model.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Touches that networks learn from: in memory, or in the store of a set that may be larger."""
+"""Training touches of networks: in memory, or in the store of a set that may be larger."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jeit.design.study.store import Store
 from jeit.touch.simulate import IndentSet
 from jeit.touch.training import ArrayRows, Rows
 
-# Touches that are in memory, and mixed, at once, at most: 120 MB of 94 channels and 48 × 48 maps.
+# The greatest number of touches that are in memory, and mixed, at once: 120 MB of 94 channels and 48 × 48 maps.
 _AT_ONCE = 12_000
 
 
@@ -21,7 +21,7 @@ class Touches(Protocol):
     """Relative changes "change" (n, M) without noise, and maps "depth" (n, rows, columns) over the thickness."""
 
     def rows(self, *names: str) -> Rows:
-        """Those of these names, float32, in this order; arrays alone where one is asked for."""
+        """The arrays of these names, float32, in this order; an array by itself where one is requested."""
         ...
 
 
@@ -39,8 +39,10 @@ class Examples(NamedTuple):
 
 
 class StoredTouches:
-    """The touches of a set that `simulate_presses` has finished, read from its store when they are asked for: as many
-    of its chunks at once as make `at_once` touches, or fewer."""
+    """The touches of a finished set of `simulate_presses`, read from its store on access.
+
+    As many of its chunks are read at once as make `at_once` touches, or fewer.
+    """
 
     def __init__(self, indents: IndentSet, path: str | Path, at_once: int = _AT_ONCE):
         """Raises `ValueError` for a store that is not finished, and as `Store` does."""
@@ -52,21 +54,21 @@ class StoredTouches:
             )
         self.fingerprint = hashlib.sha256(repr(sorted(checksums.items())).encode()).hexdigest()
         self._arrays = store.open_dataset()
-        # As even as may be: none is to be smaller than a batch.
+        # As evenly as possible: none is to be smaller than a batch.
         number = min(-(-indents.number // at_once), len(chunks))
         parts = np.array_split(np.arange(len(chunks)), number)
         self.spans = [range(chunks[part[0]].start, chunks[part[-1]].stop) for part in parts]
 
     def rows(self, *names: str) -> "StoredRows":
-        """As of `Touches`, chunk by chunk."""
+        """The arrays of `Touches`, chunk by chunk."""
         return StoredRows(self, names)
 
     def in_memory(self) -> Examples:
-        """All of them."""
+        """Read all touches into memory."""
         return Examples(self._arrays["change"].to_numpy(), self._arrays["depth"].to_numpy())
 
     def read(self, name: str, number: int) -> Float[np.ndarray, "n *shape"]:
-        """An array of one chunk, float32."""
+        """Read an array of one chunk, float32."""
         span = self.spans[number]
         return self._arrays[name][span.start : span.stop].to_numpy().astype(np.float32, copy=False)
 
@@ -84,10 +86,10 @@ class StoredRows:
 
     @property
     def fingerprint(self) -> str:
-        """Of the touches, how they are parted, and which arrays are read."""
+        """Fingerprint of the touches, of their chunks, and of which arrays are read."""
         return f"{self._touches.fingerprint} {' '.join(self._names)} {self.sizes}"
 
     def chunk(self, number: int):
-        """Those of one chunk; an array alone where there is one name."""
+        """Read the arrays of one chunk; an array by itself where there is one name."""
         arrays = tuple(self._touches.read(name, number) for name in self._names)
         return arrays[0] if len(arrays) == 1 else arrays

@@ -1,4 +1,4 @@
-"""`ImageNetwork`: voltages of a skin to maps of how deep it is indented, by a network that learnt it; and its file."""
+"""`ImageNetwork`: a trained network that estimates maps of indentation depth from a skin's voltages; and its file."""
 
 from __future__ import annotations
 
@@ -31,16 +31,18 @@ from jeit.touch.training import check_same, read_model, write_model
 
 DESIGNS = ("unrolled", "three-stages")
 _KIND, _VERSION = "a jeit image network", 1
-# Of an unrolled network.
+# The greatest number of steps of an unrolled network.
 _MOST_STEPS = 100
 FILE = "network.jeit"
-# Frames that are imaged at once, at most: more leave the cache. JAX compiles for every number of them that is 2ⁿ.
+# The greatest number of frames that are imaged at once: more exceed the cache. JAX compiles for every such number that
+# is 2ⁿ.
 _AT_ONCE = 64
-# Maps are not to be believed where they bulge more than they are indented, and so many times what noise makes, and so
-# much of the squared change, so many times the noise, is explained by no touch; and where they are so many times as
-# deep as the skin. That much unexplained alone says little: a network that has learnt little misses many touches.
+# Maps are unreliable where they bulge more than they are indented, by so many times the noise floor, and so large a
+# share of the squared change, which exceeds so many times the noise, is explained by no touch; and where they are
+# deeper than so many times the skin's thickness. An unexplained share alone is no evidence: a network that has learnt
+# little misses many touches.
 _UNEXPLAINED, _LOUD, _TOO_DEEP, _BULGE = 0.6, 3.0, 1.2, 3.0
-# Relative changes beyond this are of no touch.
+# Relative changes beyond this are not due to touch.
 _GREATEST = 100.0
 
 
@@ -63,7 +65,7 @@ class ImageNetwork:
 
     @classmethod
     def of_skin(cls, network: ThreeStages | Unrolled, skin: Skin, noise: float, shape: tuple[int, int]):
-        """A network that was trained on this skin."""
+        """Create a network that was trained on this skin."""
         design = "unrolled" if isinstance(network, Unrolled) else "three-stages"
         low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
         extent = low_x, high_x, low_y, high_y
@@ -71,26 +73,26 @@ class ImageNetwork:
         return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What it is made of: compiled programs are not pickled, they are made anew."""
+        """Fields without the compiled programs, which are not pickled, but compiled again."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def depth(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "*n rows columns"]:
-        """How deep the skin is indented, metres, of frames (M,) or (n, M), volts, and a `reference` (M,) of the skin
-        that nobody touches.
+        """Estimate the indentation depth, metres, from frames (M,) or (n, M), volts.
 
-        Channels without a reading are NaN; the "unrolled" design takes for them what the others lead it to expect.
-        Maps are the network's answer, whatever it is asked: `doubts` says which of them to believe. Raises
-        `ValueError` for other numbers of channels, and as `changes` does.
+        `reference` (M,): a frame of the untouched skin. Channels without a reading are NaN; the "unrolled" design
+        replaces them by their expected value given the others. Maps are the network's output for any input: `doubts`
+        states which of them are unreliable. Raises `ValueError` for other numbers of channels, and as `changes` does.
         """
         change = self.changes(voltages, reference)
         maps = self.thickness * self.share(change)
         return maps if np.ndim(voltages) == 2 else maps[0]
 
     def changes(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "n M"]:
-        """Relative changes (n, M) of frames and a reference, missing channels filled in.
+        """Relative changes (n, M) of frames and a reference, with missing channels filled in.
 
         Raises `ValueError` where they are infinite or 100 times the reference, and where too many channels are missing:
-        half of them, any for the design "three-stages"."""
+        half of them, any for the design "three-stages".
+        """
         channels = self.made_for["channels"]
         frames = real_array("voltages", voltages, f"frames ({channels},) or (n, {channels}), volts")
         rest = real_array("reference", reference, f"a frame ({channels},), volts")
@@ -116,18 +118,18 @@ class ImageNetwork:
         return filled(change, self._covariance, self.noise) if lost.any() else change
 
     def doubts(self, change: Float[np.ndarray, "n M"], share: Float[np.ndarray, "n rows columns"]) -> list[str]:
-        """Why each of some maps, of `share(change)`, is not to be believed; "" where nothing speaks against it.
+        """State why each map of `share(change)` is unreliable; "" where there is no evidence against it.
 
-        Nothing presses deeper than the skin is thick; and where a map bulges, what it says is pressed in has to explain
-        what changed, by the model, which "unrolled" alone has.
+        Nothing presses deeper than the skin is thick; and where a map bulges, the part that is pressed in has to
+        explain the change by the forward model, which only "unrolled" has.
         """
         found = ["" for _ in share]
         size = np.linalg.norm(change, axis=1)
         loud = size > _LOUD * self.noise * np.sqrt(change.shape[1])
         missed, bulge = np.zeros(len(share)), _BULGE * self.floor / self.thickness
         if isinstance(self.network, Unrolled) and loud.any():
-            felt = np.asarray(self._felt(np.maximum(share, 0)))
-            missed[loud] = (np.linalg.norm(change - felt, axis=1)[loud] / size[loud]) ** 2
+            response = np.asarray(self._response(np.maximum(share, 0)))
+            missed[loud] = (np.linalg.norm(change - response, axis=1)[loud] / size[loud]) ** 2
         for number, one in enumerate(share):
             if missed[number] > _UNEXPLAINED and -one.min() > max(one.max(), bulge):
                 found[number] = (
@@ -143,8 +145,7 @@ class ImageNetwork:
 
     @functools.cached_property
     def floor(self) -> float:
-        """How deep the untouched skin seems to be indented by noise as in the training, metres: the deepest place of
-        64 maps."""
+        """Noise floor of depth, metres: the greatest of 64 maps of an untouched skin with the noise of the training."""
         random = np.random.default_rng(0)
         return self.thickness * float(
             self.share(self.noise * random.normal(size=(64, self.made_for["channels"]))).max()
@@ -156,13 +157,13 @@ class ImageNetwork:
         return self.network.covariance(pixel_places(self.extent, self.shape))
 
     @functools.cached_property
-    def _felt(self) -> Callable[..., Any]:
+    def _response(self) -> Callable[..., Any]:
         network = self.network
         assert isinstance(network, Unrolled)
         return jax.jit(lambda maps: network.felt(jnp.asarray(maps, jnp.float32)))
 
     def share(self, change: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n rows columns"]:
-        """Depths over the thickness, of `change` relative to a reference (`jeit.touch.simulate.relative_changes`)."""
+        """Depths over the thickness, from `change` relative to a reference (`jeit.touch.simulate.relative_changes`)."""
         number = len(change)
         if not number:
             return np.zeros((0, *self.shape), np.float32)
@@ -190,15 +191,17 @@ class ImageNetwork:
 
 
 def described(protocol: Protocol, centres: ArrayLike, extent: tuple[float, ...]) -> dict[str, Any]:
-    """What a network is made for, as plain values that JSON takes: of a protocol, electrodes at `centres` (L, 2) and a
-    skin in a box, metres."""
+    """Describe what a network is made for, as plain values that JSON takes.
+
+    Of a protocol, electrodes at `centres` (L, 2) and a skin in a box `extent`, metres.
+    """
     places = np.round(1e3 * np.asarray(centres), 3).tolist()
     skin = np.round(1e3 * np.asarray(extent), 3).tolist()
     return {**_channels_of(protocol), "skin_mm": skin, "electrodes_mm": places}
 
 
 def write_network(network: ImageNetwork, path: str | Path) -> None:
-    """Write a network to one file, numbers with a head of JSON. Raises `ValueError` for what is none, and for a folder;
+    """Write a network to one file, numbers with a JSON header. Raises `ValueError` for what is none, and for a folder;
     `OSError` where it cannot be written."""
     check_kind("network", network, ImageNetwork, "an ImageNetwork, as of learn_images")
     head = {
@@ -215,10 +218,11 @@ def write_network(network: ImageNetwork, path: str | Path) -> None:
 
 
 def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
-    """The network of a file that `write_network` made, or of the folder of `learn_images`; nothing in it is executed.
+    """Read a network from a file that `write_network` made, or from the folder of `learn_images`.
 
-    Raises `FileNotFoundError`, and `ValueError` for another file, and where it was trained for another `skin` than is
-    given, with the difference."""
+    Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for another file, and where it was
+    trained for another `skin` than is given, with the difference.
+    """
     path = Path(path)
     path = path / FILE if path.is_dir() else path
     head, network = read_model(path, _KIND, _VERSION, _untrained)
@@ -256,7 +260,7 @@ def _untrained(head: dict[str, Any]) -> ThreeStages | Unrolled:
 
 
 def _channels_of(protocol: Protocol) -> dict[str, Any]:
-    """Of a protocol: how many channels and electrodes, and what is driven and read, whatever current is."""
+    """Numbers of channels and electrodes of a protocol, and its drive and measurement patterns, for any current."""
     drive, measured = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     patterns = np.round(np.concatenate([drive / np.abs(drive).max(), measured / np.abs(measured).max()]), 6) + 0.0
     return {

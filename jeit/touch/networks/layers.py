@@ -24,7 +24,7 @@ class Dense(eqx.Module):
         self.bias = jnp.zeros(outputs, jnp.float32)
 
     def __call__(self, values: Float[Array, "b i"]) -> Float[Array, "b o"]:
-        """Of a batch."""
+        """Apply the layer to a batch."""
         return values @ self.weight + self.bias
 
 
@@ -36,25 +36,27 @@ class Convolution(eqx.Module):
     stride: int = eqx.field(static=True)
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, *, key: Array):
-        """Of images of so many channels."""
+        """Create the layer for images with `inputs` channels."""
         self.weight = _start(key, (3, 3, inputs, outputs), 9 * inputs)
         self.bias = jnp.zeros(outputs, jnp.float32)
         self.stride = stride
 
     def __call__(self, image: Float[Array, "b r c i"]) -> Float[Array, "b p q o"]:
-        """Of a batch."""
+        """Apply the layer to a batch."""
         layout = ("NHWC", "HWIO", "NHWC")
         steps = (self.stride, self.stride)
         return jax.lax.conv_general_dilated(image, self.weight, steps, "SAME", dimension_numbers=layout) + self.bias
 
     def of_doubled(self, image: Float[Array, "b r c i"]) -> Float[Array, "b s d o"]:
-        """The same as of the image `doubled`, in four ninths of the products: two of the three rows, and columns, that
-        a pixel weighs are alike, and their weights are added first."""
+        """Apply the layer to the image `doubled`, in four ninths of the products.
+
+        Of the three rows, and columns, that a pixel weighs, two are equal, and their weights are added first.
+        """
         number, rows, columns, _ = image.shape
         tall = jnp.stack([self.weight.at[1].add(self.weight[2])[:2], self.weight.at[1].add(self.weight[0])[1:]])
         wide = [tall.at[:, :, 1].add(tall[:, :, 2])[:, :, :2], tall.at[:, :, 1].add(tall[:, :, 0])[:, :, 1:]]
         both = jnp.moveaxis(jnp.stack(wide, axis=1), (0, 1), (3, 4)).reshape(2, 2, image.shape[-1], -1)
-        # Padded beforehand: XLA takes twenty times as long for the slopes of a padded convolution of even size.
+        # Padded in advance: XLA takes twenty times as long for the derivatives of a padded convolution of even size.
         framed = jnp.pad(image, ((0, 0), (1, 1), (1, 1), (0, 0)))
         layout = ("NHWC", "HWIO", "NHWC")
         parts = jax.lax.conv_general_dilated(framed, both, (1, 1), "VALID", dimension_numbers=layout)
@@ -78,7 +80,7 @@ class Chain(eqx.Module):
         return cls(tuple(Dense(i, o, key=one) for (i, o), one in zip(pairwise(widths), keys, strict=True)), dropout)
 
     def __call__(self, values: Array, key: Array | None = None) -> Array:
-        """Of a batch; not of a last unit."""
+        """Apply the layers to a batch; there is no unit after the last."""
         for number, layer in enumerate(self.layers):
             if number:
                 values = jax.nn.elu(values)

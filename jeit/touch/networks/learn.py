@@ -1,4 +1,4 @@
-"""`learn_images`: from a skin's description to a network that images its touches; its data, trainings and standing."""
+"""`learn_images`: train a network that images the touches of a described skin, on simulated data, and evaluate it."""
 
 from __future__ import annotations
 
@@ -30,16 +30,20 @@ from jeit.touch.simulate.contact.indent_sets import image_places
 from jeit.touch.training import Plan, Trained
 
 SHAPE = (48, 48)
-# Touches of a chunk; seeds of those learnt from, held out, and of the standing, which nothing is chosen by.
+# The number of touches of a chunk; seeds of the training set, the held-out set, and the test set, which no choice
+# depends on.
 _CHUNK, _SEEDS = 250, (0, 1, 2)
-# Of the standing: a ball of so many metres, so deep in the skin's thickness, on a grid of so many places a side.
+# Of the evaluation: the diameter of a ball, metres, its depth, as a share of the skin's thickness, and the number of
+# places a side.
 _BALL, _DEPTH, _PLACES = 0.015, 0.75, 15
 
 
 @dataclass(frozen=True)
 class Preset:
-    """How much is learnt: `number` of touches, `held_out` ones besides, and the `plan` of every training; that of the
-    `three_stages`, where it is another."""
+    """Size of a training: `number` of touches, `held_out` ones besides, and the `plan` of every training.
+
+    `three_stages`: the plan of that design, where it is another.
+    """
 
     number: int
     held_out: int
@@ -47,7 +51,7 @@ class Preset:
     three_stages: Plan | None = None
 
     def plan_of(self, design: str) -> Plan:
-        """Of one of the designs."""
+        """The plan of a design."""
         return self.three_stages if design == "three-stages" and self.three_stages is not None else self.plan
 
 
@@ -64,12 +68,11 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class ImageStanding:
-    """How well a network images touches that nothing was learnt from.
+    """Accuracy of a network on touches of a test set.
 
-    **Fields**: `explained`, the share of the squares of depths in the touches of a test set that its maps get right,
-    at most 1; `place`, errors of the middle of a single ball, metres, over a grid of places (mean, sd, rms), and
-    `deepest`, its estimated depth over its depth, in the median; `right` and `estimated`, some maps, (k, rows,
-    columns) over the thickness.
+    **Fields**: `explained`, the share of the squares of depths that its maps get right, at most 1; `place`, errors of
+    the centroid of a single ball, metres, over a grid of places (mean, sd, rms), and `deepest`, the median ratio of its
+    estimated to its true depth; `right` and `estimated`, some maps, (k, rows, columns) over the thickness.
     """
 
     explained: float
@@ -81,7 +84,8 @@ class ImageStanding:
 
 @dataclass(frozen=True)
 class LearntImages:
-    """A `network`, the `courses` of its trainings by name, its `standing`; `seconds` of each part of the work."""
+    """A `network`, the `courses` of its trainings by name, its `standing`, and the `seconds` of each part of the
+    work."""
 
     network: ImageNetwork
     courses: dict[str, Trained]
@@ -102,12 +106,12 @@ def learn_images(
 ) -> LearntImages:
     """Simulate touches of a skin, train a network on them, and write it to `folder`, as `network.jeit`.
 
-    Killed at any moment, the same call goes on where it was: touches are in chunks in stores in the folder `work`, and
-    trainings in checkpoints. `preset`: "quick", under two minutes, "full", or one of one's own; `design`: "unrolled", a
-    network that knows the skin's physics, or "three-stages", that of Park et al. 2022. `touches`: how many to learn
-    from, as many as fit on the disk; the preset's unless given. `client`: of a dask cluster, which then simulates.
-    `progress` is called with how far it is. Raises `ValueError` for curved skins, names that there are not, no number,
-    and a folder of another skin's work; `ImportError` without the extras `learn` and `cluster`.
+    Interrupted at any moment, the same call resumes: touches are stored in chunks in the folder `work`, and trainings
+    in checkpoints. `preset`: "quick", under two minutes, "full", or a `Preset`; `design`: "unrolled", a network with
+    the skin's forward model, or "three-stages", that of Park et al. 2022. `touches`: the number of training touches, as
+    many as fit on the disk; the preset's unless given. `client`: of a dask cluster, which then simulates. `progress` is
+    called with a description of the progress. Raises `ValueError` for curved skins, names that there are not, no
+    number, and a folder of another skin's work; `ImportError` without the extras `learn` and `cluster`.
     """
     need_extra("learn", "a network that images touches")
     need_extra("cluster", "a store of simulated touches")
@@ -172,7 +176,7 @@ def learn_images(
 
 
 def stand(network: ImageNetwork, skin: Skin, examples: Examples, seed: int = 0) -> ImageStanding:
-    """How well a network images touches, with the noise that it was trained with."""
+    """Evaluate a network on touches, with the noise that it was trained with."""
     random = np.random.default_rng(seed)
 
     def answered(change):

@@ -1,4 +1,4 @@
-"""Measured frames imaged by a network: one after the other, each as soon as it has come."""
+"""Image measured frames by a network, each as soon as it has come."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jeit.data import Measurement
 from jeit.touch.networks.image_network import ImageNetwork
 from jeit.touch.networks.missing import MOST_MISSING
 
-# Metres that electrodes may be elsewhere than those that a network was trained for.
+# The greatest distance, metres, of electrodes from those that a network was trained for.
 _OFF = 1e-3
 
 
@@ -72,10 +72,12 @@ def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
 
 
 def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarray, " M"]) -> Iterator[FrameDepth]:
-    """Maps of frames (M,), volts, one after the other, beside the frame `rest` (M,) of the untouched skin; everything
-    is compiled before the first is asked for. A frame is refused, and the stream goes on, when it has another number of
-    channels, too many of them are missing, or its map is not to be believed (`ImageNetwork.doubts`). Raises
-    `ValueError` for what are no frames."""
+    """Image frames (M,), volts, one after the other, relative to the frame `rest` (M,) of the untouched skin.
+
+    Everything is compiled before the first frame is requested. A frame is refused, and the stream continues, when it
+    has another number of channels, too many of them are missing, or its map is unreliable (`ImageNetwork.doubts`).
+    Raises `ValueError` for what are no frames.
+    """
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
     network.doubts(np.ones((1, len(rest))), network.share(np.zeros((1, len(rest)))))
     for number, frame in enumerate(frames):

@@ -1,19 +1,22 @@
-"""Channels that a frame has no reading of, told by those that it has."""
+"""Estimate the channels that a frame has no reading of from those that it has."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
 
-# Of the channels, the share without which a frame still says enough.
+# The greatest share of missing channels with which a frame is still used.
 MOST_MISSING = 0.5
 
 
 def filled(
     changes: Float[np.ndarray, "n M"], covariance: Float[np.ndarray, "M M"], noise: float
 ) -> Float[np.ndarray, "n M"]:
-    """Changes whose missing channels, NaN, are what is expected of them, C₂₁ (C₁₁ + noise² 1)⁻¹ y₁, where touches give
-    channels the `covariance` C and those known are y₁; in Gaussian noise of this deviation."""
+    """Replace missing channels, NaN, by their expected value given the others, C₂₁ (C₁₁ + noise² 1)⁻¹ y₁.
+
+    Touches give channels the `covariance` C, and the known changes are y₁; `noise`: standard deviation of Gaussian
+    noise.
+    """
     found = np.array(changes, float)
     known = np.isfinite(found)
     for mask in np.unique(known[~known.all(axis=1)], axis=0):

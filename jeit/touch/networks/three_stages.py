@@ -17,7 +17,7 @@ from jeit.touch.networks.layers import Chain, Convolution, Dense
 
 _HIDDEN, _LATENT, _DROPOUT = 256, 84, 0.03
 _CHANNELS, _CODE = (16, 32, 64), 128
-# Of depths over the thickness, in what the autoencoder of depth maps is given.
+# Noise of depths over the thickness, in the input of the autoencoder of depth maps.
 _NOISE = 0.02
 
 
@@ -28,13 +28,13 @@ class VoltageAutoencoder(eqx.Module):
     decoder: Chain
 
     def __init__(self, channels: int, *, key: Array):
-        """Of so many channels."""
+        """Create an untrained autoencoder of `channels` channels."""
         inwards, outwards = jax.random.split(key)
         self.encoder = Chain.dense((channels, _HIDDEN, _LATENT), key=inwards, dropout=_DROPOUT)
         self.decoder = Chain.dense((_LATENT, _HIDDEN, channels), key=outwards, dropout=_DROPOUT)
 
     def __call__(self, changes: Float[Array, "b M"], key: Array | None = None) -> Float[Array, "b M"]:
-        """The same without noise; with dropout where a key is given."""
+        """Reconstruct changes without noise; with dropout where a key is given."""
         first, second = (None, None) if key is None else jax.random.split(key)
         return self.decoder(jax.nn.elu(self.encoder(changes, first)), second)
 
@@ -53,7 +53,7 @@ class DepthEncoder(eqx.Module):
         self.last = Dense(shape[0] * shape[1] // 64 * _CHANNELS[-1], _CODE, key=last)
 
     def __call__(self, maps: Float[Array, "b r c"]) -> Float[Array, "b 128"]:
-        """Of a batch."""
+        """Encode a batch."""
         image = maps[..., None]
         for layer in self.layers:
             image = jax.nn.elu(layer(image))
@@ -61,7 +61,7 @@ class DepthEncoder(eqx.Module):
 
 
 class DepthDecoder(eqx.Module):
-    """And back."""
+    """128 values to depth maps (b, rows, columns)."""
 
     first: Dense
     layers: tuple[Convolution, ...]
@@ -76,7 +76,7 @@ class DepthDecoder(eqx.Module):
         self.layers = tuple(Convolution(i, o, key=one) for (i, o), one in zip(pairwise(widths), keys, strict=True))
 
     def __call__(self, code: Float[Array, "b 128"]) -> Float[Array, "b r c"]:
-        """Of a batch."""
+        """Decode a batch."""
         image = self.first(code).reshape(len(code), *self.shape, -1)
         for layer in self.layers:
             image = layer.of_doubled(jax.nn.elu(image))
@@ -95,7 +95,7 @@ class DepthAutoencoder(eqx.Module):
         self.encoder, self.decoder = DepthEncoder(shape, key=inwards), DepthDecoder(shape, key=outwards)
 
     def __call__(self, maps: Float[Array, "b r c"], key: Array | None = None) -> Float[Array, "b r c"]:
-        """The same maps; with noise on what it is given where a key is given."""
+        """Reconstruct maps; with noise on the input where a key is given."""
         if key is not None:
             maps = maps + _NOISE * jax.random.normal(key, maps.shape, maps.dtype)
         return self.decoder(jax.nn.elu(self.encoder(maps)))
@@ -120,7 +120,7 @@ class ThreeStages(eqx.Module):
         self.decoder = DepthAutoencoder(shape, key=depth).decoder
 
     def standard(self, changes: Float[Array, "b M"]) -> Float[Array, "b M"]:
-        """Changes, standardised as those that it was trained on."""
+        """Standardise changes by the `mean` and `deviation` of the training set."""
         return (changes - self.mean) / self.deviation
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:

@@ -1,4 +1,4 @@
-"""What image networks learn from: bodies pressed into a skin, and the noise of its readings."""
+"""Training data of image networks: bodies pressed into a skin, and the noise of its readings."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from jeit.touch.simulate import Bar, Disc, Indent, IndentDraws, Joined, Placed, 
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
 from jeit.touch.simulate.contact.indents import relative_changes
 
-# Of the skin's thickness: the least and the greatest depth of a touch; Park et al.'s 10 mm, 1 and 8 mm.
+# Least and greatest depth of a touch, as shares of the skin's thickness; in Park et al., 1 and 8 mm of 10 mm.
 DEPTHS = (0.1, 0.8)
-# How many bodies touch at once, at most.
+# The greatest number of bodies that touch at once.
 _AT_ONCE = 3
-# The paper's limit of detection, of a ball 15 mm across, as so many deviations of the noise; places along a side that
-# are touched to find what it reads.
+# The paper's limit of detection, of a ball 15 mm across, in deviations of the noise; the number of places along a side
+# at which its reading is computed.
 _LIMIT, _DEVIATIONS, _PLACES = 0.7, 3.0, 15
-# Of the skin: no middle of a touch nearer to its edge, of its shorter side.
+# Least distance of a touch's centre from the skin's edge, as a share of its shorter side.
 _MARGIN = 0.04
 
 
@@ -27,7 +27,7 @@ def wrench() -> Joined:
 
 
 def bodies() -> list[AbstractIndenter]:
-    """What is pressed in: bells, balls, discs, bars, and a wrench."""
+    """Bodies that are pressed in: bells, balls, discs, bars, and a wrench."""
     return [
         *(Revolved(Bell(0.02, deviation)) for deviation in (5e-3, 7.5e-3, 10e-3)),
         *(ball(diameter) for diameter in (0.015, 0.020, 0.030)),
@@ -47,14 +47,14 @@ def touch_draws(skin: Skin) -> IndentDraws:
 
 
 def detection_noise(skin: Skin, limit: float = _LIMIT) -> float:
-    """The relative noise of a channel with which a ball 15 mm across under `limit` newtons is just detected: a third of
-    the greatest relative change of any channel, in the median of places all over the skin.
+    """Relative noise of a channel with which a ball 15 mm across under `limit` newtons is just detected.
 
-    Park et al. 2022 detect 0.7 N; a hydrogel of 100 kPa lets the ball in 1.7 mm then.
+    It is a third of the greatest relative change of any channel, in the median of places all over the skin. Park et al.
+    2022 detect 0.7 N; a hydrogel of 100 kPa is then indented by 1.7 mm.
     """
     tip = ball(0.015)
     depth = material("hydrogel").support.pressure(tip, limit).approach
     grid = touches_away_from_the_edge(skin.flat_outline, 0.0075, _PLACES, _PLACES)
     change = relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places])
-    # To four digits, which no order of sums decides.
+    # Rounded to four digits, which do not depend on the order of sums.
     return float(f"{np.median(np.abs(change).max(axis=1)) / _DEVIATIONS:.4g}")

@@ -1,4 +1,4 @@
-"""How the two designs are trained, on touches simulated."""
+"""Train the two designs of image networks, on simulated touches."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from jeit.touch.networks.three_stages import DepthAutoencoder, ThreeStages, Volt
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.training import MappedRows, Objective, Plan, Rows, Trained, fit
 
-# Of the unrolled network: how much the maps of its first steps count, and the misfit beside the last map; the model's
-# own error, relative to the changes; deviations of logarithms of contact impedances that drift, at most; and how many
-# times the noise it is to stand, at most.
+# Of the unrolled network: weights of the maps of its first steps, and of the misfit relative to the last map; the
+# model's own error, relative to the changes; the greatest deviations of logarithms of contact impedances that drift;
+# and the greatest multiple of the noise that it is trained with.
 _EARLY, _MISFIT, _MODEL_ERROR, _DRIFT, _LOUDER = 0.3, 0.05, 0.1, 0.1, 6.0
-# Squares of depths, so that losses are about one before training.
+# Scale of the squares of depths, so that losses are about one before training.
 _SCALE = 0.002
 
 
@@ -34,7 +34,8 @@ class Learnt(NamedTuple):
 
 
 class Runs(NamedTuple):
-    """Trainings, one after the other: their `plan`, `key`, the `folder` of their checkpoints, and who is told."""
+    """Settings of consecutive trainings: their `plan`, `key`, the `folder` of their checkpoints, and `progress`, which
+    is called with a description of the progress."""
 
     plan: Plan
     key: Array
@@ -42,7 +43,7 @@ class Runs(NamedTuple):
     progress: Callable[[str], None] | None = None
 
     def run(self, name: str, network, objective: Objective, training, validation) -> Trained:
-        """One, its key its own by its name."""
+        """Run one training, with a key of its own by its name."""
         key = jax.random.fold_in(self.key, int.from_bytes(name.encode()[:4], "little"))
         kept = None if self.folder is None else self.folder / f"{name}.training"
         report = self.progress
@@ -51,8 +52,10 @@ class Runs(NamedTuple):
 
 
 def train_three_stages(training: Touches, validation: Examples, noise: float, runs: Runs) -> Learnt:
-    """The paper's: an autoencoder of the changes, one of the maps, and what leads from the one to the other while both
-    stay. `noise`: deviation of relative changes."""
+    """Train the paper's design: an autoencoder of the changes, one of the maps, and a projection between them.
+
+    Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of relative changes.
+    """
     shape = validation.depth.shape[1:]
     start = ThreeStages(validation.change.shape[1], shape, key=runs.key)
     mean, deviation = mean_and_deviation(training.rows("change"))
@@ -111,14 +114,16 @@ def train_three_stages(training: Touches, validation: Examples, noise: float, ru
 def train_unrolled(
     start: Unrolled, sensed: Sensed, training: Touches, validation: Examples, noise: float, runs: Runs
 ) -> Learnt:
-    """The network `start`, of a skin already: its maps are to be right, and so are the voltages that the skin's model
-    gives them, under `noise` and contacts that drift."""
+    """Train the network `start`, which is of a skin already, on the error of its maps and of their voltages.
+
+    The voltages are those of the skin's forward model for the maps, with `noise` and drifting contacts.
+    """
     contacts = jnp.asarray(sensed.contacts, jnp.float32)
 
     def loss(network, batch, key):
         change, wanted = batch
         keys = jax.random.split(key, 4)
-        # Most are near what is usual: squares of uniform shares.
+        # Squares of uniform shares: most are near the usual values.
         much, loud = (jax.random.uniform(one, (len(change), 1), change.dtype) ** 2 for one in keys[2:])
         drift = _DRIFT * much * jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
         own = noise * _LOUDER**loud
@@ -129,7 +134,7 @@ def train_unrolled(
             value = value + _EARLY * jnp.mean((one - wanted) ** 2)
         off = own[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
         missed = jnp.mean((network.felt(last) - change) ** 2, axis=1) / off
-        # Its logarithm: touches on electrodes, which the model explains least, would count for more than all others.
+        # The logarithm of the misfit: otherwise touches on electrodes, which the model explains least, would dominate.
         return value / _SCALE + _MISFIT * jnp.mean(jnp.log1p(missed)), network
 
     rows = training.rows("change", "depth"), _noisy(validation, noise)
@@ -138,7 +143,7 @@ def train_unrolled(
 
 
 def shuffled(examples: Examples, seed: int = 0) -> Examples:
-    """The same changes and maps, each with another's: nothing can be learnt of them but what maps are like."""
+    """The same changes and maps, in random pairs: only the distribution of maps can be learnt from them."""
     order = np.random.default_rng(seed).permutation(len(examples.change))
     return examples._replace(depth=examples.depth[order])
 
@@ -149,7 +154,7 @@ def _map_errors(network, batch):
 
 
 def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
-    """Of each column of rows that are arrays (n, M), over all their chunks."""
+    """Mean and deviation of each column of rows that are arrays (n, M), over all their chunks."""
     number, mean, squares = 0, np.zeros(()), np.zeros(())
     for chunk, size in enumerate(rows.sizes):
         own = np.asarray(rows.chunk(chunk), float)
@@ -162,6 +167,6 @@ def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.nd
 
 
 def _noisy(examples: Examples, noise: float) -> tuple[Float[np.ndarray, "n M"], Float[np.ndarray, "n r c"]]:
-    """Changes and maps, with noise that stays: what is held out is the same at every look."""
+    """Changes with noise, and maps; the noise is fixed, so that held-out data are the same in every evaluation."""
     random = np.random.default_rng(0).normal(size=examples.change.shape)
     return np.asarray(examples.change + noise * random, np.float32), examples.depth

@@ -1,8 +1,8 @@
-"""A network that knows the skin's physics: linear images of what its maps do not explain yet, refined by convolutions.
+"""An unrolled network with the skin's forward model: linear images of the residual, refined by convolutions.
 
-Every step images the rest of the changes by matrices of the forward model (one Gauss-Newton step of a Gaussian prior,
-with the noise alone and with drifting contacts besides), and a small convolutional network, the same all over the skin,
-adds to the map. Trained with the misfit of the voltages that the model gives its maps.
+Every step images the residual changes by matrices of the forward model (one Gauss-Newton step with a Gaussian prior,
+with the noise alone and also with drifting contacts), and a small convolutional network, the same all over the skin,
+adds to the map. Training includes the misfit of the voltages that the model gives its maps.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from jeit.touch.networks.layers import Convolution, doubled, unfolded
 from jeit.touch.networks.sensed import Sensed, depth_of, rounded, strength
 
 _WIDE, _NARROW = 24, 16
-# The prior: deviation of a pixel's strength, and length of its correlation over the skin's longer side; how many times
-# the noise is taken for each of the images without drift, the first of which is where maps start; and the drift of
-# logarithms of contacts with which one more is made.
+# The prior: deviation of a pixel's strength, and length of its correlation over the skin's longer side; the multiples
+# of the noise for each of the images without drift, the first of which is the initial map; and the drift of logarithms
+# of contacts in one more image.
 _DEVIATION, _LENGTH, _TIMES, _DRIFT = 0.15, 0.04, (8.0, 1.5), 0.05
 
 
 class Refinement(eqx.Module):
-    """Images (b, rows, columns, i) to changes of a map of twice as many rows and columns: a U of convolutions."""
+    """A convolutional U-net from images (b, rows, columns, i) to changes of a map of twice as many rows and columns."""
 
     inwards: tuple[Convolution, ...]
     outwards: tuple[Convolution, ...]
     last: Convolution
 
     def __init__(self, channels: int, *, key: Array):
-        """Of images of so many channels."""
+        """Create an untrained net for images with `channels` channels."""
         keys = jax.random.split(key, 9)
         self.inwards = (
             Convolution(channels, _NARROW, key=keys[0]),
@@ -46,11 +46,11 @@ class Refinement(eqx.Module):
             Convolution(_NARROW, _NARROW, key=keys[7]),
         )
         last = Convolution(_NARROW, 4, key=keys[8])
-        # Nothing is added at first: what is untrained leaves linear images as they are.
+        # Almost nothing is added at first: an untrained net leaves linear images as they are.
         self.last = eqx.tree_at(lambda one: one.weight, last, 0.01 * last.weight)
 
     def __call__(self, images: Float[Array, "b r c i"]) -> Float[Array, "b s d"]:
-        """Of a batch."""
+        """Apply the net to a batch."""
         elu = jax.nn.elu
         first = elu(self.inwards[0](images))
         second = elu(self.inwards[2](elu(self.inwards[1](first))))
@@ -61,11 +61,11 @@ class Refinement(eqx.Module):
 
 
 class Unrolled(eqx.Module):
-    """Relative changes (b, M) to depth maps (b, rows, columns) over the skin's thickness.
+    """A network from relative changes (b, M) to depth maps (b, rows, columns) over the skin's thickness.
 
-    **Fields**: `operator` (M, P), what pixels change; `imagers` (M, p, k), transposed matrices of linear images on
-    pixels twice as wide; `still` (rows / 2, columns / 2, s), of the skin alone; `scale`, of changes in the images; the
-    `steps`. All but these are the skin's, and not trained.
+    **Fields**: `operator` (M, P), the response to pixels; `imagers` (M, p, k), transposed matrices of linear images on
+    pixels twice as wide; `still` (rows / 2, columns / 2, s), constant images of the skin; `scale`, of changes in the
+    images; the `steps`. All but these are properties of the skin, and not trained.
     """
 
     operator: Float[Array, "M P"]
@@ -75,7 +75,7 @@ class Unrolled(eqx.Module):
     shape: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, channels: int, shape: tuple[int, int], num_steps: int = 1, *, key: Array):
-        """Of so many channels, and maps of this shape; untrained, and of no skin yet."""
+        """Create an untrained network for so many channels, and maps of this shape, without a skin."""
         rows, columns = shape[0] // 2, shape[1] // 2
         images = len(_TIMES) + 1
         self.operator = jnp.zeros((channels, shape[0] * shape[1]), jnp.float32)
@@ -86,8 +86,11 @@ class Unrolled(eqx.Module):
         self.shape = shape
 
     def of_skin(self, sensed: Sensed, places: Float[np.ndarray, "r c 2"], centres, noise: float) -> "Unrolled":
-        """The same of a skin: what it senses, where its pixels and its electrodes' `centres` (L, 2) are, metres, and
-        the relative `noise` of its channels."""
+        """Return the network for a skin.
+
+        `sensed`: the linear model of its channels; `places` of its pixels and `centres` (L, 2) of its electrodes,
+        metres; `noise`: the relative noise of its channels.
+        """
         operator = sensed.halved()
         covariance = _covariance(places[::2, ::2].reshape(-1, 2))
         across = operator @ covariance
@@ -98,30 +101,30 @@ class Unrolled(eqx.Module):
         imagers = np.stack([np.linalg.solve(own + rest, across) for rest in rests], axis=-1)
         middles = places.reshape(self.shape[0] // 2, 2, self.shape[1] // 2, 2, 2).mean(axis=(1, 3))
         distance = np.linalg.norm(middles[..., None, :] - np.asarray(centres), axis=-1).min(axis=-1)
-        felt = np.log(np.linalg.norm(operator, axis=0).reshape(distance.shape) + 1e-9)
-        still = np.stack([distance / distance.max(), (felt - felt.mean()) / felt.std()], axis=-1)
+        response = np.log(np.linalg.norm(operator, axis=0).reshape(distance.shape) + 1e-9)
+        still = np.stack([distance / distance.max(), (response - response.mean()) / response.std()], axis=-1)
         arrays = [jnp.asarray(rounded(one), jnp.float32) for one in (sensed.operator, imagers, still)]
         return eqx.tree_at(lambda one: (one.operator, one.imagers, one.still), self, arrays)
 
     @property
     def trained(self) -> "Unrolled":
-        """A tree of truth values: what is trained of it."""
+        """A tree of truth values: which leaves are trained."""
         nothing = jax.tree.map(lambda _: False, self)
         return eqx.tree_at(lambda one: one.steps, nothing, jax.tree.map(eqx.is_inexact_array, self.steps))
 
     def covariance(self, places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
-        """Of the changes of channels, where pixels at these places have strengths of the prior."""
+        """Covariance of the changes of channels, for pixels at these places with strengths of the prior."""
         rows, columns = self.shape[0] // 2, self.shape[1] // 2
         operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
         operator = operator.reshape(len(operator), -1)
         return operator @ _covariance(places[::2, ::2].reshape(-1, 2)) @ operator.T
 
     def felt(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
-        """Relative changes that the model gives maps."""
+        """Relative changes that the forward model predicts for maps."""
         return strength(maps).reshape(len(maps), -1) @ self.operator.T
 
     def each(self, changes: Float[Array, "b M"]) -> list[Float[Array, "b r c"]]:
-        """Maps after each of its steps."""
+        """Maps after each of the steps."""
         number, (rows, columns) = len(changes), (self.shape[0] // 2, self.shape[1] // 2)
         still = jnp.broadcast_to(self.still, (number, *self.still.shape))
         found = []
@@ -139,12 +142,12 @@ class Unrolled(eqx.Module):
         return found
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
-        """After the last."""
+        """Map after the last step."""
         return self.each(changes)[-1]
 
 
 def _covariance(places: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
-    """Of strengths: Gaussian in the distance."""
+    """Gaussian covariance of strengths as a function of distance."""
     length = _LENGTH * np.ptp(places, axis=0).max()
     squared = ((places[:, None] - places) ** 2).sum(axis=-1)
     return _DEVIATION**2 * np.exp(-squared / (2 * length**2))

@@ -1,4 +1,4 @@
-"""Pictures of touches, and of what is learnt from them."""
+"""Plot touches, and how well models of them were learnt."""
 
 from __future__ import annotations
 

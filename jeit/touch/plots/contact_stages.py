@@ -1,4 +1,4 @@
-"""Every step from image to contacts, beside each other."""
+"""Plot every step of finding contacts in an image, side by side."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _TITLES = ("region of interest", "grey", "adaptive threshold", "opened", "contou
 
 
 def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarray | None = None) -> np.ndarray:
-    """Draw what every step of `RasterFinder` made of an image, on six axes: region of interest with its unit, grey,
-    threshold, opened, contours, and centroids in millimetres over the region.
+    """Draw the result of every step of `RasterFinder` on six axes.
 
-    `stages`: `finder.stages(image, noise)`. `unit` of the image. `axes` (6,) to draw on, those of a new figure unless
-    given. Raises `ValueError` for what are no stages, and another number of axes.
+    They are the region of interest with its unit, grey levels, threshold, opened mask, contours, and centroids in
+    millimetres over the region. `stages`: `finder.stages(image, noise)`; `unit`: the unit of the image; `axes` (6,) to
+    draw on, those of a new figure unless given. Raises `ValueError` for what are no stages, and another number of axes.
     """
     check_kind("stages", stages, RasterStages, "what finder.stages(image, noise) of a RasterFinder gives")
     axes = _six() if axes is None else np.asarray(axes, object).ravel()
@@ -29,7 +29,7 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     strongest = factor * largest(stages.region) or 1.0
     keywords = {"cmap": "RdBu_r", "vmin": -strongest, "vmax": strongest}
     region = _drawn(axes[0], factor * stages.region, stages, keywords)
-    # No taller than its image, however tall the axes are that six images share.
+    # No taller than its image, however tall the axes are that the six images share.
     bar = axes[0].inset_axes((1.02, 0.1, 0.035, 0.8))
     draw_colour_bar(axes[0], region, f"Change ({with_prefix})", signed=True, place=bar)
     black = {"cmap": "gray", "vmin": 0, "vmax": 255}

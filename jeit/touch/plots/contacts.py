@@ -1,4 +1,4 @@
-"""Contacts over the image that they were found in."""
+"""Plot contacts over the image in which they were found."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def plot_contacts(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw an image (m,) with the outline of every contact, a cross at its centroid, and where that is in millimetres.
+    """Draw an image (m,) with the outline of every contact, a cross at its centroid, and the centroid in millimetres.
 
     Arguments as in `plot_image`. Raises `ValueError` as it does, and for what are no contacts.
     """
@@ -41,7 +41,8 @@ def plot_contacts(
 
 
 def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axes:
-    """Outlines, crosses and places of contacts, on axes in metres. Raises `ValueError` for what are no contacts."""
+    """Draw outlines, centroids and coordinates of contacts, on axes in metres. Raises `ValueError` for what are no
+    contacts."""
     check_contacts(contacts)
     ax = axes_or_new(ax)
     for contact in contacts:
@@ -65,12 +66,12 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
 
 
 def check_contacts(contacts) -> None:
-    """Raises `ValueError` for what are no contacts."""
+    """Check that these are contacts. Raises `ValueError` for what are no contacts."""
     check_kind("contacts", contacts, (list, tuple), "a list of contacts, as of find_contacts(finder, image)")
     for number, contact in enumerate(contacts):
         check_kind(f"contacts[{number}]", contact, Contact, "a Contact")
 
 
 def largest(values: np.ndarray) -> float:
-    """The greatest magnitude of what is not NaN; 0 of nothing."""
+    """The greatest magnitude of the finite values; 0 if there are none."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))

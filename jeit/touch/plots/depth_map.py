@@ -1,4 +1,4 @@
-"""Maps of how deep a skin is indented; and how a training went."""
+"""Plot maps of the indentation depth of a skin, and the losses of a training."""
 
 from __future__ import annotations
 
@@ -32,8 +32,10 @@ def plot_depth_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a map of depth (rows, columns), metres, row 0 at the least y, over `extent` (x_min, x_max, y_min, y_max),
-    metres, as of `ImageNetwork`; `most`, the depth at the end of the colours. Raises `ValueError` for what is no map.
+    """Draw a map of indentation depth (rows, columns), metres, row 0 at the least y, as `ImageNetwork` estimates.
+
+    `extent`: (x_min, x_max, y_min, y_max), metres; `most`: the depth at the end of the colour scale. Raises
+    `ValueError` for what is no map.
     """
     depth = real_array("depth", depth, "a map (rows, columns) of depths in metres")
     if depth.ndim != 2:
@@ -53,8 +55,10 @@ def plot_depth_map(
 
 
 def plot_losses(courses: Mapping[str, Trained], *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the losses of trainings, by name, as of `jeit.touch.training.fit`: of the rows held out, relative to the
-    first look, and where each was best. Raises `ValueError` for what are none."""
+    """Draw the held-out losses of trainings by name, relative to the first evaluation, and mark the best of each.
+
+    `courses`: as from `jeit.touch.training.fit`. Raises `ValueError` for what are none.
+    """
     check_kind("courses", courses, Mapping, "trainings by name, such as learnt.courses")
     ax = axes_or_new(ax)
     for (name, trained), colour in zip(courses.items(), SERIES_COLOURS * len(courses), strict=False):

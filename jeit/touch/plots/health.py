@@ -1,4 +1,4 @@
-"""A skin and what happened to it: cuts as lines, electrodes that fail as crosses, over an image or the bare skin."""
+"""Plot the damage of a skin: cuts as lines, failed electrodes as crosses, over an image or the bare skin."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ def plot_health(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a skin with its cuts, those that are mended dashed, how long they are and how well that is known, when they
-    were made, and a cross on every electrode that has failed; over an `image` (m,) of it, if one is given.
+    """Draw a skin with its cuts and failed electrodes, over an `image` (m,) of it, if one is given.
 
-    `scale` as in `plot_image`. Raises `ValueError` for a skin without a model, and as `plot_image` does.
+    Each cut is labelled with its length, the standard deviation of the length, and when it was made; mended cuts are
+    dashed. A cross marks every electrode that has failed. `scale` as in `plot_image`. Raises `ValueError` for a skin
+    without a model, and as `plot_image` does.
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(frames, model=model, …)")
     if health.skin is None:
@@ -64,12 +65,12 @@ def _draw_cut(ax: Axes, event: HealthEvent) -> None:
     colour = _MENDED if mended else _CUT
     style = (0, (2.5, 1.5)) if mended else "-"
     ax.plot(*path.T, color=colour, linestyle=style, linewidth=2.4, zorder=5, path_effects=_HALO)
-    # No finer than it is known.
+    # The deviation is omitted where it rounds to 0 mm.
     known = f" ± {1e3 * event.deviation:.0f}" if 1e3 * event.deviation >= 0.5 else ""
     said = f"{'mended' if mended else 'cut'}, {1e3 * event.length:.0f}{known} mm, at {event.time:.4g} s"
     low, high = ax.get_xlim()
     top = path[path[:, 1].argmax()]
-    # A label by the edge of the skin grows away from it.
+    # A label near the edge of the skin extends away from the edge.
     share = (top[0] - low) / (high - low)
     aligned = "left" if share < 0.25 else "right" if share > 0.75 else "center"
     ax.annotate(

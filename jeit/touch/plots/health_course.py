@@ -1,4 +1,4 @@
-"""A skin's change from how it was when healthy, in time, and what was told of it when."""
+"""Plot the change of a skin from its healthy state over time, and the events that were detected."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from jeit.plot.axes import INK, SERIES_COLOURS, SOFT, axes_or_new, soften_axes
 from jeit.touch.health import EventKind, SkinHealth
 from jeit.touch.health.lasting import size_of
 
-# Events that are written beside their lines, at most; and the least height of the axes, times the limit.
+# The greatest number of events that are labelled; and the least height of the axes, as a multiple of the limit.
 _WRITTEN, _LEAST = 12, 1.5
 
 
 def plot_health_course(
     health: SkinHealth, times: ArrayLike, frames: ArrayLike, *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw how far frames (F, M) at `times` (F,) are from the healthy skin, times the limit that a lasting change
-    exceeds, and a line for every event at the time that it began.
+    """Draw the change of frames (F, M) at `times` (F,) from the healthy skin, and a line at the time of every event.
 
-    Touches stand out, as far as damage may, and come back; damage stays. Raises `ValueError` for shapes that disagree.
+    The change is in multiples of the limit that a lasting change exceeds. Touches stand out as far as damage may, but
+    come back; damage stays. Raises `ValueError` for shapes that disagree.
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of watch(health, frames)")
     when, read = np.asarray(times, float), np.asarray(frames, float)

@@ -1,4 +1,4 @@
-"""What was heard in time: how probable each name is, and which one is told."""
+"""Plot the classification of sounds over time: the probability of each name, and the name that is chosen."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jeit.touch.listening.feature_images import EVERY
 
 
 def plot_heard(heard: Heard, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the probabilities of all names in time, a row each, a bar under the name that is told; quiet is blank."""
+    """Draw the probabilities of all names over time, a row each, with a bar under the chosen name; quiet is blank."""
     ax = axes_or_new(ax, (8.0, 3.2))
     names, times = heard.names, heard.times
     shown = np.where((heard.named != "")[:, None], heard.probabilities, np.nan).T

@@ -1,4 +1,4 @@
-"""A self-organising map: its net of neurons, and what each of them says."""
+"""Plot a self-organising map: its net of neurons, and a value for each of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jeit.arguments import check_kind, real_array
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar, extent_of
 from jeit.touch.kohonen import MapTouch
 
-# Area of a neuron's mark, points², of a map of as many neurons as one of 32 by 32.
+# Area of a neuron's mark, points², in a map with as many neurons as one of 32 by 32.
 _MARK, _NEURONS = 26.0, 1024
 
 
@@ -27,11 +27,13 @@ def plot_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the net of a map's neurons at `places` (R, C, 2), neighbours joined, those that are NaN left out.
+    """Draw the net of a map's neurons at `places` (R, C, 2), neighbours joined; neurons whose place is NaN are left
+    out.
 
-    `places`: in metres, as of `PlacedMap.places`; or anywhere (`on_skin=False`, without a scale bar), as of
-    `drawn_map`. `values` (R, C) of neurons, such as the activity of a frame, in colour, named `label`. `touches`: a
-    cross for each. Raises `ValueError` for arrays of other shapes, and a map none of whose neurons has a place.
+    `places`: in metres, as of `PlacedMap.places`; or in any unit (`on_skin=False`, without a scale bar), as of
+    `drawn_map`. `values` (R, C) of neurons, such as the activity of a frame, are drawn in colour and named `label`.
+    `touches`: a cross for each. Raises `ValueError` for arrays of other shapes, and a map none of whose neurons has a
+    place.
     """
     places = real_array("places", places, "places (R, C, 2) of neurons")
     if places.ndim != 3 or places.shape[2] != 2:

@@ -1,4 +1,4 @@
-"""How well a skin learnt: errors of presses held out, over the skin, against force, between labels, and of keys."""
+"""Plot the errors of a learnt skin on held-out presses: of places, forces, labels and keys."""
 
 from __future__ import annotations
 
@@ -19,13 +19,15 @@ from jeit.plot.axes import (
 )
 from jeit.touch import Standing
 
-# Labels that are written beside a confusion matrix, at most.
+# The greatest number of labels that are written beside a confusion matrix.
 _MOST_WRITTEN = 24
 
 
 def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw how far off places of presses held out were told, where they were, in millimetres. `place`: the standing of
-    that name of a `LearntSkin`."""
+    """Draw the errors of the places estimated for held-out presses, at the true places, in millimetres.
+
+    `place`: the standing of that name of a `LearntSkin`.
+    """
     ax = axes_or_new(ax)
     off = 1e3 * np.linalg.norm(place.held_out - place.right, axis=1)
     extent = extent_of(place.right)
@@ -40,7 +42,7 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
 
 
 def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw forces told of presses held out against those that pressed, in newtons."""
+    """Draw the forces estimated for held-out presses against the true forces, in newtons."""
     ax = axes_or_new(ax)
     right, said = force.right[:, 0], force.held_out[:, 0]
     ends = [min(right.min(), said.min()), max(right.max(), said.max())]
@@ -56,7 +58,7 @@ def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | N
 
 
 def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw which labels presses held out were given, in per cent of the presses of each kind."""
+    """Draw the confusion matrix of held-out presses, in per cent of the presses of each label."""
     ax = axes_or_new(ax)
     kinds = np.unique(label.right)
     counts = np.array([[np.sum((label.right == one) & (label.held_out == other)) for other in kinds] for one in kinds])
@@ -79,7 +81,7 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
 
 
 def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the share of presses held out of which each key was told wrongly, in per cent."""
+    """Draw the share of held-out presses in which each key was classified wrongly, in per cent."""
     ax = axes_or_new(ax)
     wrong = 100 * np.mean(keys.held_out != keys.right, axis=0)
     ax.bar(range(len(wrong)), wrong, color=SERIES_COLOURS[0], width=0.7)
@@ -95,8 +97,7 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
 
 
 def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw how many of the presses held out each of the methods that were tried told rightly, per cent, the best on
-    top."""
+    """Draw the accuracy on held-out presses of each method that was tried, in per cent, the best on top."""
     ax = axes_or_new(ax)
     names, right = [one for one, _ in label.tried], [100 * (1 - error) for _, error in label.tried]
     colours = [SERIES_COLOURS[0] if one == label.method else "#c9d3de" for one in names]

@@ -1,4 +1,4 @@
-"""Named touches in time, a lane for each gesture beneath the change that they made; and their paths on the skin."""
+"""Plot named touches over time, in a lane for each gesture beneath the change that they made, and their paths."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.mesh import draw_outline
 from jeit.touch.gestures.touch_watch import NamedTouch
 
-# A curve is broken where nothing came for so many times the usual; points of a curve, at most; the shortest bar, of the
-# whole time; touches that are numbered, at most.
+# A curve is interrupted where no frame came for this multiple of the usual interval; the greatest number of points of a
+# curve; the shortest bar, as a share of the whole time; the greatest number of touches that are numbered.
 _UNSEEN, _POINTS, _SHORTEST, _NUMBERED = 10.0, 3000, 0.003, 60
 _UNLIKE = "#b9bdc4"
 
@@ -44,7 +44,7 @@ def plot_changes(
 ) -> Axes:
     """Draw the greatest change (F,) of frames at `seconds` (F,), and the level that a touch exceeds, both in `unit`.
 
-    Frames that were refused, NaN, leave gaps. Raises `ValueError` for shapes that disagree.
+    Refused frames, which are NaN, leave gaps. Raises `ValueError` for shapes that disagree.
     """
     when, values = np.asarray(seconds, float), np.asarray(peaks, float)
     if when.shape != values.shape or when.ndim != 1:
@@ -65,10 +65,10 @@ def plot_changes(
 def plot_timeline(
     touches: Sequence[NamedTouch], names: Sequence[str], *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw named touches from onset to end, in the lane of the gesture that each was told to be: the fainter, the less
-    probable; what is unlike any that was learnt in a lane of its own. `names` (C,) of the gestures.
+    """Draw named touches from onset to end, each in the lane of its predicted gesture.
 
-    Raises `ValueError` for what are no named touches.
+    The less probable the gesture, the fainter the bar; touches unlike any in the training set have a lane of their own.
+    `names` (C,) of the gestures. Raises `ValueError` for what are no named touches.
     """
     check_named(touches)
     ax = axes_or_new(ax, (9.0, 2.6))
@@ -113,10 +113,9 @@ def plot_touch_paths(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the skin and where touches went, each a line from a dot where it began, in the colour of its gesture, with
-    its number.
+    """Draw the skin and the paths of touches, each a line from a dot at its start, in the colour of its gesture.
 
-    Raises `ValueError` for what are no named touches.
+    The number of each touch is written beside it. Raises `ValueError` for what are no named touches.
     """
     check_named(touches)
     ax = axes_or_new(ax)
@@ -143,12 +142,12 @@ def plot_touch_paths(
 
 
 def gesture_colour(one: NamedTouch, names: Sequence[str]) -> str:
-    """Of its gesture; grey for what is unlike any."""
+    """Colour of a touch's gesture; grey for touches unlike any in the training set."""
     return _UNLIKE if one.unlike else SERIES_COLOURS[list(names).index(one.gesture) % len(SERIES_COLOURS)]
 
 
 def check_named(touches) -> None:
-    """Raises `ValueError` for what are no named touches."""
+    """Check that these are named touches. Raises `ValueError` for what are no named touches."""
     check_kind("touches", touches, (list, tuple), "a list of named touches, as TouchWatch.follow gives them")
     for number, one in enumerate(touches):
         check_kind(f"touches[{number}]", one, NamedTouch, "a NamedTouch")
@@ -159,14 +158,14 @@ def _alpha(one: NamedTouch) -> float:
 
 
 def _broken(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """With NaN wherever no frame came for long."""
+    """Insert NaN wherever no frame came for long."""
     passed = np.diff(when)
     gaps = 1 + np.flatnonzero(passed > _UNSEEN * np.median(passed)) if passed.size else np.zeros(0, int)
     return np.insert(when, gaps, when[gaps]), np.insert(values, gaps, np.nan)
 
 
 def _thinned(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A curve of no more points than can be seen, with its extremes."""
+    """Reduce a curve to no more points than can be seen, keeping its extremes."""
     if len(when) <= _POINTS:
         return when, values
     parts = np.array_split(np.arange(len(when)), _POINTS // 2)

@@ -1,4 +1,4 @@
-"""What a learnt skin said of frames: places over the skin, with how sure they are."""
+"""Plot a learnt skin's predictions for frames: places over the skin, with their standard deviations."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from jeit.plot.axes import (
 )
 from jeit.touch import Touches
 
-# Ellipses that are drawn, at most: more would hide each other.
+# The greatest number of ellipses that are drawn: more would hide each other.
 _MOST = 400
 
 
 def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the places told of frames, the later the brighter, in ellipses of one standard deviation.
+    """Draw the estimated places of frames, the later the brighter, with ellipses of one standard deviation.
 
     Raises `ValueError` for touches of a skin that did not learn places.
     """
@@ -64,7 +64,7 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
 
 
 def plot_answers(touches: Touches, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw what was told of frames one after the other: keys that were pressed, labels, or forces in newtons."""
+    """Draw the predictions for consecutive frames: pressed keys, labels, or forces in newtons."""
     ax = axes_or_new(ax)
     frame = np.arange(len(touches))
     if touches.touched is not None:

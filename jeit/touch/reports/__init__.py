@@ -1,4 +1,4 @@
-"""Reports, tables and pictures of touches, and of what is learnt from them, written to a folder."""
+"""Write reports, tables and pictures of touches, and of models learnt from them, to a folder."""
 
 from __future__ import annotations
 

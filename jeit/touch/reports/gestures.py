@@ -1,4 +1,4 @@
-"""What is left of learnt gestures in a folder: the model, a report, and a picture of what was taken for what."""
+"""Write a learnt gesture classifier to a folder: the model, a report, and a picture of the confusion matrix."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ _PACKAGES = ("jeit", "numpy", "scikit-learn", "skops")
 
 
 def write_gestures(learnt: LearntGestures, folder: str | Path, *, name: str = "recordings") -> None:
-    """Write `gestures.skops`, `report.json` and the picture `gestures.png` into `folder`, made if need be; `name`: of
-    the recordings. Raises `ValueError` for what cannot be a folder."""
+    """Write `gestures.skops`, `report.json` and the picture `gestures.png` into `folder`, which is made if need be.
+
+    `name`: the name of the recordings. Raises `ValueError` if `folder` cannot be a folder.
+    """
     with results(folder, GESTURE_FILES) as made:
         learnt.model.write(made / GESTURE_FILE)
         write_json(report_gestures(learnt, name), made / "report.json")
@@ -25,7 +27,7 @@ def write_gestures(learnt: LearntGestures, folder: str | Path, *, name: str = "r
 
 
 def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
-    """How well gestures were learnt, as plain numbers, strings, lists and dictionaries."""
+    """Report how well gestures were learnt, as plain numbers, strings, lists and dictionaries."""
     model, standing = learnt.model, learnt.model.standing
     report: dict[str, Any] = {
         "recordings": name,
@@ -49,7 +51,7 @@ def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
 
 
 def draw_gestures(learnt: LearntGestures):
-    """What was taken for what, and how right each classifier was, as a matplotlib `Figure` that needs no display."""
+    """Draw the confusion matrix and the accuracy of each classifier, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_confusion, plot_tried

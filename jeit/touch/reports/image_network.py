@@ -1,4 +1,4 @@
-"""What is left of learning to image, and of the frames that a network imaged, in folders."""
+"""Write the results of training an image network, and of imaging frames with one, to folders."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from jeit.touch.simulate.contact.indent_sets import pixel_places
 LEARNT_FILES = ("network.jeit", "report.json", "learning.png")
 DEPTH_FILES = ("frames.csv", "depth.npz", "depth.png", "report.json")
 _PACKAGES = ("jeit", "jax", "equinox", "optax", "numpy")
-# Maps that are drawn, at most.
+# The greatest number of maps drawn.
 _DRAWN = 6
-# Numbers of refused frames that a report lists, at most.
+# The greatest number of refused frames that a report lists.
 _LISTED = 1000
 
 
 def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
     """Write `report.json` and the picture `learning.png`, beside the network that `learn_images` wrote.
 
-    Raises `ValueError` for what cannot be a folder.
+    Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, LEARNT_FILES) as made:
         write_json(report_learnt_images(learnt), made / "report.json")
@@ -40,7 +40,7 @@ def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
 
 
 def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
-    """How well a network learnt to image, as plain numbers, strings, lists and dictionaries."""
+    """Report how well a network learnt to image, as plain numbers, strings, lists and dictionaries."""
     network = learnt.network
     trainings = {
         name: {
@@ -70,8 +70,10 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
 
 
 def draw_learnt_images(learnt: LearntImages):
-    """Losses, and maps of touches that nothing was learnt from, right above and told below; a matplotlib `Figure` that
-    needs no display."""
+    """Draw the losses, and maps of held-out touches: true maps above, estimated maps below.
+
+    Returns a matplotlib `Figure` that needs no display.
+    """
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_depth_map, plot_losses
@@ -92,8 +94,10 @@ def draw_learnt_images(learnt: LearntImages):
 
 
 class DeepestFrame(NamedTuple):
-    """The number of a frame in its file, how deep, metres, and where the middle of that is, (2,) metres, NaN where
-    nothing is deeper than noise makes it."""
+    """The deepest frame: its number in the file, its greatest depth in metres, and the centroid of the indentation.
+
+    The centroid is (2,) metres, NaN where no depth exceeds the noise floor.
+    """
 
     number: int
     depth: float
@@ -102,8 +106,11 @@ class DeepestFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenDepths:
-    """What `write_depths` has written: the `number` of frames, how many were `imaged`, the `deepest`, and the `latency`
-    in seconds of those that were imaged, (K,), of many frames some of them, evenly chosen."""
+    """Summary of what `write_depths` has written.
+
+    `number`: the number of frames; `imaged`: how many were imaged; `deepest`: the deepest frame; `latency` (K,):
+    seconds taken by each imaged frame, of many frames an evenly spaced sample.
+    """
 
     number: int
     imaged: int
@@ -120,18 +127,20 @@ def write_depths(
     progress: Callable[[FrameDepth], None] | None = None,
     drawing: Callable[[str], None] | None = None,
 ) -> WrittenDepths:
-    """Write what a network told of the frames `name`: `frames.csv`, a line for each as it comes: `x_m`, `y_m`, the
-    middle of what is deepest, and `depth_m`, how deep; and at the end `depth.npz` with all maps; `depth.png`;
-    `report.json`. There may be any number of frames: their maps grow on the disk, not in memory.
+    """Write the depth maps that a network estimated from the frames `name`.
 
-    `found`: those of `stream_depths`. Maps of frames that were refused are NaN; where nothing is deeper than noise
-    makes it, there is no middle. `progress` is called with every frame, and `drawing` as by `write_stream`. Each file
-    is whole, or not there. Raises `ValueError` for what cannot be a folder, and, leaving no file, where no frame was
-    imaged; `OSError` on a full disk.
+    `frames.csv` has a line for each frame as it comes: `x_m`, `y_m`, the centroid of the indentation, and `depth_m`,
+    its greatest depth. At the end, `depth.npz` with all maps, `depth.png` and `report.json` are written. There may be
+    any number of frames: their maps are kept on disk, not in memory.
+
+    `found`: the frames that `stream_depths` yields. Maps of refused frames are NaN; where no depth exceeds the noise
+    floor, there is no centroid. `progress` is called with every frame, and `drawing` as by `write_stream`. Each file is
+    written whole, or not at all. Raises `ValueError` if `folder` cannot be a folder, and, leaving no file, if no frame
+    was imaged; `OSError` on a full disk.
     """
     where = results_folder(folder, DEPTH_FILES)
     for earlier in DEPTH_FILES[1:]:
-        (where / earlier).unlink(missing_ok=True)  # would not go with these frames
+        (where / earlier).unlink(missing_ok=True)  # would not belong to these frames
     clear_unfinished(where)
     report = drawing or (lambda said: None)
     with GrowingRows(where, network.shape) as rows:
@@ -165,7 +174,7 @@ def write_depths(
 
 
 class _Imaged:
-    """What is kept of the frames that a network imaged, whose number may be any."""
+    """Statistics of the frames that a network imaged, in memory that does not grow with their number."""
 
     def __init__(self, network: ImageNetwork):
         self.network, self._places = network, pixel_places(network.extent, network.shape)
@@ -176,7 +185,7 @@ class _Imaged:
         self.deepest = DeepestFrame(-1, -np.inf, np.full(2, np.nan))
 
     def take(self, one: FrameDepth) -> tuple[list[object], Float[np.ndarray, "rows columns"]]:
-        """The line of a frame in the table, and its map."""
+        """Return the line of a frame in the table, and its map."""
         if one.depth is None:
             self.number_refused += 1
             self.first_reason = self.first_reason or one.reason
@@ -196,7 +205,7 @@ class _Imaged:
         return [one.number, *said], one.depth
 
     def report(self, name: str, number: int) -> dict[str, Any]:
-        """As plain numbers, strings, lists and dictionaries."""
+        """Report the statistics as plain numbers, strings, lists and dictionaries."""
         network = self.network
         return plain(
             {
@@ -222,7 +231,7 @@ def _draw_depths(
     from jeit.touch.plots import plot_depth_map
 
     figure = Figure(figsize=(4.2 * len(maps), 4.2), layout="constrained")
-    # What noise alone makes of the untouched skin is not stretched over the colours.
+    # The colour scale reaches at least 4 times the noise floor, so that noise on an untouched skin does not fill it.
     most = max(deepest, 4 * network.floor)
     for ax, one, number in zip(figure.subplots(1, len(maps), squeeze=False)[0], maps, numbers, strict=True):
         last = number == numbers[-1]

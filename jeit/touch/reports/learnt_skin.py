@@ -1,4 +1,4 @@
-"""What is left of a learnt skin, and of what it said of frames, in folders."""
+"""Write a learnt skin, and its predictions for frames, to folders."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _PACKAGES = ("jeit", "numpy", "scikit-learn", "skops")
 
 
 def write_learnt_skin(skin: LearntSkin, folder: str | Path) -> None:
-    """Write `skin.skops`, `report.json` and the picture `learning.png` into `folder`, made if need be.
+    """Write `skin.skops`, `report.json` and the picture `learning.png` into `folder`, which is made if need be.
 
-    Raises `ValueError` for what cannot be a folder.
+    Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, SKIN_FILES) as made:
         write_skin(skin, made / "skin.skops")
@@ -27,12 +27,12 @@ def write_learnt_skin(skin: LearntSkin, folder: str | Path) -> None:
 
 
 def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str) -> None:
-    """Write `touches.csv`, `report.json` and the picture `touches.png` of what a `skin` said of the frames `name`.
+    """Write `touches.csv`, `report.json` and the picture `touches.png` of a `skin`'s predictions for the frames `name`.
 
-    The table has a line for each frame, from 0: `x_m`, `y_m` (`z_m`), their standard deviations, `force_N`,
+    The table has a line for each frame, numbered from 0: `x_m`, `y_m` (`z_m`), their standard deviations, `force_N`,
     `std_force_N`, `label`, `probability`, `key_0` … (1 where pressed) with `probability_0` …, as far as they were
-    learnt; `unlike`, 1 for frames unlike any learnt from, of which nothing is said. Raises `ValueError` for what
-    cannot be a folder.
+    learnt; `unlike` is 1 for frames unlike any in the training set, for which nothing is predicted. Raises `ValueError`
+    if `folder` cannot be a folder.
     """
     columns = _columns(touches)
     dead = np.flatnonzero(~touches.alive.any(axis=0))
@@ -56,7 +56,7 @@ def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str)
 
 
 def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
-    """How well a skin learnt, as plain numbers, strings, lists and dictionaries."""
+    """Report how well a skin learnt, as plain numbers, strings, lists and dictionaries."""
     return plain(
         {
             "presses": skin.name,
@@ -72,7 +72,7 @@ def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
 
 
 def summary(name: str, standing: Standing) -> str:
-    """How well one thing was learnt, in a line."""
+    """Summarise in one line how well one quantity was learnt."""
     said = _report(name, standing)
     if name == "place":
         mean, median, most, guess = (
@@ -91,7 +91,7 @@ def summary(name: str, standing: Standing) -> str:
 
 
 def draw_learning(skin: LearntSkin):
-    """How well it learnt, as a matplotlib `Figure` that needs no display."""
+    """Draw the errors on held-out presses, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors
@@ -105,7 +105,7 @@ def draw_learning(skin: LearntSkin):
 
 
 def draw_touches(touches: Touches):
-    """What was told of frames, as a matplotlib `Figure` that needs no display."""
+    """Draw the predictions for frames, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_answers, plot_places
@@ -120,7 +120,7 @@ def draw_touches(touches: Touches):
 
 
 def _report(name: str, standing: Standing) -> dict[str, Any]:
-    """Figures of presses held out."""
+    """Error statistics of held-out presses."""
     said: dict[str, Any] = {"method": standing.method, "presses": len(standing.right)}
     if name in ("place", "force"):
         unit = "m" if name == "place" else "N"

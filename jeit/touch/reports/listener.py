@@ -1,4 +1,4 @@
-"""What is left of a listener, and of what it heard in a recording, in folders."""
+"""Write a sound classifier, and its predictions for a recording, to folders."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _PACKAGES = ("jeit", "jax", "numpy", "scipy", "scikit-learn")
 
 
 def write_listener(listener: Listener, folder: str | Path) -> None:
-    """Write `listener.jeit`, `report.json` and the picture `learning.png` into `folder`, made if need be.
+    """Write `listener.jeit`, `report.json` and the picture `learning.png` into `folder`, which is made if need be.
 
-    Raises `ValueError` for what cannot be a folder.
+    Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, LISTENER_FILES) as made:
         listener.write(made / "listener.jeit")
@@ -28,13 +28,13 @@ def write_listener(listener: Listener, folder: str | Path) -> None:
 
 
 def write_heard(heard: Heard, folder: str | Path, *, model: str) -> None:
-    """Write `events.csv`, `report.json` and the picture `timeline.png` of what the listener `model` heard into
-    `folder`, made if need be.
+    """Write `events.csv`, `report.json` and the picture `timeline.png` of the sounds that the listener `model`
+    classified.
 
-    The table has a line for each window, every 0.1 s: `time_s`, its middle; `heard`, the likeliest name, empty where it
-    is quiet; its `probability`, and those of all names, `p_…`; the loudest `microphone`, from 0; and where places were
-    told, `x_m`, `y_m` (`z_m`) and `std_x_m` …, empty where there is none. Raises `ValueError` for what cannot be a
-    folder.
+    `folder` is made if need be. The table has a line for each window, every 0.1 s: `time_s`, the window's middle;
+    `heard`, its likeliest name, empty where it is quiet; the `probability` of that name, and those of all names, `p_…`;
+    the loudest `microphone`, numbered from 0; and, where places were estimated, `x_m`, `y_m` (`z_m`) and `std_x_m` …,
+    empty where there is none. Raises `ValueError` if `folder` cannot be a folder.
     """
     columns = _columns(heard)
     with results(folder, HEARD_FILES) as made:
@@ -44,7 +44,7 @@ def write_heard(heard: Heard, folder: str | Path, *, model: str) -> None:
 
 
 def report_listener(listener: Listener) -> dict[str, Any]:
-    """How well a listener learnt, as plain numbers, strings, lists and dictionaries."""
+    """Report how well a listener learnt, as plain numbers, strings, lists and dictionaries."""
     standing, held_out = listener.standing, None
     if standing is not None:
         right = standing.held_out == standing.right
@@ -71,7 +71,7 @@ def report_listener(listener: Listener) -> dict[str, Any]:
 
 
 def report_heard(heard: Heard, *, model: str) -> dict[str, Any]:
-    """All that was heard, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    """Report the classified sounds as plain numbers, strings, lists and dictionaries; what is not known is None."""
     whole, probability = heard.whole
     names, counts = np.unique(heard.named, return_counts=True)
     events = [
@@ -102,7 +102,7 @@ def report_heard(heard: Heard, *, model: str) -> dict[str, Any]:
 
 
 def summary(listener: Listener) -> str:
-    """How well it learnt, in a line."""
+    """Summarise in one line how well a listener learnt."""
     standing = listener.standing
     if standing is None:
         return "not known: nothing could be held out"
@@ -112,7 +112,7 @@ def summary(listener: Listener) -> str:
 
 
 def draw_listener(listener: Listener):
-    """What was taken for what, as a matplotlib `Figure` that needs no display."""
+    """Draw the confusion matrix of held-out clips, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_confusion
@@ -132,7 +132,7 @@ def draw_listener(listener: Listener):
 
 
 def draw_heard(heard: Heard):
-    """The timeline, as a matplotlib `Figure` that needs no display."""
+    """Draw the timeline of a classified recording, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_heard
@@ -142,18 +142,18 @@ def draw_heard(heard: Heard):
     return figure
 
 
-def _columns(heard: Heard) -> dict[str, list]:
+def _columns(result: Heard) -> dict[str, list]:
     columns: dict[str, list] = {
-        "time_s": [f"{time:.4f}" for time in heard.times],
-        "heard": heard.named.tolist(),
-        "probability": _texts(heard.probability),
-        **{f"p_{name}": _texts(own) for name, own in zip(heard.names, heard.probabilities.T, strict=True)},
-        "microphone": heard.strongest.tolist(),
+        "time_s": [f"{time:.4f}" for time in result.times],
+        "heard": result.named.tolist(),
+        "probability": _texts(result.probability),
+        **{f"p_{name}": _texts(own) for name, own in zip(result.names, result.probabilities.T, strict=True)},
+        "microphone": result.strongest.tolist(),
     }
-    if heard.position is not None and heard.position_std is not None:
-        axes = "xyz"[: heard.position.shape[1]]
-        columns |= {f"{axis}_m": _texts(own) for axis, own in zip(axes, heard.position.T, strict=True)}
-        columns |= {f"std_{axis}_m": _texts(own) for axis, own in zip(axes, heard.position_std.T, strict=True)}
+    if result.position is not None and result.position_std is not None:
+        axes = "xyz"[: result.position.shape[1]]
+        columns |= {f"{axis}_m": _texts(own) for axis, own in zip(axes, result.position.T, strict=True)}
+        columns |= {f"std_{axis}_m": _texts(own) for axis, own in zip(axes, result.position_std.T, strict=True)}
     return columns
 
 

@@ -1,4 +1,4 @@
-"""What became of a watched skin, in a folder: its events, a report, and a picture of them in time and on the skin."""
+"""Write the events of a monitored skin to a folder: a table, a report, and a picture over time and on the skin."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def write_health(
     timed: bool = True,
     notes: Sequence[str] = (),
 ) -> None:
-    """Write `events.csv`, `report.json` and the picture `health.png` of what `watch` told of frames (F, M) at `times`
-    (F,) into `folder`; `timed`: whether these are seconds, or numbers of frames; `notes`, what speaks against it.
+    """Write `events.csv`, `report.json` and the picture `health.png` of the events that `watch` detected.
 
-    A path is written as places x y in metres, parted by semicolons; electrodes are numbered from 1. Raises `ValueError`
-    for what cannot be a folder.
+    `frames` (F, M) were recorded at `times` (F,); `timed`: whether these are in seconds, or are numbers of frames;
+    `notes`: reasons to doubt the result. A path is written as points x y in metres, separated by semicolons; electrodes
+    are numbered from 1. Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, HEALTH_FILES) as made:
         write_rows(made / "events.csv", _EVENTS, (_row(one) for one in health.events))
@@ -43,7 +43,7 @@ def write_health(
 
 
 def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
-    """What was told, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    """Report the detected events as plain numbers, strings, lists and dictionaries; what is not known is None."""
     held = health.held
     return plain(
         {
@@ -80,7 +80,7 @@ def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
 
 
 def draw_health(health: SkinHealth, times: Float[np.ndarray, " F"], frames: Float[np.ndarray, "F M"], timed: bool):
-    """The picture, as a matplotlib `Figure` that needs no display."""
+    """Draw the events over time, and on the skin if there is a model, as a `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_health, plot_health_course

@@ -1,4 +1,4 @@
-"""What was told of a watched skin, in a folder: touches as they end, their paths, a report, a picture."""
+"""Write the touches detected on a monitored skin to a folder: a table as they end, their paths, a report, a picture."""
 
 from __future__ import annotations
 
@@ -27,9 +27,13 @@ _PATHS = ("touch", "time_s", "x_m", "y_m", "peak_S")
 
 @dataclass(frozen=True)
 class WrittenWatch:
-    """What `write_watch` has written: `touches`; of every frame its second and greatest change, `seconds` and `peaks`
-    (F,); `latency` (K,), seconds from a frame to what was told of it, of those that named a touch; `counts` of frames
-    by status, and the `first_reason` of one that was refused, empty if there is none; `notes`, what frames told."""
+    """Summary of what `write_watch` has written.
+
+    `touches`: the detected touches; `seconds` and `peaks` (F,): the time and the greatest change of every frame;
+    `latency` (K,): seconds from a frame to its result, for frames in which a touch was named; `counts`: the number of
+    frames by status; `first_reason`: why the first refused frame was refused, empty if there is none; `notes`: the
+    notes of frames.
+    """
 
     touches: tuple[NamedTouch, ...]
     seconds: Float[np.ndarray, " F"]
@@ -48,16 +52,18 @@ def write_watch(
     name: str = "stream",
     progress: Callable[[WatchedFrame], None] | None = None,
 ) -> WrittenWatch:
-    """Write `events.csv`, a line for every touch as it ends, `paths.csv`, where it was in each of its frames, and at
-    the end `report.json` and the picture `timeline.png` into `folder`. A touch unlike any learnt from has no gesture.
+    """Write the detected touches to `events.csv` and `paths.csv`, then `report.json` and `timeline.png`, into `folder`.
 
-    `watched`: what `watch.follow(frames)` gives. Places are in metres, changes in S; `named_s` is the second of the
-    stream at which a touch was named, `latency_ms` how long after that frame. `progress` is called with every frame.
-    Raises `ValueError`, with the `name` of the stream, if no frame came, and for what cannot be a folder.
+    `events.csv` has a line for every touch, written as it ends, and `paths.csv` its place in each of its frames. A
+    touch unlike any in the training set has no gesture.
+
+    `watched`: what `watch.follow(frames)` gives. Places are in metres, changes in S; `named_s` is the time in the
+    stream at which a touch was named, `latency_ms` the delay after that frame. `progress` is called with every frame.
+    Raises `ValueError`, with the `name` of the stream, if no frame came, and if `folder` cannot be a folder.
     """
     folder = results_folder(folder, WATCH_FILES)
     for earlier in WATCH_FILES[2:]:
-        (folder / earlier).unlink(missing_ok=True)  # would not go with these touches
+        (folder / earlier).unlink(missing_ok=True)  # would not belong to these touches
     touches: list[NamedTouch] = []
     seconds, peaks, latency, counts, reason, notes = [], [], [], {}, "", []
     with GrowingTable(folder / "events.csv", _EVENTS) as events, GrowingTable(folder / "paths.csv", _PATHS) as paths:
@@ -94,7 +100,7 @@ def write_watch(
 
 
 def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[str, Any]:
-    """What was told, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    """Report the detected touches as plain numbers, strings, lists and dictionaries; what is not known is None."""
     names, number = np.unique([one.gesture for one in written.touches if not one.unlike], return_counts=True)
     quick = written.latency
     return plain(
@@ -126,7 +132,7 @@ def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[st
 
 
 def draw_watch(written: WrittenWatch, watch: TouchWatch):
-    """The picture, as a matplotlib `Figure` that needs no display."""
+    """Draw the timeline and the paths of touches, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
     from jeit.touch.plots import plot_changes, plot_timeline, plot_touch_paths

@@ -1,4 +1,4 @@
-"""Simulated skins: pressed, damaged and touched by people."""
+"""Simulate skins that are pressed, damaged and touched by people."""
 
 from __future__ import annotations
 

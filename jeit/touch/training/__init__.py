@@ -1,7 +1,8 @@
-"""Networks trained from arrays, and kept as files.
+"""Train networks on arrays, and store them as files.
 
-`fit` trains any equinox network by Adam, stops early, and goes on where it was killed; `write_model` and `read_model`
-keep networks as numbers with a JSON head, never a pickle. Training needs the extra `learn`; what is trained does not.
+`fit` trains any equinox network by Adam with early stopping, and resumes after an interruption; `write_model` and
+`read_model` store networks as numbers with a JSON header, never a pickle. Training needs the extra `learn`; using a
+trained network does not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Rows to train on, in memory or chunk by chunk, and which of them make up each batch."""
+"""Rows of training data, in memory or chunk by chunk, and their order in batches."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from jeit.arguments import describe
 
 
 class Rows(Protocol):
-    """Rows that are trained on: `sizes`, how many each chunk has, `chunk`, those of one, and a `fingerprint` that
-    changes with any of them. Sets larger than memory write a class of their own."""
+    """Rows of training data: `sizes`, how many each chunk has, `chunk`, those of one, and a `fingerprint`.
+
+    The fingerprint changes with any of them. Sets larger than memory implement a class of their own.
+    """
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -24,7 +26,7 @@ class Rows(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """Of all that the rows hold, the same in another process."""
+        """Fingerprint of all that the rows hold, the same in another process."""
         ...
 
     def chunk(self, number: int) -> Any:
@@ -57,35 +59,37 @@ class ArrayRows:
         return digest.hexdigest()
 
     def chunk(self, number: int) -> Any:
-        """All of them."""
+        """All rows."""
         return self.arrays
 
 
 class MappedRows:
-    """Other rows, of whose chunks a `function` makes others of as many rows; `name` says what it does, and all that it
-    depends on but the rows."""
+    """Rows derived from others by a `function` of each chunk, which keeps their number.
+
+    `name` describes the function, and all that it depends on except the rows.
+    """
 
     def __init__(self, rows: Rows, function: Callable[[Any], Any], name: str):
         self.rows, self.function, self.name = rows, function, name
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Those of the rows."""
+        """Number of rows of each chunk."""
         return self.rows.sizes
 
     @property
     def fingerprint(self) -> str:
-        """That of the rows, with the name."""
+        """Fingerprint of the rows, with the name."""
         return f"{self.rows.fingerprint}, {self.name}"
 
     def chunk(self, number: int) -> Any:
-        """What the function makes of that of the rows."""
+        """The function of a chunk of the rows."""
         return self.function(self.rows.chunk(number))
 
 
 class Leg(NamedTuple):
-    """Batches one after the other of one chunk: its number, which `rows` (b, batch) they take, and the number of the
-    first of them in the whole training."""
+    """Consecutive batches of one chunk: its number, which `rows` (b, batch) they take, and the number of the first of
+    them in the whole training."""
 
     chunk: int
     rows: Int[np.ndarray, "b batch"]
@@ -93,9 +97,11 @@ class Leg(NamedTuple):
 
 
 class Order:
-    """Which rows each batch has: in every epoch all chunks in another order, and within each its rows in another; those
-    that fill no batch are left out, others each time. All of it follows from `seed`, so that a place in the data is one
-    number, that of the batch."""
+    """The order of rows in batches.
+
+    In every epoch all chunks are in another order, and the rows within each too; rows that fill no batch are left out,
+    others each time. The order depends on `seed` only, so that a position in the data is one number, that of the batch.
+    """
 
     def __init__(self, sizes: tuple[int, ...], batch: int, seed: list[int]):
         self.batch, self.seed = min(batch, *sizes), seed
@@ -104,11 +110,11 @@ class Order:
 
     @property
     def an_epoch(self) -> int:
-        """Number of batches."""
+        """Number of batches of an epoch."""
         return sum(self.batches)
 
     def legs(self, first: int, last: int, most: int) -> Iterator[Leg]:
-        """Batches `first` to `last`, that one left out, in legs of `most` at most, each within one chunk."""
+        """Batches from `first` to `last`, exclusive, in legs of `most` at most, each within one chunk."""
         while first < last:
             epoch, place = divmod(first, self.an_epoch)
             chunks = self._shuffled(len(self.sizes), epoch)

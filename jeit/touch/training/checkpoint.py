@@ -1,4 +1,4 @@
-"""Where a training is, on the disk: what was killed goes on from there."""
+"""Checkpoints of trainings on disk, from which an interrupted training resumes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ _KIND, _VERSION = "a jeit training under way", 1
 
 
 class Course(NamedTuple):
-    """Losses that were looked at, one after the other: after how many batches `steps`, of the `training` batches since
-    the last look, their mean, and of the rows held out, `validation`."""
+    """Losses at each evaluation.
+
+    `steps`: the number of batches done; `training`: the mean loss of the batches since the last evaluation;
+    `validation`: the loss of the held-out rows.
+    """
 
     steps: list[int]
     training: list[float]
@@ -23,13 +26,16 @@ class Course(NamedTuple):
 
     @property
     def best(self) -> int:
-        """Number of the look at the least loss of the rows held out; 0 where none was looked at."""
+        """Number of the evaluation with the least loss of the held-out rows; 0 if there was none."""
         return min(range(len(self.validation)), key=self.validation.__getitem__, default=0)
 
 
 class State(NamedTuple):
-    """All of a training: `step`, batches done, and its `course`; the network that is `moving`, all of it, the state of
-    its optimiser, the `best` network so far, and the `total` of the losses since the last look."""
+    """The whole state of a training.
+
+    `step`, batches done, and its `course`; the network that is `moving`, all of it, the state of its optimiser, the
+    `best` network so far, and the `total` of the losses since the last evaluation.
+    """
 
     step: int
     course: Course
@@ -40,19 +46,21 @@ class State(NamedTuple):
 
 
 class Checkpoint:
-    """A file of one training, which `fingerprint` tells from all others."""
+    """A checkpoint file of one training, identified by its `fingerprint`."""
 
     def __init__(self, path: str | Path, fingerprint: dict[str, Any]):
         self.path, self.fingerprint = Path(path), fingerprint
 
     def write(self, state: State) -> None:
-        """Write all of it, whole or not at all."""
+        """Write the state, whole or not at all."""
         head = {"training": self.fingerprint, "step": state.step, "course": list(state.course)}
         write_model(self.path, _KIND, _VERSION, head, state[2:])
 
     def read(self, like: State) -> State:
-        """What was written; `like` itself, the state before the first batch, where nothing was. Raises `ValueError` for
-        a file of another training, with the first difference."""
+        """Read the state; `like`, the state before the first batch, if there is no file.
+
+        Raises `ValueError` for a file of another training, with the first difference.
+        """
         if not self.path.exists():
             return like
 

@@ -1,4 +1,4 @@
-"""`fit`: a network trained by Adam until rows held out get no better, in a way that goes on where it was killed."""
+"""`fit`: train a network by Adam with early stopping on held-out rows, with checkpoints to resume from."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ from jeit.arguments.extras import need_extra
 from jeit.touch.training.batches import ArrayRows, Order
 from jeit.touch.training.checkpoint import Checkpoint, Course, State
 
-# Batches between two chances to write a checkpoint, and rows held out that are asked for at once, at most.
+# The number of batches between two chances to write a checkpoint; the greatest number of held-out rows that are
+# evaluated at once.
 _LEG, _AT_ONCE = 32, 256
 
 
 class Objective(NamedTuple):
-    """What a network is to get better at; both are compiled.
+    """The objective of a training; both functions are compiled.
 
-    **Fields**: `loss(network, batch, key)` gives the loss of a batch of rows, to be minimised, and the network, whose
-    leaves that are not trained it may have changed, such as running means; `held_out(network, batch)` the loss (b,) of
-    each row held out; `trained`, which leaves are trained: a function of a leaf, or a tree of truth values like the
-    network, as of `equinox.filter`.
+    **Fields**: `loss(network, batch, key)` returns the loss of a batch of rows, to be minimised, and the network, of
+    which it may have changed leaves that are not trained, such as running means; `held_out(network, batch)` the loss
+    (b,) of each held-out row; `trained`, which leaves are trained: a function of a leaf, or a tree of truth values like
+    the network, as of `equinox.filter`.
     """
 
     loss: Callable[[Any, Any, Array], tuple[Float[Array, ""], Any]]
@@ -40,10 +41,13 @@ class Objective(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """How a network is trained: by Adam of this `rate`, which is multiplied by `decay` after every `decay_epochs`, in
-    batches of `batch` rows for `epochs` at most. Rows held out are looked at after every `look_every` batches, an epoch
-    unless given; the training stops at the `patience`-th look in a row that was no better than the best. A checkpoint
-    is written after so many `seconds`, some dozen batches later at most."""
+    """Settings of a training.
+
+    Adam with this `rate`, which is multiplied by `decay` after every `decay_epochs`, in batches of `batch` rows for
+    `epochs` at most. Held-out rows are evaluated after every `look_every` batches, an epoch unless given; training
+    stops at the `patience`-th consecutive evaluation that was no better than the best. A checkpoint is written after so
+    many `seconds`, some dozen batches later at most.
+    """
 
     rate: float = 1e-3
     batch: int = 128
@@ -70,7 +74,8 @@ class Plan:
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained `network`, that which rows held out were best with, and its `course`; `reason`, why it ended."""
+    """A trained `network`, the one with the least loss of held-out rows, its `course`, and the `reason` why it
+    ended."""
 
     network: Any
     course: Course
@@ -163,7 +168,7 @@ class _Run:
             moving = eqx.apply_updates(moving, updates)
             return eqx.combine(eqx.filter(moving, eqx.is_array), still_after), state, value
 
-        # A step a call: XLA's convolutions take a hundred times as long within loops that it compiles, on processors.
+        # One call a step: on CPUs, XLA's convolutions take a hundred times as long within loops that it compiles.
         def step(arrays, state, total, data, rows, number):
             batch = jax.tree.map(lambda one: one[rows], data)
             arrays, state, value = moved(arrays, state, batch, jax.random.fold_in(key, number))
@@ -176,23 +181,25 @@ class _Run:
         self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
 
     def whole(self, arrays) -> Any:
-        """The network of its arrays."""
+        """The network with these arrays."""
         return eqx.combine(arrays, self.fixed)
 
     def start(self) -> State:
-        """Before the first batch."""
+        """The state before the first batch."""
         return State(0, Course([], [], []), self.arrays, self.optimiser, self.arrays, jnp.zeros(()))
 
     def leg(self, state: State, data, rows: Int[np.ndarray, "b batch"]) -> State:
-        """After batches of these rows."""
+        """The state after batches of these rows."""
         arrays, optimiser, total = state.moving, state.optimiser, state.total
         for place, batch in enumerate(rows):
             arrays, optimiser, total = self._step(arrays, optimiser, total, data, batch, state.step + place)
         return State(state.step + len(rows), state.course, arrays, optimiser, state.best, total)
 
     def look(self, state: State, data, since: int) -> State:
-        """After a look at the rows held out, `since` batches after the last. Raises `ValueError` if neither that loss
-        nor any before was finite."""
+        """The state after an evaluation of the held-out rows, `since` batches after the last.
+
+        Raises `ValueError` if neither that loss nor any before was finite.
+        """
         number = len(jax.tree.leaves(data)[0])
         size = min(number, _AT_ONCE)
         index = np.minimum(np.arange(-(-number // size) * size), number - 1).reshape(-1, size)
@@ -212,7 +219,7 @@ class _Run:
 
 
 def _ended(state: State, plan: Plan, last: int) -> str | None:
-    """Why a training is at its end; None while it is not."""
+    """Why a training has ended; None while it has not."""
     looks = len(state.course.validation)
     if looks and looks - 1 - state.course.best >= plan.patience:
         return f"no better at {plan.patience} looks in a row"

@@ -1,4 +1,4 @@
-"""Networks as files: a head of JSON, which says what they are, and their arrays; never a pickle."""
+"""Files of networks: a JSON header that describes them, and their arrays; never a pickle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from jeit.arguments import describe
 from jeit.files import reason, written_whole
 
-# Of the file: how it begins; bytes of the head, and of all arrays together, at most.
+# The first bytes of a file; the greatest size in bytes of the header, and of all arrays together.
 _MAGIC, _LONGEST_HEAD, _LARGEST = b"jeit model\n", 2**20, 2**31
 
 
@@ -91,7 +91,7 @@ def check_same(path: str | Path, made_for: dict[str, Any], here: dict[str, Any])
 
 @contextmanager
 def _opened(path: Path, kind: str) -> Iterator[BinaryIO]:
-    """A file to read, whose faults are told with its name."""
+    """Open a file to read; errors are raised with its name."""
     if path.is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, {kind}.")
     if not path.is_file():
@@ -99,7 +99,7 @@ def _opened(path: Path, kind: str) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
             yield file
-    except Exception as error:  # of any kind: what the head says is made before it can be checked
+    except Exception as error:  # of any kind: what the header describes is made before it can be checked
         raise ValueError(f"'{path}' is not {kind} that can be read: {reason(error)}.") from None
 
 
@@ -126,7 +126,7 @@ def _size(arrays) -> int:
 
 
 def _read_array(file: BinaryIO, leaf: Any) -> Any:
-    """What stands in the place of one array; all that is no array is of the architecture."""
+    """Read one array; leaves that are no arrays are taken from the architecture."""
     if not isinstance(leaf, jax.ShapeDtypeStruct):
         return leaf
     version = np.lib.format.read_magic(file)

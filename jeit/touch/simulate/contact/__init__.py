@@ -1,7 +1,7 @@
-"""The physics of contact: load → pressure → change of conductivity, in time → voltages.
+"""The physics of contact: from load to pressure, to change of conductivity over time, to voltages.
 
-An indenter says how far its surface is above its lowest point, and a support how pressure spreads beneath it.
-Arrays are NumPy's: what touches what is no smooth function of anything.
+An indenter defines the height of its surface above its lowest point, and a support how pressure spreads beneath it.
+Arrays are NumPy's, since contact is not a smooth function of its parameters.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Pressure on the cells of a mesh, at a few samples of each, which a load is balanced on."""
+"""Compute the pressure on the cells of a mesh, at a few samples of each, which balances a load."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from jeit.touch.simulate.contact.press import Press
 from jeit.touch.simulate.contact.pressure import AbstractSupport
 from jeit.touch.simulate.contact.samples import Samples
 
-# A finer lattice is for contacts on few samples; it finds all that is as wide as this share of a cell.
+# A finer lattice is used for contacts on few samples; it resolves all that is as wide as this share of a cell.
 _FINE_LATTICE, _FEW, _FOUND = 11, 6, 1 / 6
-# Presses whose pressures are worked out at once: so much memory is in the cache.
+# The number of presses whose pressures are computed at once, so that memory fits in the cache.
 _AT_ONCE = 16
-# How much farther a contact reaches that has about half its area on the skin; Winkler's ball: 2^(1/4).
+# How much larger the reach of a contact is that has about half its area on the skin; Winkler's ball: 2^(1/4).
 _MARGIN = 1.25
-# Of the area within reach of a press that is skin: with less, it may be felt farther than that.
+# The share of the area within reach of a press that is skin, below which its pressure may extend farther.
 _ON_SKIN = 0.6
 
 
@@ -41,10 +41,10 @@ def pressed_cells(
     touches: Sequence[tuple[Press, ...]],
     progress: Callable[[str], None] | None = None,
 ) -> PressedCells:
-    """Cells under touches, each of one press or several; what several press, the sum of their pressures does.
+    """Compute the cells under touches, each of one press or several, whose pressures are added.
 
-    What of an indenter is over the edge of the skin carries nothing. `progress` is told of presses done. Raises
-    `ValueError` for presses off the skin, and as the support does.
+    Parts of an indenter over the edge of the skin carry nothing. `progress` is called with the number of presses done.
+    Raises `ValueError` for presses off the skin, and as the support does.
     """
     presses = [press for touch in touches for press in touch]
     if not presses:
@@ -72,13 +72,13 @@ def _of_each(
     position = np.array([press.position for press in presses])
     shapes = _shapes(presses)
     farthest = samples.chord * np.array([press.indenter.reach for press in presses])
-    # How far a press is felt where the skin is flat says nothing of hollows.
+    # The extent of pressure on a flat skin does not bound that in hollows.
     reaches = farthest if samples.curved is not None else _reaches(support, presses, shapes)
-    felt = np.minimum(reaches, farthest) + samples.radius
+    extent = np.minimum(reaches, farthest) + samples.radius
     tree = KDTree(samples.points.mean(axis=1))
-    near = tree.query_ball_point(position, felt, return_sorted=True)
+    near = tree.query_ball_point(position, extent, return_sorted=True)
     on_skin = samples.points.shape[1] * np.array([samples.area[cells].sum() for cells in near])
-    beyond = np.flatnonzero(on_skin < _ON_SKIN * np.pi * felt**2)
+    beyond = np.flatnonzero(on_skin < _ON_SKIN * np.pi * extent**2)
     near[beyond] = tree.query_ball_point(position[beyond], farthest[beyond] + samples.radius, return_sorted=True)
     near = samples.near(presses, near)
     number = np.array([len(cells) for cells in near])
@@ -107,7 +107,7 @@ def _of_each(
 
 
 def _shapes(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
-    """A number for each indenter, the same for those that are equal."""
+    """Number the indenters, with the same number for those that are equal."""
     numbers: dict = {}
     known: dict[int, int] = {}
     for press in presses:
@@ -119,22 +119,24 @@ def _shapes(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
 
 
 def _reaches(support: AbstractSupport, presses: Sequence[Press], shapes) -> Float[np.ndarray, " n"]:
-    """How far from its origin each press is felt, at most, metres: as far as with up to twice its load, and some more
-    where the skin's edge leaves it less area."""
+    """Greatest distance from its origin, metres, at which each press exerts pressure.
+
+    It is that with up to twice its load, and somewhat more where the skin's edge leaves it less area.
+    """
     known: dict[tuple[int, int], float] = {}
     doublings = np.ceil(np.log2([press.load for press in presses]))
     for press, *case in zip(presses, shapes, doublings, strict=True):
         if tuple(case) not in known:
             try:
-                felt = _MARGIN * support.pressure(press.indenter, 2.0 ** case[1]).reach
+                extent = _MARGIN * support.pressure(press.indenter, 2.0 ** case[1]).reach
             except ValueError:  # more than it can carry: that of this press may not be
-                felt = press.indenter.reach
-            known[tuple(case)] = min(felt, press.indenter.reach)
+                extent = press.indenter.reach
+            known[tuple(case)] = min(extent, press.indenter.reach)
     return np.array([known[case] for case in zip(shapes, doublings, strict=True)])
 
 
 def _alike(samples: Samples, support: AbstractSupport, presses: Sequence[Press], cells, there):
-    """Pressures (b, c, s) of presses with one and the same indenter at the samples of `cells` (b, c)."""
+    """Pressures (b, c, s) of presses with the same indenter at the samples of `cells` (b, c)."""
     points = samples.points[cells]
     shape = points.shape[:-1]
     local, fall, share = samples.seen(presses, cells, points.reshape(len(cells), -1, points.shape[-1]))
@@ -148,8 +150,11 @@ def _alike(samples: Samples, support: AbstractSupport, presses: Sequence[Press],
 
 
 def _between(samples: Samples, support: AbstractSupport, press: Press, cells, there):
-    """Pressures (c, s) of a press on few samples: means of each of the `cells` (c,) over a finer lattice; all on the
-    nearest sample where that is missed. Raises `ValueError` for one that touches no skin."""
+    """Pressures (c, s) of a press on few samples: means of each of the `cells` (c,) over a finer lattice.
+
+    The nearest sample has all of the load where that lattice is missed. Raises `ValueError` for one that touches no
+    skin.
+    """
     points = samples.on(cells, _FINE_LATTICE)
     fine, coarse = points.shape[1], samples.points.shape[1]
     local, fall, share = samples.seen([press], cells[None], points.reshape(1, -1, points.shape[-1]))

@@ -1,4 +1,4 @@
-"""What changes on a skin that nobody touches: its conductivity, its contacts, and every reading."""
+"""Drift and noise of an untouched skin: of its conductivity, its contacts, and every reading."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from jaxtyping import Array, Float
 
 
 def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """The draws of `jax.random.normal`: the first of a power of two of them, of which fewer programs are compiled than
-    there are records of different length."""
+    """Draw from `jax.random.normal`: the first of a power of two of draws.
+
+    Fewer programs are then compiled than there are records of different length.
+    """
     number = math.prod(shape)
     return np.asarray(jax.random.normal(key, (1 << max(number - 1, 0).bit_length(),)))[:number].reshape(shape)
 
@@ -27,10 +29,10 @@ def walk(
 
 
 def gains(key: Array, spread: float, number: int) -> Float[np.ndarray, " M"]:
-    """Of `number` channels: log-normal round 1, `spread` the deviation of the logarithm."""
+    """Gains of `number` channels: log-normal about 1, `spread` the deviation of the logarithm."""
     return np.exp(spread * standard_normal(key, (number,)))
 
 
 def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """Independent and normal, volts."""
+    """Independent normal noise, volts."""
     return deviation * standard_normal(key, shape)

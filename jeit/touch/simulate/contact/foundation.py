@@ -1,4 +1,4 @@
-"""A thin soft layer on a rigid back: pressure at a place follows from how far the layer is pressed in there alone."""
+"""A thin soft layer on a rigid back: pressure at a place depends only on the indentation there."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jeit.touch.simulate.contact.pressure import (
     raster,
 )
 
-# Pixels along a side: of the raster that finds the contact, and of that which the load is balanced on.
+# Pixels along a side: of the raster that finds the contact, and of that on which the load is balanced.
 _COARSE, _FINE = 24, 96
 
 
@@ -27,7 +27,7 @@ class FoundationPressure(AbstractPressure):
     stiffness: float
 
     def at(self, points):
-        """Of the indenter's gap there."""
+        """Pressure from the indenter's gap at points."""
         return self.stiffness * np.maximum(self.approach - self.indenter.gap(points), 0.0)
 
 
@@ -53,7 +53,7 @@ class Foundation(AbstractSupport):
         return self.modulus / self.thickness
 
     def pressure(self, indenter: AbstractIndenter, load: float) -> FoundationPressure:
-        """That beneath `indenter` under `load` newtons.
+        """Pressure beneath `indenter` under `load` newtons.
 
         Raises `ValueError` for a load that is not positive, one that presses through the layer, and indenters thinner
         than a pixel.

@@ -26,17 +26,18 @@ from jeit.touch.simulate.contact.pressure import (
 
 # Pixels along a side of the raster that finds the contact.
 _COARSE = 24
-# Of a free contact's pressure: with less on the skin, the rest of it says nothing of the pressure there; and what the
-# points have to carry of it not to be asked.
+# The least share of a free contact's pressure on the skin, below which the pressure there is undetermined; and the
+# share that the points have to carry for it not to be computed.
 _LEAST_SHARE, _DOUBTED = 0.2, 0.5
-# Of the load, that a step moves when it is the last; and steps.
+# Share of the load that the last step moves; and the greatest number of steps.
 _TOLERANCE, _MOST_STEPS = 1e-8, 2000
 
 
 class HalfSpace(AbstractSupport):
-    """An elastic half-space: `modulus` E in pascals and Poisson's ratio `poisson` of it.
+    """An elastic half-space: its `modulus` E in pascals and Poisson's ratio `poisson`.
 
-    `pixels`: along a side of the raster that the pressure is found on, over a rectangle little wider than the contact.
+    `pixels`: along a side of the raster on which the pressure is computed, over a rectangle little wider than the
+    contact.
     """
 
     modulus: float
@@ -59,7 +60,7 @@ class HalfSpace(AbstractSupport):
         return self.modulus / (1 - self.poisson**2)
 
     def pressure(self, indenter: AbstractIndenter, load: float) -> PressureRaster:
-        """That beneath `indenter` under `load` newtons.
+        """Pressure beneath `indenter` under `load` newtons.
 
         Raises `ValueError` for a load that is not positive and for indenters thinner than a pixel, and `RuntimeError`
         where the contact is not found.
@@ -112,9 +113,10 @@ def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
 
 
 def sinking(number: int, pixel, plane_modulus: float):
-    """The function from pressures (N, N), pascals, on pixels of these sides to how far their middles sink, metres.
+    """Return the function from pressures (N, N), pascals, on pixels of these sides to the displacement of their
+    centres, metres.
 
-    A uniformly pressed rectangle sinks as Love (1929) has it: Johnson, Contact Mechanics, 1985, equation 3.25.
+    A uniformly pressed rectangle sinks as in Love (1929): Johnson, Contact Mechanics, 1985, equation 3.25.
     """
     along, half = np.arange(2 * number) - number, np.asarray(pixel) / 2
     x, y = np.meshgrid(pixel[0] * along, pixel[1] * along)
@@ -151,7 +153,7 @@ def rigid_contact(gap: np.ndarray, sink, total: float) -> tuple[np.ndarray, floa
         response = sink(direction)
         response -= response[touching].mean()
         slope = np.sum(response * direction)
-        if square == 0 or slope <= 0:  # nothing is left but rounding, or a single pixel touches
+        if square == 0 or slope <= 0:  # only rounding is left, or a single pixel touches
             break
         length = np.sum(distance[touching] * direction[touching]) / slope
         before, pressure = pressure, np.where(touching, np.maximum(pressure - length * direction, 0.0), 0.0)

@@ -1,4 +1,5 @@
-"""Sets of drawn indents, with what a skin reads of them and their depth maps: in chunks, as sets of presses are."""
+"""Simulate sets of drawn indents, with a skin's readings of them and their depth maps, in chunks, like sets of
+presses."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.study.contents import Contents
 from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relative_changes, resting_skin
 
-# Changes with what the same set is simulated to.
+# Increased when the simulation of the same set changes.
 _VERSION = 2
-# Of a worker's threads, one works out what the chunks share, and the others wait for it.
+# One of a worker's threads computes what the chunks share, and the others wait for it.
 _ONE = Lock()
 _MEANINGS = {
     "change": ("1", "change of each channel's voltage, relative to the skin at rest"),
@@ -27,10 +28,11 @@ _MEANINGS = {
 
 
 class IndentSet:
-    """`number` touches drawn from `draws`, and what `skin` reads of them, exactly; the same for the same `seed`.
+    """A set of `number` touches drawn from `draws`, and exact readings of `skin` for them; the same for the same
+    `seed`.
 
-    Depths are on a grid of `shape` (rows, columns) over the skin; `chunk`, touches simulated, and written, at once: it
-    decides which are drawn too.
+    Depths are on a grid of `shape` (rows, columns) over the skin; `chunk`, the number of touches simulated, and
+    written, at once: it affects which are drawn too.
     """
 
     def __init__(
@@ -75,7 +77,7 @@ class IndentSet:
         return _digest(parts, str(own))
 
     def solve(self, number: int) -> dict[str, np.ndarray]:
-        """Changes (k, M) and depths (k, rows, columns) of one chunk, as they stand in the store."""
+        """Simulate the changes (k, M) and depths (k, rows, columns) of one chunk, as the store holds them."""
         key = jax.random.fold_in(jax.random.key(self.seed), number)
         touches = self.draws.draw(key, len(self.chunks[number]))
         depth = depth_maps(touches, self.places) / float(self.skin.thickness)
@@ -84,7 +86,7 @@ class IndentSet:
         return {"change": relative_changes(self.skin, touches, resting), "depth": depth.astype(np.float32)}
 
     def contents(self) -> Contents:
-        """What its store holds."""
+        """The contents of the set's store."""
 
         def fill(group: Any) -> None:
             channels = self.skin.model.protocol.num_measurements
@@ -126,7 +128,7 @@ class _Deep:
 
 @lru_cache(maxsize=1)
 def _resting(deep: _Deep) -> RestingSkin | None:
-    """What all chunks share, of all sets of a skin; a gigabyte, of a layer."""
+    """Data that all chunks, of all sets of a skin, share; a gigabyte for a layer."""
     return resting_skin(deep.skin, deep.depth)
 
 
@@ -140,13 +142,13 @@ def _digest(parts: Any, text: str) -> str:
 
 
 def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:
-    """Middles (rows, columns, 2) of pixels over the box of a skin, metres, row 0 at the least y."""
+    """Centres (rows, columns, 2) of pixels over the box of a skin, metres, row 0 at the least y."""
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     return pixel_places((low_x, high_x, low_y, high_y), (rows, columns))
 
 
 def pixel_places(extent: tuple[float, float, float, float], shape: tuple[int, int]) -> np.ndarray:
-    """Middles (rows, columns, 2) of pixels over a box (x_min, x_max, y_min, y_max), metres, row 0 at the least y."""
+    """Centres (rows, columns, 2) of pixels over a box (x_min, x_max, y_min, y_max), metres, row 0 at the least y."""
     (low_x, high_x, low_y, high_y), (rows, columns) = extent, shape
     x = low_x + (high_x - low_x) * (np.arange(columns) + 0.5) / columns
     y = low_y + (high_y - low_y) * (np.arange(rows) + 0.5) / rows

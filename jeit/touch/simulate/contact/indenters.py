@@ -1,4 +1,4 @@
-"""Rigid indenters: how far the surface that comes down on a skin is above its lowest point."""
+"""Rigid indenters: the height of their surface above its lowest point."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jeit_solvers.engines import host
 
 
 class AbstractIndenter(eqx.Module):
-    """A rigid body that comes straight down, in a frame of its own. Add another by writing one class."""
+    """A rigid body that moves straight down, in a frame of its own. Add another by writing one class."""
 
     @abc.abstractmethod
     def gap(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
@@ -27,7 +27,7 @@ class AbstractIndenter(eqx.Module):
     @property
     @abc.abstractmethod
     def reach(self) -> float:
-        """Distance in metres from the frame's origin beyond which there is nothing of it."""
+        """Distance in metres from the frame's origin beyond which the body does not extend."""
 
 
 class Disc(AbstractIndenter):
@@ -136,7 +136,7 @@ class Revolved(AbstractIndenter):
         self.indentation = indentation
 
     def gap(self, points):
-        """What the profile's depth lacks of that in its middle."""
+        """Difference of the profile's depth from that in its middle."""
         distance = _distance(points)
         deepest = float(self.indentation.depth_at(host.zeros(())))
         gap = deepest - np.asarray(self.indentation.depth_at(distance))
@@ -177,7 +177,7 @@ class DepthMap(AbstractIndenter):
         self.height, self.pixel = height, float(pixel)
 
     def gap(self, points):
-        """What the surface lacks of its greatest height."""
+        """Difference of the surface's height from its greatest height."""
         middle = (np.array(self.height.shape) - 1) / 2
         place = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + middle, -1, 0)
         flat = map_coordinates(self.height, place.reshape(2, -1), order=1, cval=np.nan)

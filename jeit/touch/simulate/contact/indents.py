@@ -1,4 +1,4 @@
-"""Rigid bodies held at a depth in a skin, whatever load that takes: depth maps, and what such touches read."""
+"""Rigid bodies held at a depth in a skin, under whatever load: depth maps, and the readings of such touches."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from jeit_solvers.engines import as_array
 
 # Places in each cell of a mesh, see `lattice`; what of a sheet conducts at least, where it is pressed through.
 _LATTICE, _LEAST = 2, 1e-3
-# Of the greatest voltage: nothing less is divided by.
+# Voltages are not divided by less than this share of the greatest.
 _FLOOR = 1e-3
 
 
@@ -46,7 +46,7 @@ class Indent(eqx.Module):
         self.position, self.angle = check_position(position), check_angle(angle)
 
     def depth_at(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
-        """How deep the skin is indented at `points` (…, 2), metres."""
+        """Depth of the indentation at `points` (…, 2), metres."""
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         local = (np.asarray(points) - self.position) @ np.array([[cos, -sin], [sin, cos]])
         return np.maximum(self.depth - self.indenter.gap(local), 0.0)
@@ -70,16 +70,16 @@ class IndentDraws(eqx.Module):
         """Raises `ValueError` as `PressDraws` does, and for depths that are no metres."""
         for one in depth:
             check_metres("depth", one, 0.1, "any skin is thick")
-        # What is drawn there as newtons is metres here.
+        # Loads in newtons of the presses are depths in metres here.
         self.presses = PressDraws(indenters, outline, depth, margin=margin, at_once=at_once)
 
     @property
     def depth(self) -> tuple[float, float]:
-        """Least and greatest, metres."""
+        """Least and greatest depth, metres."""
         return self.presses.load
 
     def draw(self, key: Array, number: int) -> list[tuple[Indent, ...]]:
-        """So many touches. Raises `ValueError` for what is no key, and no number."""
+        """Draw `number` touches. Raises `ValueError` for what is no key, and no number."""
         drawn = self.presses.draw(key, number)
         return [tuple(Indent(one.indenter, one.load, one.position, one.angle) for one in touch) for touch in drawn]
 
@@ -87,7 +87,7 @@ class IndentDraws(eqx.Module):
 def depth_maps(
     touches: Sequence[Sequence[Indent]], places: Float[np.ndarray, "*shape 2"]
 ) -> Float[np.ndarray, "n *shape"]:
-    """How deep each of n touches indents at `places` (…, 2), metres: the deepest of its indents there."""
+    """Indentation depth of each of n touches at `places` (…, 2), metres: the deepest of its indents there."""
     maps = np.zeros((len(touches), *places.shape[:-1]))
     for number, touch in enumerate(touches):
         for indent in touch:
@@ -96,7 +96,7 @@ def depth_maps(
 
 
 def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCells:
-    """What n touches change of a skin: nothing conducts where it is indented (Park et al. 2022, text S4).
+    """Changes of a skin's cells by n touches: nothing conducts where it is indented (Park et al. 2022, text S4).
 
     In a layer every cell loses the share of it that is indented; in a sheet, the share of its thickness. Raises
     `ValueError` for indents as deep as the skin.
@@ -144,14 +144,14 @@ def relative_changes(
     if resting is not None:
         rest = np.asarray(resting.rest)
         return relative_to(rest, rest + resting.changes(touched))
-    # Gains and noise of the material are those of its readings; these voltages are the model's own.
+    # The material's gains and noise apply to its readings only; these voltages are the model's own.
     pressed = PressedSkin(jax.random.key(0), skin.model, material("hydrogel"), conductivity=skin.model_conductivity)
     rest = np.asarray(skin.model.voltages(skin.model_conductivity))
     return relative_to(rest, pressed.voltages_under(touched))
 
 
 def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
-    """A skin at rest, for indents up to a `depth`, metres; None where it would take too much memory."""
+    """Prepare a skin at rest, for indents up to a `depth`, metres; None where it would take too much memory."""
     mesh = skin.model.mesh
     touchable = np.ones(mesh.num_points, bool)
     if skin.num_layers:
@@ -162,7 +162,9 @@ def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
 
 
 def relative_to(reference: Float[np.ndarray, " M"], voltages: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n M"]:
-    """Changes (n, M) relative to a reference, volts, channel by channel; such as read next to nothing at rest, to a
-    thousandth of the greatest."""
+    """Changes (n, M) relative to a reference, volts, channel by channel.
+
+    Channels that read next to nothing at rest are relative to a thousandth of the greatest.
+    """
     size = np.abs(reference)
     return (voltages - reference) / np.maximum(size, _FLOOR * size.max())

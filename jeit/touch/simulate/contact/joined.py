@@ -1,4 +1,4 @@
-"""Indenters moved and turned in their frame, and several that are one rigid body."""
+"""Indenters moved and turned in their frame, and several joined to one rigid body."""
 
 from __future__ import annotations
 

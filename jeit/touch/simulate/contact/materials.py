@@ -1,4 +1,4 @@
-"""Materials of skins: how conductivity follows pressure, in time, and what else a reading of them holds."""
+"""Materials of skins: conductivity as a function of pressure over time, drift, and noise of readings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Presses: an indenter, its load and its place; still, or moving."""
+"""Presses: an indenter, its load and its place; at rest, or moving."""
 
 from __future__ import annotations
 
@@ -35,8 +35,10 @@ class Press(eqx.Module):
 
 
 class MovingPress(eqx.Module):
-    """The same in time: `load` (T,) newtons, 0 while it is lifted, `position` (T, 2) metres, on a curved skin (T, 3),
-    `angle` (T,) radians, one for each frame; what stays the same may be given once."""
+    """A press over time: `load` (T,) newtons, 0 while it is lifted, `position` (T, 2) metres, on a curved skin (T, 3).
+
+    `angle` (T,) radians. There is one value for each frame; what stays the same may be given once.
+    """
 
     indenter: AbstractIndenter
     load: Float[np.ndarray, " T"]
@@ -76,7 +78,7 @@ class MovingPress(eqx.Module):
 
 
 def touches_of(presses) -> list[tuple[Press, ...]]:
-    """Each touch as the presses that are there at once. Raises `ValueError` for none, and for what is none."""
+    """List the simultaneous presses of each touch. Raises `ValueError` for none, and for what is none."""
     check_kind("presses", presses, (list, tuple), "a list of them, one for each frame, such as [press]")
     if not presses:
         raise ValueError("presses: give one at least.")
@@ -91,8 +93,10 @@ def touches_of(presses) -> list[tuple[Press, ...]]:
 
 
 def motions_of(motions, frames: int) -> list[MovingPress]:
-    """One motion, or those of a list, which may have none: nothing touches. Raises `ValueError` for what is none, those
-    of another number of frames, and motions without any load."""
+    """List the motions of a recording: one, or those of a list, which may be empty if nothing touches.
+
+    Raises `ValueError` for what is none, those of another number of frames, and motions without any load.
+    """
     motions = [motions] if isinstance(motions, MovingPress) else motions
     check_kind(
         "motions", motions, (list, tuple), "a MovingPress, or a list of those that are there at once, [] for none"

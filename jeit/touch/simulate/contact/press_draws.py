@@ -1,4 +1,4 @@
-"""Presses drawn at random: what is pressed, how hard, where, and how many at once."""
+"""Draw presses at random: indenters, loads, places, and the number at once."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jeit.mesh import Domain
 from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indenter
 from jeit.touch.simulate.contact.press import Press
 
-# Places drawn at once for each that is wanted, until one is on the skin.
+# The number of places drawn at once for each that is needed, until one is on the skin.
 _TRIES = 20
 
 
@@ -63,7 +63,7 @@ class PressDraws(eqx.Module):
             raise ValueError(f"margin is {1e3 * self.margin:g} mm, which leaves no place on the skin; give less.")
 
     def draw(self, key: Array, number: int) -> list[tuple[Press, ...]]:
-        """So many touches. Raises `ValueError` for what is no key, and no number."""
+        """Draw `number` touches. Raises `ValueError` for what is no key, and no number."""
         check_key(key)
         if not (isinstance(number, (int, np.integer)) and not isinstance(number, bool) and number >= 0):
             raise ValueError(f"number must be a whole number of touches, 0 or more; it is {describe(number)}.")
@@ -85,7 +85,7 @@ class PressDraws(eqx.Module):
         return [tuple(presses[end - count : end]) for end, count in zip(ends, counts, strict=True)]
 
     def innermost(self) -> np.ndarray:
-        """Of a thousand places (x, y), metres, on the skin, that which is farthest from its edge."""
+        """Of a thousand places (x, y), metres, on the skin, the one farthest from its edge."""
         places = self._anywhere(np.random.default_rng(0), 1000)
         return places[np.asarray(self.outline.signed_distance(places)).argmax()]
 

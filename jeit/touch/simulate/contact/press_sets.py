@@ -1,6 +1,7 @@
-"""Sets of drawn touches and their frames, larger than memory: in chunks, to a Zarr store, here or on a cluster.
+"""Simulate sets of drawn touches and their frames, larger than memory: in chunks, to a Zarr store, here or on a
+cluster.
 
-The store, and what a chunk is to it, is that of the studies of `jeit.design`. Needs the extra `cluster`.
+The store and its chunks are as in the studies of `jeit.design`. Needs the extra `cluster`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from jeit.touch.simulate.contact.press import Press
 from jeit.touch.simulate.contact.press_draws import PressDraws
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin, check_seconds
 
-# Changes with what the same set is simulated to.
+# Increased when the simulation of the same set changes.
 _VERSION = 1
 _MEANINGS = {
     "voltages": ("V", "what the channels read"),
@@ -87,7 +88,8 @@ class PressSet:
         return digest.hexdigest()
 
     def solve(self, number: int) -> dict[str, np.ndarray]:
-        """Touches and frames of one chunk, as they stand in the store: (k, …), NaN where a touch has fewer presses."""
+        """Simulate the touches and frames of one chunk, as the store holds them: (k, …), NaN where a touch has fewer
+        presses."""
         for_draws, for_frames = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), number))
         touches = self.draws.draw(for_draws, len(self.chunks[number]))
         results = {name: np.full((len(touches), *shape), np.nan) for name, (shape, _) in self._shapes().items()}
@@ -100,7 +102,7 @@ class PressSet:
         return results
 
     def contents(self) -> Contents:
-        """What its store holds."""
+        """The contents of the set's store."""
 
         def fill(group: Any) -> None:
             for name, (shape, dimensions) in self._shapes().items():
@@ -138,12 +140,12 @@ def simulate_presses(
     client: Any = None,
     progress: Callable[[Progress], None] | None = None,
 ):
-    """Simulate what is not finished of a set, of presses or indents, and return it, as of `open_presses`.
+    """Simulate the unfinished chunks of a set, of presses or indents, and return it, as `open_presses` does.
 
-    Killed at any moment, it goes on from the last finished chunk when run again, to the same store. `path`, `client`
-    and `progress` as in `jeit.design.run_study`. Raises `ValueError` for another set's store, for one
-    that another process writes, and as `PressedSkin.frames` does, `ImportError` without the extra `cluster`, and
-    `OSError` where the store cannot be written.
+    Interrupted at any moment, it resumes from the last finished chunk when run again with the same store. `path`,
+    `client` and `progress` as in `jeit.design.run_study`. Raises `ValueError` for another set's store, for one that
+    another process writes, and as `PressedSkin.frames` does, `ImportError` without the extra `cluster`, and `OSError`
+    where the store cannot be written.
     """
     need_extra("cluster", "a set of touches")
     check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
@@ -158,9 +160,11 @@ def simulate_presses(
 
 
 def open_presses(presses: PressSet | IndentSet, path: str | Path):
-    """The set in a store as an `xarray.Dataset` with dimensions touch, channel and press (row and column of indents),
-    read when it is asked for; `finished` (touch,) says which touches are. Raises as `jeit.design.study.store.Store`
-    does."""
+    """Open the set in a store as an `xarray.Dataset` with dimensions touch, channel and press (row and column of
+    indents).
+
+    It is read on access; `finished` (touch,) states which touches are. Raises as `jeit.design.study.store.Store` does.
+    """
     need_extra("cluster", "a set of touches")
     store = Store(presses.contents(), path, create=False)
     finished = np.zeros(presses.number, bool)
@@ -170,7 +174,7 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
 
 
 def solve_presses(presses: PressSet | IndentSet, number: int) -> dict[str, np.ndarray]:
-    """One chunk of a set, as `PressSet.solve`: a function, for workers of a cluster to be sent."""
+    """Simulate one chunk of a set, as `PressSet.solve`: a function, which can be sent to workers of a cluster."""
     return presses.solve(number)
 
 

@@ -1,4 +1,4 @@
-"""`PressedSkin`: a skin of some material, and what it reads while it is pressed."""
+"""`PressedSkin`: a skin of some material, and its readings while it is pressed."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from jeit.touch.simulate.contact.response import advance, held_pressure, unstrai
 from jeit.touch.simulate.contact.samples import Samples
 from jeit_solvers.engines import as_array
 
-# Touches worked on at once; their numbers of cells that part them; and their extent over the root of their area, above
-# which their contacts are apart.
+# The number of touches processed at once; the numbers of cells by which they are grouped; and the ratio of their extent
+# to the root of their area, above which their contacts are apart.
 _AT_ONCE, _CELLS, _APART = 1024, (128, 512, 2048), 3.0
-# Of the greatest change of a touch: less is left out.
+# Changes below this share of the greatest change of a touch are left out.
 _LEAST = 1e-6
 
 
@@ -61,10 +61,10 @@ class PressedSkin(eqx.Module):
         conductivity: ArrayLike | None = None,
         face: str = "outer",
     ):
-        """A skin whose gains are drawn from `key`. `conductivity` at rest, S/m (2-D: S): the material's unless given.
-        `face`: as `jeit.design.Skin.touched_face` says.
+        """Create a skin whose gains are drawn from `key`.
 
-        Raises `ValueError` for what is no key, model, material, conductivity or face.
+        `conductivity` at rest, S/m (2-D: S): the material's unless given. `face`: as in
+        `jeit.design.Skin.touched_face`. Raises `ValueError` for what is no key, model, material, conductivity or face.
         """
         check_key(key)
         check_model(model)
@@ -77,7 +77,7 @@ class PressedSkin(eqx.Module):
         self.gain = gains(key, material.gain_spread, model.protocol.num_measurements)
 
     def rest(self) -> Float[np.ndarray, " M"]:
-        """Voltages (M,) of the skin that nobody touches and nothing disturbs, as its channels read them."""
+        """Voltages (M,) of the untouched skin without disturbances, as its channels read them."""
         return self.gain * self._at_rest
 
     def frames(
@@ -89,12 +89,12 @@ class PressedSkin(eqx.Module):
         elapsed: float = 0.0,
         progress: Callable[[str], None] | None = None,
     ) -> Float[np.ndarray, "n M"]:
-        """Voltages (n, M) of n touches of a skin that has had no load before: one press each, or a tuple of several at
-        once.
+        """Simulate the voltages (n, M) of n touches of a skin without earlier load.
 
-        `held`: seconds that the load has been there. `elapsed`: seconds since the skin was as its model says, over
-        which it drifts, once for all these frames. `progress` is called with how far it is. Raises `ValueError` for
-        presses off the skin or through it, and what is no press or time.
+        `presses`: one press for each touch, or a tuple of several at once. `held`: seconds that the load has been
+        there. `elapsed`: seconds since the skin was as its model says, over which it drifts, once for all these frames.
+        `progress` is called with a description of the progress. Raises `ValueError` for presses off the skin or through
+        it, and what is no press or time.
         """
         check_key(key)
         check_seconds("held", held)
@@ -142,9 +142,9 @@ class PressedSkin(eqx.Module):
         *,
         progress: Callable[[str], None] | None = None,
     ) -> list[Float[np.ndarray, "T M"]]:
-        """Voltages (T, M) of each of several recordings, pairs of motions and times, as of `record`: of this skin each
-        time anew, worked on together, which is quicker by far where there are many.
+        """Simulate the voltages (T, M) of each of several recordings, pairs of motions and times, as in `record`.
 
+        Each recording begins with this skin; they are processed together, which is much faster where there are many.
         Raises `ValueError` for what are no such pairs, and as `record` does.
         """
         check_key(key)
@@ -169,8 +169,8 @@ class PressedSkin(eqx.Module):
         *,
         progress: Callable[[str], None] | None = None,
     ) -> TouchedCells:
-        """What is changed in each of T frames, also by loads that were there before; as of `record`, whose errors it
-        raises."""
+        """The cells whose conductivity changes in each of T frames, also by earlier loads; as of `record`, whose errors
+        it raises."""
         seconds = _check_times(seconds)
         motions = motions_of(motions, len(seconds))
         found = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
@@ -193,8 +193,10 @@ class PressedSkin(eqx.Module):
     def voltages_under(
         self, touched: TouchedCells, *, progress: Callable[[str], None] | None = None
     ) -> Float[np.ndarray, "n M"]:
-        """Voltages (n, M) of the model under n touches, undisturbed; `progress` is told of touches done. Raises as
-        `touch_changes` does."""
+        """Voltages (n, M) of the model under n touches, undisturbed.
+
+        `progress` is called with the number of touches done. Raises as `touch_changes` does.
+        """
         done = 0
         voltages = np.tile(self._at_rest, (len(touched.places), 1))
         places, cells, change = (np.asarray(one) for one in (touched.places, touched.cells, touched.change))
@@ -213,10 +215,10 @@ class PressedSkin(eqx.Module):
     def read(
         self, key: Array, exact: Float[np.ndarray, "n M"], seconds: Float[np.ndarray, " t"]
     ) -> Float[np.ndarray, "n M"]:
-        """What the channels read of exact voltages at `seconds` (n,), or (1,) for all: drift, gains and noise, volts.
+        """Readings of exact voltages at `seconds` (n,), or (1,) for all, with drift, gains and noise, volts.
 
-        A sheet of e^d σ with contacts e^c z has the voltages of one of σ with contacts e^(c + d) z, over e^d; what
-        contacts change is linear, that of the skin at rest. Raises `ValueError` for what is no key.
+        A sheet of e^d σ with contacts e^c z has the voltages of one of σ with contacts e^(c + d) z, over e^d; the
+        effect of contacts is linearised about the skin at rest. Raises `ValueError` for what is no key.
         """
         check_key(key)
         for_conductivity, for_contacts, for_noise = jax.random.split(key, 3)
@@ -231,7 +233,7 @@ class PressedSkin(eqx.Module):
 
     @property
     def _dimension(self) -> int:
-        """Of the places of presses."""
+        """Dimension of the places of presses."""
         return 3 if is_curved(self.model.mesh) else 2
 
     @cached_property
@@ -251,7 +253,7 @@ class PressedSkin(eqx.Module):
 
 
 def _touched(places, cells, change, number: int) -> TouchedCells:
-    """The changes that count, as of `TouchedCells`, the first of each row."""
+    """The changes that are not negligible, as `TouchedCells`, the first of each row."""
     kept = np.abs(change) > _LEAST * np.abs(change).max(axis=1, keepdims=True)
     rows, there = padded([row[one] for row, one in zip(cells, kept, strict=True)])
     wide = _even(rows.shape[1]) - rows.shape[1]
@@ -262,7 +264,7 @@ def _touched(places, cells, change, number: int) -> TouchedCells:
 
 
 def _together(each: Sequence[TouchedCells]) -> TouchedCells:
-    """Several of one skin as one, with zeros at the ends of their rows."""
+    """Concatenate the touched cells of one skin, padded with zeros at the ends of their rows."""
     wide = max(one.cells.shape[1] for one in each)
 
     def joined(name: str) -> Array:
@@ -274,8 +276,11 @@ def _together(each: Sequence[TouchedCells]) -> TouchedCells:
 
 
 def _kinds(mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, "n c"]) -> list[np.ndarray]:
-    """Numbers of the touches that change anything, those together that cost alike: by how many cells they have, and
-    whether these lie together or, of several contacts, apart."""
+    """Group the touches that change anything by similar cost.
+
+    Returns the numbers of the touches of each group: by how many cells they have, and whether these lie together or, of
+    several contacts, apart.
+    """
     there = change != 0
     number = there.sum(axis=1)
     middles = np.asarray(centroids(mesh))[:, : 3 if is_curved(mesh) else 2][cells]

@@ -14,7 +14,7 @@ from jeit.touch.simulate.contact.indenters import AbstractIndenter
 
 
 class AbstractPressure(eqx.Module):
-    """Pressure in the frame of the indenter that makes it.
+    """Pressure in the frame of the indenter that causes it.
 
     **Fields**: `load`, newtons; `approach`, how far the indenter has come down from where it first touched, metres;
     `reach`, the distance from the frame's origin beyond which there is no pressure, metres.
@@ -30,11 +30,11 @@ class AbstractPressure(eqx.Module):
 
 
 class AbstractSupport(eqx.Module):
-    """What a skin is to what presses on it. Add another by writing one class."""
+    """The mechanical response of a skin to a press. Add another by writing one class."""
 
     @abc.abstractmethod
     def pressure(self, indenter: AbstractIndenter, load: float) -> AbstractPressure:
-        """That beneath `indenter` under `load` newtons. Raises `ValueError` for a load that cannot be carried."""
+        """Pressure beneath `indenter` under `load` newtons. Raises `ValueError` for a load that cannot be carried."""
 
     @abc.abstractmethod
     def spread(
@@ -62,7 +62,7 @@ class PressureRaster(AbstractPressure):
     pixel: Float[np.ndarray, "2"]
 
     def at(self, points):
-        """Linear between pixels, none beyond."""
+        """Pressure, linear between pixels, zero beyond them."""
         place = np.moveaxis((np.asarray(points) / self.pixel)[..., ::-1] + (len(self.values) - 1) / 2, -1, 0)
         flat = map_coordinates(self.values, place.reshape(2, -1), order=1, mode="grid-constant")
         return flat.reshape(place.shape[1:])

@@ -1,4 +1,4 @@
-"""Places on the cells of a skin that pressure is worked out at, as a press sees them."""
+"""Points on the cells of a skin at which pressure is computed, in the frames of presses."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from jeit.mesh import Mesh, check_flat, measures
 from jeit.mesh.geodesic import Triangles
 from jeit.touch.simulate.contact.press import Press
 
-# Of a cell: barycentric coordinates are multiples of 1 / (lattice + 1), moved inwards by the same for all.
+# Barycentric coordinates in a cell are multiples of 1 / (lattice + 1), moved inwards by the same for all.
 _LATTICE = 2
 # Cosine of the angle between a curved skin and a press, from which on it is beneath; what is within a distance of the
 # press's axis is then within 1 / cos(60° / 2) times as much of the place pressed, on a ball.
 _BENEATH, _CHORD = 0.5, 1.2
 # Of the z axis along a normal, from which on "up" in the plane that touches a curved skin is along y.
 _LEVEL = 0.866
-# Of the surface's largest triangle, that a press may be off it.
+# The greatest distance of a press from the surface, relative to its largest triangle.
 _OFF = 0.5
 
 

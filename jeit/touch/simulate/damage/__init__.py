@@ -1,7 +1,7 @@
-"""Skins that get damaged: cuts, electrodes that fail, and repair.
+"""Simulate damage of skins: cuts, electrodes that fail, and repair.
 
-Voltages are solved anew on the damaged conductivity, whose mesh is fine along the cut; readings have the drift, gains
-and noise of the material, and go on through the damage.
+Voltages are computed for the damaged conductivity, on a mesh that is fine along the cut; readings have the drift, gains
+and noise of the material, which continue through the damage.
 """
 
 from __future__ import annotations

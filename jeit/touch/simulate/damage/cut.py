@@ -1,4 +1,4 @@
-"""`Cut`: a slit along a path, through the whole skin or a part of its depth, and what conducts there afterwards."""
+"""`Cut`: a slit along a path, through the whole skin or a part of its depth, and the conductivity left there."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jeit.arguments import check_key, check_kind, check_metres, describe, is_num
 from jeit.forward.assembly import check_conductivity
 from jeit.mesh import Domain, Mesh, Refine, centroids, check_flat, measures
 
-# Directions tried for a cut before another place is; and how far a bent one turns, radians.
+# The number of directions tried for a cut before another place; and the turn of a bent one, radians.
 _TRIES, _LEAST_BEND, _MOST_BEND = 400, 0.35, 1.2
 
 
@@ -41,7 +41,7 @@ class Cut(eqx.Module):
 
     @property
     def length(self) -> float:
-        """Of the path, metres."""
+        """Length of the path, metres."""
         return float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
 
     def refine(self, cell_size: float = 1e-3) -> Refine:

@@ -1,4 +1,4 @@
-"""`ElectrodeFault`: an electrode that has died, hangs loose, or whose wire is torn off, and what channels then read."""
+"""`ElectrodeFault`: a dead electrode, a loose one, or one whose wire is torn off, and the readings of its channels."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from jeit.forward.model import check_model, select_channels
 
 FaultKind = Literal["dead", "loose", "torn"]
 FAULTS: tuple[FaultKind, ...] = ("dead", "loose", "torn")
-# Contact impedance of a dead electrode, times what it was; the source gives out at so many times the greatest voltage
+# Contact impedance of a dead electrode, relative to before; the limit of the source's voltage, relative to the greatest
 # that it drives at rest.
 _DEAD, _RAIL = 1e7, 5.0
-# A loose contact wanders between these factors, its logarithm in a time of so many seconds.
+# A loose contact fluctuates between these factors, its logarithm with this time constant in seconds; the number of
+# levels at which it is solved.
 _LOOSE, _WANDERING, _LEVELS = (10.0, 1000.0), 0.5, 7
-# What a wire that hangs in the air picks up, of the root mean square of all voltages.
+# Voltage picked up by a wire that hangs in the air, relative to the root mean square of all voltages.
 _STRAY = 0.02
 
 
@@ -49,11 +50,10 @@ class ElectrodeFault(eqx.Module):
     def changes(
         self, key: Array, model: ForwardModel, conductivity: ArrayLike, seconds: Float[np.ndarray, " T"]
     ) -> Float[np.ndarray, "T M"]:
-        """By how much voltages (T, M) of a skin at rest differ from those without the fault, at `seconds` (T,), volts.
+        """Differences of the voltages (T, M) of a skin at rest from those without the fault, at `seconds` (T,), volts.
 
-        `conductivity` of the skin, S/m (2-D: S).
-
-        Raises `ValueError` for what is no key or model, an electrode that it lacks, and times that are none.
+        `conductivity` of the skin, S/m (2-D: S). Raises `ValueError` for what is no key or model, an electrode that it
+        lacks, and times that are none.
         """
         check_key(key)
         check_model(model)
@@ -84,7 +84,7 @@ class ElectrodeFault(eqx.Module):
         return model.with_electrodes(worse)
 
     def _driven(self, model: ForwardModel, conductivity) -> Float[np.ndarray, " M"]:
-        """Voltages (M,) with a dead electrode, of a source that gives out."""
+        """Voltages (M,) with a dead electrode, from a source of limited voltage."""
         before, after = (np.asarray(one.transfer_impedance(conductivity)) for one in (model, self._worse(model, _DEAD)))
         drive = np.asarray(model.protocol.drive)
         spans = [np.ptp(np.where(drive != 0, drive @ z.T, 0.0), axis=1) for z in (before, after)]
@@ -93,7 +93,7 @@ class ElectrodeFault(eqx.Module):
         return voltages * current[np.asarray(model.protocol.drive_index)]
 
     def _wandering(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
-        """Voltages (T, M) of a contact that wanders, solved at a few levels of its logarithm."""
+        """Voltages (T, M) of a contact that fluctuates, solved at a few levels of its logarithm."""
         low, high = np.log(_LOOSE)
         levels = np.linspace(low, high, _LEVELS)
         solved = [np.asarray(self._worse(model, float(np.exp(one))).voltages(conductivity)) for one in levels]
@@ -104,7 +104,7 @@ class ElectrodeFault(eqx.Module):
             kept = np.exp(-step / _WANDERING) if number else 0.0
             now = kept * now + np.sqrt(1 - kept**2) * one
             place[number] = now
-        # Uniform in its logarithm: a normal number's share of the others below it.
+        # Uniform in its logarithm: the quantile of a normal variable.
         share = np.asarray(jax.scipy.stats.norm.cdf(place)) * (_LEVELS - 1)
         below = np.minimum(share.astype(int), _LEVELS - 2)
         part = (share - below)[:, None]

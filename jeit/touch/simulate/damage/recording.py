@@ -1,4 +1,4 @@
-"""Frames of a skin through its mishaps: whole, then cut, then mended, and with electrodes that fail."""
+"""Simulate frames of a skin through mishaps: whole, then cut, then mended, and with electrodes that fail."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def record_mishaps(
     seconds: Float[np.ndarray, " T"],
     mishaps: Sequence[Mishap],
 ) -> Float[np.ndarray, "T M"]:
-    """Voltages (T, M) at `seconds` (T,) of a skin under moving presses, `[]` for none, through its mishaps.
+    """Simulate voltages (T, M) at `seconds` (T,) of a skin under moving presses, `[]` for none, through its mishaps.
 
-    Of each mishap on, until the next says otherwise, skin and faults are as it says. Drift, gains and noise go on
+    From each mishap on, until the next, skin and faults are those of the mishap. Drift, gains and noise continue
     through all of them. Every frame is solved anew, as a skin with another conductivity. Raises `ValueError` for what
     are no mishaps, those of a skin with other channels, and as `PressedSkin.touched_in_time` does.
     """

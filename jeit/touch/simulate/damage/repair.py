@@ -1,4 +1,4 @@
-"""Repair: a cut that conducts again, about as well as before, in a material that lags behind its load more."""
+"""Repair: a cut that conducts again, about as well as before, in a material with more hysteresis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""People who touch a skin: how each of them makes each of six gestures, and what the skin reads."""
+"""Simulate people who touch a skin: how each of them makes each of six gestures, and the skin's readings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A gesture as a press that moves: its load, place and angle, frame by frame."""
+"""A gesture as a moving press: its load, place and angle, frame by frame."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from jeit.touch.simulate.contact.joined import Joined, Placed
 from jeit.touch.simulate.contact.press import MovingPress
 from jeit.touch.simulate.people.manners import MANNERS
 
-# Seconds recorded before a touch, and after, at least; what the number of frames is a multiple of.
+# Seconds recorded before a touch, and the least after it; the number of frames is a multiple of the last.
 _BEFORE, _AFTER, _EVEN = 0.1, 0.5, 16
 # Pascals, more than a hand's pressure; metres of a hand's middle from the skin's edge, at least; metres that a hand
 # rolls which stays where it is; shares of a long touch in which its load comes and goes; how much a load wobbles.
 _MOST_PRESSURE, _MARGIN, _ROLL, _RAMP, _WOBBLE = 120e3, 15e-3, 2e-3, 0.15, 0.08
-# Fingertips that scratch, and their distance over their radius; how much less load is on them where they turn.
+# The number of fingertips that scratch, and their distance over their radius; the reduction of their load where they
+# turn.
 _TIPS, _APART, _LIGHTER = 3, 2.6, 0.4
-# Places tried until a path lies on the skin, before it is made shorter, and by what.
+# The number of places tried until a path lies on the skin, before it is made shorter, by this factor.
 _TRIES, _SHORTER = 20, 0.8
 
 
@@ -32,7 +33,7 @@ def gesture_motion(
     force = min(force, _MOST_PRESSURE * np.pi * radius**2)
     frames = int(np.ceil((_BEFORE + duration + _AFTER) * rate))
     seconds = np.arange(_EVEN * -(-frames // _EVEN)) / rate
-    # Frames are read when they are, whenever somebody touches.
+    # Frames are not synchronised with touches.
     share = (seconds - _BEFORE - rng.uniform(0, 1) / rate) / duration
     within = (share > 0) & (share < 1)
     share = np.clip(share, 0, 1)
@@ -52,7 +53,7 @@ def gesture_motion(
 
 
 def _loads(rng: np.random.Generator, share: np.ndarray, gesture: str, sweeps: int) -> np.ndarray:
-    """Load over its most, at shares of the duration."""
+    """Load relative to its maximum, at shares of the duration."""
     if MANNERS[gesture].duration == "short":
         return np.sin(np.pi * share)
     ramp = np.clip(np.minimum(share, 1 - share) / _RAMP, 0, 1)

@@ -1,4 +1,4 @@
-"""One long recording of gestures, one after another with pauses between, as a skin in use reads them."""
+"""Simulate one long recording of gestures, one after another with pauses, as from a skin in use."""
 
 from __future__ import annotations
 

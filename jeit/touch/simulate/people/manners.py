@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 TRAITS = ("force", "radius", "duration", "speed", "path")
-"""What a touch is drawn by: force, N; radius of a disc as large as its contact, m; duration, s; and of one that moves
+"""Parameters of a touch: force, N; radius of a disc as large as its contact, m; duration, s; and of moving touches
 speed, m/s, and path, m, of a sweep."""
 
 # Of each word: the median, and the deviation of its logarithm among people.
@@ -24,14 +24,16 @@ _AREA = {"small": (7e-3, 0.2), "sm-large": (12e-3, 0.45), "med-large": (20e-3, 0
 _INTENSITY = {"low": (1.0, 0.3), "low-med": (2.0, 0.4), "med-high": (5.0, 0.4), "high": (10.0, 0.3)}
 _DURATION = {"short": (0.15, 0.3), "med-long": (1.2, 0.4)}
 _MOVING = 0.35
-# From touch to touch of one person, of every trait.
+# Deviation of the logarithm of every trait between touches of one person.
 _WITHIN = 0.25
 
 
 @dataclass(frozen=True)
 class Manner:
-    """Of a gesture: the words of Table I for area, intensity and duration; and where it moves, speed, m/s, and path of
-    a sweep, m."""
+    """How a gesture is made: the words of Table I for area, intensity and duration.
+
+    Where it moves: also speed, m/s, and path of a sweep, m.
+    """
 
     area: str
     intensity: str
@@ -41,7 +43,7 @@ class Manner:
 
     @property
     def medians(self) -> Float[np.ndarray, " 5"]:
-        """Of `TRAITS`, in SI units, among people; 0 where it does not move."""
+        """Medians of `TRAITS` among people, in SI units; 0 where it does not move."""
         return np.array([*(one[0] for one in self._words), self.speed, self.path])
 
     @property
@@ -51,7 +53,7 @@ class Manner:
 
     @property
     def within(self) -> float:
-        """Deviation of their logarithms from touch to touch of one person."""
+        """Deviation of their logarithms between touches of one person."""
         return _WITHIN
 
     @property
@@ -75,4 +77,4 @@ MANNERS: dict[str, Manner] = {
 """The six gestures, in the paper's order."""
 
 GESTURES = tuple(MANNERS)
-"""Their names."""
+"""Names of the gestures."""

@@ -1,4 +1,4 @@
-"""People: each makes each gesture in a way of their own, and never twice the same."""
+"""Simulated people: each makes each gesture in a way of their own, with variation between touches."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jeit.touch.simulate.contact.press import MovingPress
 from jeit.touch.simulate.people.gesture_motion import gesture_motion
 from jeit.touch.simulate.people.manners import GESTURES, MANNERS, TRAITS
 
-# Metres from the edge that a hand's middle keeps; a skin has room for it.
+# Least distance, metres, of a hand's centre from the edge; a skin has room for it.
 _LEAST_SIDE = 0.06
 
 
@@ -32,7 +32,7 @@ class Person(eqx.Module):
 
     @classmethod
     def draw(cls, key: Array) -> "Person":
-        """Anybody: medians log-normal about those of each gesture. Raises `ValueError` for what is no key."""
+        """Draw a person: medians are log-normal about those of each gesture. Raises `ValueError` for what is no key."""
         check_key(key)
         normal = np.asarray(jax.random.normal(key, (len(GESTURES), len(TRAITS))))
         manners = MANNERS.values()
@@ -42,9 +42,9 @@ class Person(eqx.Module):
     def touch(
         self, key: Array, gesture: str, outline: Domain, *, rate: float = 60.0
     ) -> tuple[MovingPress, Float[np.ndarray, " T"]]:
-        """A gesture by this person anywhere on a skin of this `outline`: the press, and the times (T,) of its frames,
-        seconds, at `rate` frames/s, some before and after it.
+        """Simulate a gesture by this person anywhere on a skin of this `outline`.
 
+        Returns the press, and the times (T,) of its frames, seconds, at `rate` frames/s, some before and after it.
         Traits are log-normal about the person's own. Raises `ValueError` for what is no key, gesture, outline or rate,
         and a skin too small for a hand.
         """

@@ -1,4 +1,4 @@
-"""Gestures of many people on a simulated skin, as it reads them."""
+"""Simulate the recordings of gestures of many people on a skin."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jeit.touch.simulate.people.person import Person
 # Seconds since the reference, at most, in which a skin drifts; frames of the reference, and of the untouched skin: each
 # of so many drifts.
 _LATEST, _REFERENCE, _DRIFTS, _FRAMES = 60.0, 60, 40, 16
-# Recordings simulated at once.
+# The number of recordings simulated at once.
 _AT_ONCE = 120
 
 
