@@ -1,8 +1,7 @@
-"""What is said of arguments and files that cannot be right: another kind of thing, a name there is not, a length in
-millimetres.
+"""Checks and error messages for invalid arguments and files: a wrong type, an unknown name, a length in millimetres.
 
-One sentence each, before anything is compiled: which argument, what was given, what to give. Beneath all rooms, and
-light: nothing of the library is imported here.
+Each message is one sentence, raised before anything is compiled: which argument, what was given, what to give. It is
+the lowest layer, and light: nothing of the library is imported here.
 """
 
 from __future__ import annotations

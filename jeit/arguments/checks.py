@@ -14,7 +14,7 @@ import numpy as np
 
 from jeit_solvers.engines import has_values
 
-# Of numbers, texts and nothing it is told what they are, with so many letters at most; of all else, of what kind.
+# Types whose values are shown in messages, with at most this many letters; of all others the type is named.
 _PLAIN, _LONGEST = (str, bytes, int, float, complex, type(None)), 60
 
 
@@ -31,7 +31,7 @@ def is_number(given: Any) -> bool:
 
 
 def describe(given: Any) -> str:
-    """What was given, in a few words: 'laplace', nan, a list, an array of float64 of shape (3,)."""
+    """Describe an argument in a few words: 'laplace', nan, a list, an array of float64 of shape (3,)."""
     thing = _scalar(given)
     if isinstance(thing, (np.ndarray, jax.Array)):
         return f"an array of {thing.dtype} of shape {thing.shape}"
@@ -56,8 +56,8 @@ def _scalar(given: Any) -> Any:
 
 
 def real_array(name: str, given: Any, wanted: str) -> np.ndarray:
-    """What was given as an array of float64. Raises `ValueError`, about the argument `name`, for what holds no real
-    numbers, or rows of several lengths; `wanted` says what is."""
+    """Convert an argument to an array of float64. Raises `ValueError`, about the argument `name`, for what holds no
+    real numbers, or rows of several lengths; `wanted` says what is."""
     try:
         values = np.asarray(given)
     except (ValueError, TypeError):
@@ -67,12 +67,12 @@ def real_array(name: str, given: Any, wanted: str) -> np.ndarray:
     return values.astype(float)
 
 
-# Below it nobody cares how little it is.
+# Below this, the exact value does not matter.
 _LEAST_PERCENT = 0.001
 
 
 def counted(number: int, noun: str) -> str:
-    """So many of a thing: "1 frame", "1,000 frames", "2 touches"."""
+    """A number with its noun: "1 frame", "1,000 frames", "2 touches"."""
     several = "es" if noun.endswith(("ch", "s", "x")) else "s"
     return f"{number:,} {noun}{'' if number == 1 else several}"
 

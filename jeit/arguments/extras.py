@@ -6,7 +6,7 @@ import importlib
 from importlib.util import find_spec
 from types import ModuleType
 
-# Of each extra: what is imported, and the package that it comes in.
+# For each extra, the module that is imported and the package that contains it.
 EXTRAS = {
     "mesh": {"gmsh": "gmsh"},
     "cad": {"ezdxf": "ezdxf"},
@@ -17,7 +17,7 @@ EXTRAS = {
     "cluster": {"dask": "dask", "distributed": "distributed", "zarr": "zarr", "xarray": "xarray"},
 }
 
-# Letters of why a package cannot be imported: what to install stands behind them.
+# Greatest number of letters of the reason why a package cannot be imported, which precedes the advice what to install.
 _REASON = 120
 
 

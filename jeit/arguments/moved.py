@@ -1,5 +1,5 @@
-"""Public names of version 0.2 that have another home now. They are found there, with a `DeprecationWarning` that names
-it, and until the next version."""
+"""Public names of version 0.2 that have moved. They still work until the next version, with a `DeprecationWarning` that
+names the new place."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-# Of each contents page: where names have moved to, as they are.
+# For each contents page, the new places of names that have moved unchanged.
 _MOVED = {
     "jeit.imaging": {
         "jeit.touch": "LearntGestures NamedTouch TouchImages TouchWatch WatchedFrame doubts_of learn_gestures "

@@ -1,4 +1,4 @@
-"""The `jeit` command: one file for each of its commands, and `app`, which ties them together.
+"""The `jeit` command line: one file for each command, and `app`, which combines them.
 
 The commands import what they need when they run, so that `jeit --help` answers at once.
 """

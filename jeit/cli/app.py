@@ -1,4 +1,4 @@
-"""The command line's frame: its commands and its errors."""
+"""The command-line application: its commands and the reporting of errors."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ _REPEATING = (
     "listen fit",
 )
 
-# Of use to those who write programs, and noise to those who run one: what a package that jeit uses will change.
+# Warnings of future changes in packages that jeit uses: useful to programmers, noise to users of the command line.
 _FOR_PROGRAMMERS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning)
 
-# Letters of what is said of an error.
+# Greatest number of letters of an error's message.
 _LONGEST = 390
 
 
@@ -79,11 +79,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command with `arguments` (those of the process unless given); returns its exit status.
 
     0: done. 1: something is wrong with the data or the values given. 2: the command was not called as it should be.
-    Whatever is wrong is said in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
+    Errors are reported in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
     """
     for output in (sys.stdout, sys.stderr):
         if isinstance(output, io.TextIOWrapper):
-            output.reconfigure(errors="replace")  # a terminal that knows no Greek must not end the run
+            output.reconfigure(errors="replace")  # a terminal without Greek letters must not end the run
     given = sys.argv[1:] if arguments is None else list(arguments)
     command = as_command(given)
     try:
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def as_command(arguments: Sequence[str] = ()):
-    """All of it as one command of click, whose errors name options where jeit's name arguments.
+    """The application as one click command, whose errors name options where jeit's name arguments.
 
     Where the first of the `arguments` is a command, the others are left out, and not imported.
     """
@@ -115,7 +115,7 @@ def as_command(arguments: Sequence[str] = ()):
 
 
 def _name_options(command) -> None:
-    """Let every command's errors say the option where jeit says the argument of that name."""
+    """Make every command's errors name the option where jeit names the argument."""
     for one in getattr(command, "commands", {}).values():
         _name_options(one)
     options = {one.name: max(one.opts, key=len) for one in command.params if one.param_type_name == "option"}
@@ -126,7 +126,7 @@ def _name_options(command) -> None:
 
 
 def _explain(error: Exception) -> int:
-    """One line on standard error, and the exit status."""
+    """Report an error in one line on standard error; return the exit status."""
     if hasattr(error, "format_message"):  # how the command was called: click's and typer's own errors
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "jeit"
@@ -156,14 +156,14 @@ def _fail(message: str, status: int) -> int:
 
 
 def _one_line(message: str) -> str:
-    """One line that a terminal shows as it is, of its beginning and its end where it is long."""
+    """Text as one line that a terminal shows as it is, shortened in the middle where it is long."""
     line = "".join(letter if letter.isprintable() else "�" for letter in " ".join(message.split()))
     half = (_LONGEST - 3) // 2
     return line if len(line) <= _LONGEST else f"{line[:half]} … {line[-half:]}"
 
 
 def _shown_once() -> Callable[..., None]:
-    """What shows a command's warnings, the same one once: what it computes with is often made again."""
+    """Function that shows a command's warnings, each only once, since the same objects are often created again."""
     shown: set[str] = set()
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
@@ -178,10 +178,10 @@ def _shown_once() -> Callable[..., None]:
 
 
 def _start(*, quickly: bool) -> None:
-    """Set up one process; `quickly` for one that runs no program many times: compilation would be most of its time. A
-    user who has set XLA_FLAGS has decided already."""
+    """Set up the process; `quickly` for commands that run no program many times, whose time would be mostly
+    compilation. XLA_FLAGS set by the user take precedence."""
     if quickly:
         os.environ.setdefault("XLA_FLAGS", quick_compilation())
     logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of folders that it cannot write to, and fonts
-    # What is imported and traced are many small objects, which Python would look through for rubbish again and again.
+    # Imports and tracing create many small objects, which Python's garbage collector would scan again and again.
     gc.set_threshold(100_000, 20, 50)

@@ -1,10 +1,12 @@
-"""What the command line has of the applications above the core, by name: they are imported when they are called."""
+"""Commands of the applications above the core, by name: they are imported when they are called."""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable
 from typing import Any
+
+from jeit.cli.options import NETWORK
 
 # Each command and the module that has it, which is imported when the command is called.
 COMMANDS = {
@@ -23,9 +25,6 @@ COMMANDS = {
     "touch": "jeit.touch.commands.touch",
     "learn": "jeit.touch.commands.learn",
 }
-
-NETWORK = "network"
-"""The method that `--method` of `reconstruct` and `stream` has beside those of `jeit.imaging`."""
 
 
 def check_method(method: str | None, others: Iterable[str]) -> None:

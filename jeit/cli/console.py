@@ -1,4 +1,4 @@
-"""What the commands print: steps as they go, and tables of results."""
+"""Output of the commands: progress of their steps, and tables of results."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
     from jeit.image import Inclusion
 
 
-# Columns that all that is known of a body goes into.
+# Number of columns that all properties of a body fit into.
 _WIDTH = 80
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
 
 def plain_console() -> Console:
-    """Standard output, on which text is shown as it is: what a file holds is never taken for rich's markup."""
+    """Standard output on which text is shown as it is: the content of files is never interpreted as rich's markup."""
     return Console(highlight=False, markup=False)
 
 
 class Steps:
     """Progress on standard output: the step under way with a spinner, steps done with the seconds they took.
 
-    Call it with the name of each step as it begins; `tell` says how far it is. Prints nothing when `quiet`.
+    Call it with the name of each step as it begins; `report` says how far it is. Prints nothing when `quiet`.
     """
 
     def __init__(self, console: Console, *, quiet: bool):
@@ -137,7 +137,7 @@ def inclusion_table(
         rows.append([*place, f"{1e6 * inclusion.area:.{digits}f}", peak, *after])
 
     def table_of(parted: str) -> Table:
-        """With this between the kind of a body and "column"."""
+        """Table with this text between the kind of a body and "column"."""
         table = Table("inclusion", *places, size, f"peak change\n/ {unit}", *more, **close)
         table.columns[0].min_width = max((len(one.kind) for one in inclusions), default=0)
         for column in table.columns[1:]:

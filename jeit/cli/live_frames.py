@@ -8,17 +8,17 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-# Of the usual time between frames, how long is waited for one that comes as it is read, not before; so many in a row;
-# and seconds in which what came before is read, at most.
+# Share of the usual time between frames after which a frame counts as arriving live; the number of such frames in a row
+# that ends the search; and the most seconds for reading earlier frames.
 _WAITED, _IN_A_ROW, _BEFORE = 0.4, 3, 5.0
 
 
 class LiveFrames:
     """Pairs of a second and a frame, of `lines` as `parse_frames` gives them, that end with them.
 
-    By a `rate`, frames/s, all frames count. Without one the clock tells their seconds, which it cannot of frames that
-    came while nobody read: those are left out, `left_out` of them; and where all have come already, as of a file, the
-    `usual` rate is taken.
+    With a `rate`, frames/s, all frames count. Without one the clock gives their seconds, except for frames that arrived
+    while nobody read: those are left out, `left_out` of them; and where all frames have arrived already, as from a
+    file, the `usual` rate is used.
     """
 
     def __init__(self, lines: Iterator[object], rate: float | None, usual: float):

@@ -58,6 +58,9 @@ ReferenceFrames = Annotated[
         metavar="FIRST-LAST",
     ),
 ]
+NETWORK = "network"
+"""The method that `--method` of `reconstruct` and `stream` has beside those of `jeit.imaging`."""
+
 # Folders that make_folder made, the innermost of each first; files that the command under way was given.
 _MADE: list[Path] = []
 _GIVEN: list[Path] = []
@@ -66,7 +69,7 @@ _WRITTEN = ("output", "page", "film")
 
 
 def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command after whose call `make_folder` knows the files that it was given."""
+    """Wrap a command so that `make_folder` knows the files that it was given."""
 
     @wraps(command)
     def call(**values: Any) -> Any:
@@ -81,11 +84,11 @@ def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class StoppedError(Exception):
-    """Ctrl-C ended a command; what is said of it."""
+    """Raised when Ctrl-C ended a command, with the message to print."""
 
 
 def telling_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that raises `StoppedError` on Ctrl-C, of which typer would say nothing."""
+    """Wrap a command so that it raises `StoppedError` on Ctrl-C, which typer would not report."""
 
     @wraps(command)
     def call(*given: Any, **values: Any) -> Any:
@@ -99,7 +102,7 @@ def telling_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def naming_options(options: dict[str, str]) -> Iterator[None]:
-    """Errors that speak of these arguments speak of their options instead, see `in_options`."""
+    """Context in which errors about these arguments name their options instead; see `in_options`."""
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
@@ -143,9 +146,10 @@ def read_pair(
 
 
 def in_options(said: str, options: dict[str, str]) -> str:
-    """What jeit says of its arguments, at the beginning of a sentence or as `name=`, said of a command's options.
+    """Turn a message about jeit's arguments, at the beginning of a sentence or as `name=`, into one about a command's
+    options.
 
-    An option in millimetres says so in its name: whether they were given for metres is not asked.
+    An option in millimetres says so in its name: the question whether millimetres were given for metres is left out.
     """
     from jeit.arguments import IN_MILLIMETRES
 

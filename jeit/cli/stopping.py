@@ -1,4 +1,5 @@
-"""Ctrl-C and SIGTERM while frames are streamed: what has come is written, and the exit status says what ended it."""
+"""Handling of Ctrl-C and SIGTERM while frames are streamed: the frames received are written, and the exit status says
+which signal ended the command."""
 
 from __future__ import annotations
 
@@ -18,12 +19,12 @@ from jeit.cli.options import remove_empty_folders
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _NO_MORE = object()
-# Seconds from one word of how many frames have come to the next.
+# Seconds between reports of the number of frames received.
 _EVERY = 0.25
 
 
 class _StoppedError(Exception):
-    """A stream was stopped, and what is left to do is left out."""
+    """Raised when a stream was stopped, to skip the remaining work."""
 
 
 class Stopping:
@@ -55,7 +56,7 @@ class Stopping:
             self._waiting = False
 
     def before(self, pictures: Sequence[str], step: Steps) -> Callable[[str], None]:
-        """Tells of what is written and drawn as steps; nothing is drawn where a signal has come."""
+        """Function that reports what is written and drawn as steps; nothing is drawn once a signal has come."""
 
         def report(what: str) -> None:
             part = "draw" if what.partition(":")[0] in pictures else "write"
@@ -92,8 +93,8 @@ class Stopping:
 
     def __enter__(self) -> "Stopping":
         if threading.current_thread() is threading.main_thread():
-            heard = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
-            self._earlier = {one: signal.signal(one, self._stop) for one in heard}
+            handled = [one for one in _SIGNALS if signal.getsignal(one) is not signal.SIG_IGN]
+            self._earlier = {one: signal.signal(one, self._stop) for one in handled}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_) -> None:
@@ -110,14 +111,14 @@ class Stopping:
 
 
 class FrameCounter:
-    """Says of the step under way how many frames have come, of `number` where that is known, a few times a second."""
+    """Reports, a few times a second, how many frames have been received, of `number` where that is known."""
 
     def __init__(self, step: Steps, number: int | None = None):
         self._step, self._of = step, "" if number is None else f" of {number:,}"
         self.number, self._last = 0, 0.0
 
     def one_more(self) -> None:
-        """A frame has come."""
+        """Count one more frame."""
         self.number += 1
         now = time.monotonic()
         if now - self._last > _EVERY:

@@ -28,7 +28,7 @@ _NUMERIC = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13
 # Types in which numbers are stored; the flag of complex ones.
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _COMPLEX = 0x800
-# Bytes of a number at most, in memory, and of all that is told beside them.
+# Greatest number of bytes of a number in memory, and of everything else in an element.
 _BYTES, _BESIDE = 16, 2**16
 
 
@@ -57,8 +57,8 @@ def variable_names(path: Path) -> set[str]:
 
 
 def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
-    """Of the variables `wanted` those that hold numbers, by name, sparse matrices made dense, and under "" the names of
-    all that there are. What is not wanted is not unpacked.
+    """Load those of the variables `wanted` that hold numbers, by name, sparse matrices made dense, and under "" the
+    names of all variables. Other variables are not unpacked.
 
     Raises `ValueError` when it cannot be read, and for what would not fit in memory (`check_memory`).
     """
@@ -87,7 +87,7 @@ def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
 
 
 def _plain(read: dict, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Of SciPy's, of format 4."""
+    """Arrays of variables that SciPy read from a file of format 4, sparse ones made dense."""
     found = {name: read[name] for name in wanted if name in read}
     return {name: value.toarray() if hasattr(value, "toarray") else value for name, value in found.items()}
 
@@ -104,7 +104,7 @@ def _is_format_4(path: Path) -> bool:
 
 
 def _variables(path: Path) -> list[_Variable]:
-    """What a file of format 5 says that it holds. Raises `ValueError` for others."""
+    """Headers of the variables of a file of format 5. Raises `ValueError` for others."""
     content = path.read_bytes()
     if len(content) >= _HEADER and (content[:8] == b"\x89HDF\r\n\x1a\n" or 2 in content[124:126]):
         raise ValueError(
@@ -115,7 +115,7 @@ def _variables(path: Path) -> list[_Variable]:
 
 
 def _elements(content: bytes) -> Iterator[_Variable]:
-    """Its arrays, one after the other; of packed ones the beginning is unpacked."""
+    """Arrays of the file, one after the other; of packed ones the beginning is unpacked."""
     if len(content) < _HEADER or content[126:128] not in (b"IM", b"MI"):
         raise ValueError("it is of another kind")
     order = "<" if content[126:128] == b"IM" else ">"
@@ -162,7 +162,7 @@ def _part(content: bytes, place: int, order: str) -> tuple[int, bytes, int]:
 
 
 def _numbers(content: bytes, place: int, order: str) -> tuple[np.ndarray, int]:
-    """Those of a sub-element, and where the next begins."""
+    """Numbers of a sub-element, and the place where the next begins."""
     kind, stored, place = _part(content, place, order)
     if kind not in _STORED:
         raise ValueError(f"an array of it is stored as type {kind}")

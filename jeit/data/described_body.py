@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jeit.data.description_tables import ElectrodesTable, FacetsTable, GeometryTable, MeshTable, PlacedTable
 
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
-# How many times a key's length the body is large.
+# Size of the body over the length given by a key.
 _ACROSS = {"radius": 2.0, "width": 1.0, "depth": 1.0, "height": 1.0, "thickness": 1.0}
 
 
@@ -61,7 +61,8 @@ def _extent(points) -> float:
     return float(np.ptp(np.asarray(points), axis=0).max())
 
 
-# Of an electrode's smaller size: how far off the surface it may be, and of its height: how far out above the wall.
+# Greatest distance of an electrode from the surface, as a share of its smaller size, and its greatest overhang beyond
+# the wall, as a share of its height.
 _MOST_OFF = 0.1
 _MOST_OUT = 0.02
 
@@ -96,7 +97,7 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
 
 
 def _off(body: Solid, place: Float[np.ndarray, "L 3"]):
-    """How far places are off the surface, metres, and whether its wall is nearer than its lids."""
+    """Distance of places from the surface, metres, and whether the wall is nearer than the lids."""
     z = place[:, 2]
     within, between = np.asarray(body.outline.signed_distance(place[:, :2])), np.minimum(z, body.thickness - z)
     off_wall, off_lid = np.abs(within), np.abs(between)

@@ -2,8 +2,9 @@
 
 Whether electrodes on an edge are numbered as they follow each other along it.
 
-A layout may be numbered in any order. But two rows of a table of positions exchanged look just like that, spoil every
-image, and are noticed by nobody; so it is said, and what the voltages say of it, whose signs hang on the order.
+A layout may be numbered in any order. But two exchanged rows of a table of positions look the same, spoil every image,
+and go unnoticed; so such an order is reported, with what the signs of the voltages, which depend on the order, say of
+it.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
 
 
 def _constructed(table: ConstructedTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
-    """By the constructor of that name."""
-    # That of a reference electrode counts those on the boundary only.
+    """Make a protocol by the constructor of that name."""
+    # The number of a protocol with a reference electrode counts those on the boundary only.
     apart = 1 if table.kind == "reference_electrode" else 0
     number = table.number if num_electrodes is None or table.number is not None else num_electrodes - apart
     if number is None:
@@ -92,7 +93,7 @@ def _optimal(table: OptimalTable, origin: str) -> Protocol:
 
 
 def _counts(kind: str, number: int, options: dict[str, Any]) -> tuple[int, int, int, int]:
-    """How many drive and measurement patterns, electrodes and channels a protocol has at most."""
+    """Upper bounds of the numbers of drive and measurement patterns, electrodes and channels of a protocol."""
     if kind == "two_terminal":
         pairs = number * (number - 1) // 2 if options.get("pairs") is None else len(options["pairs"])
         return pairs, pairs, number, pairs
@@ -136,7 +137,7 @@ def number_in_name(pattern: str, name: str) -> float | None:
 
 
 def _number_end(text: str, start: int) -> int:
-    """Where a number that begins at `start` ends."""
+    """The end of a number that begins at `start`."""
     end = start
     while end < len(text) and text[end] in "0123456789":
         end += 1

@@ -53,7 +53,7 @@ _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
 
 @dataclass(frozen=True)
 class TableLayout:
-    """How numbers lie in a file (section `[data]`)."""
+    """Arrangement of the numbers in a file (section `[data]`)."""
 
     frames_in: str = "rows"
     delimiter: str = ","
@@ -106,8 +106,8 @@ class Description:
 
     @property
     def reading(self) -> tuple[Reading, int | None]:
-        """What is read of the potentials of all electrodes where the currents lie in the data file, and which electrode
-        they are read against."""
+        """Reading of the potentials of all electrodes where the currents lie in the data file, and the electrode they
+        are read against."""
         section = self.protocol_section
         if section is None or section.kind != "measured":
             return "mean-removed", None

@@ -21,9 +21,9 @@ Sizes = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-9, 1e3, "m", s
 Place = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
 Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e3, 1e3, "m")]
 Positions = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES), (2, 3)), -1e3, 1e3, "m")]
-# One ring is as well told by its height alone as each size by one for all.
+# A single number stands for one ring, as one size stands for all electrodes.
 Levels = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 0, 1e3, "m", single=True)]
-# Of arcs on the edge of a sheet in ohm·m.
+# The contact impedance of arcs on the edge of a sheet is in ohm·m.
 Impedances = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-15, 1e12, "ohm·m²", single=True)]
 Patterns = Annotated[np.ndarray, Numbers(((1, math.inf), (2, MOST_ELECTRODES)), -1e12, 1e12)]
 Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MOST_ELECTRODES, kind=int)]
@@ -33,7 +33,7 @@ Choices = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=boo
 
 
 class DiskTable(Table):
-    """Of a disk, or with a thickness a cylinder."""
+    """Table of a disk, or with a thickness a cylinder."""
 
     what = "a disk"
     shape: Literal["disk"]
@@ -43,7 +43,7 @@ class DiskTable(Table):
 
 
 class RectangleTable(Table):
-    """Of a rectangle, or with a thickness a box."""
+    """Table of a rectangle, or with a thickness a box."""
 
     what = "a rectangle"
     shape: Literal["rectangle"]
@@ -54,7 +54,7 @@ class RectangleTable(Table):
 
 
 class PolygonTable(Table):
-    """Of a polygon, or with a thickness what stands upright on it."""
+    """Table of a polygon, or with a thickness the upright solid on it."""
 
     what = "a polygon"
     shape: Literal["polygon"]
@@ -75,7 +75,7 @@ class PolygonTable(Table):
 
 
 class BoxTable(Table):
-    """Of a box."""
+    """Table of a box."""
 
     what = "a box"
     shape: Literal["box"]
@@ -85,7 +85,7 @@ class BoxTable(Table):
 
 
 class CylinderTable(Table):
-    """Of a cylinder."""
+    """Table of a cylinder."""
 
     what = "a cylinder"
     shape: Literal["cylinder"]
@@ -94,7 +94,7 @@ class CylinderTable(Table):
 
 
 class MeshTable(Table):
-    """Of a mesh in a file beside the description. `scale`: its unit."""
+    """Table of a mesh in a file beside the description. `scale`: its unit."""
 
     what = "a mesh"
     mesh: Word
@@ -102,7 +102,7 @@ class MeshTable(Table):
 
 
 class PlacedTable(Table):
-    """What electrodes of all kinds but facets have: where they are."""
+    """Base of tables of electrodes of all kinds but facets: their positions."""
 
     layout: Literal["ring", "perimeter"] | None = None
     number: Annotated[int, _COUNT] | None = None
@@ -127,7 +127,7 @@ class PlacedTable(Table):
 
 
 class BoundaryTable(PlacedTable):
-    """Of arcs on the edge of a sheet. `contact_impedance`: ohm·m."""
+    """Table of arcs on the edge of a sheet. `contact_impedance`: ohm·m."""
 
     what = "electrodes of kind 'boundary'"
     kind: Literal["boundary"] = "boundary"
@@ -136,7 +136,7 @@ class BoundaryTable(PlacedTable):
 
 
 class DiscTable(PlacedTable):
-    """Of discs."""
+    """Table of discs."""
 
     what = "electrodes of kind 'disc'"
     kind: Literal["disc"]
@@ -145,7 +145,7 @@ class DiscTable(PlacedTable):
 
 
 class PatchTable(PlacedTable):
-    """Of rectangles on a solid."""
+    """Table of rectangles on a solid."""
 
     what = "electrodes of kind 'patch'"
     kind: Literal["patch"]
@@ -155,14 +155,14 @@ class PatchTable(PlacedTable):
 
 
 class PointTable(PlacedTable):
-    """Of points."""
+    """Table of points."""
 
     what = "electrodes of kind 'point'"
     kind: Literal["point"]
 
 
 class FacetsTable(Table):
-    """Of groups of a mesh's facets, by their names."""
+    """Table of groups of a mesh's facets, by their names."""
 
     what = "electrodes of kind 'facets'"
     kind: Literal["facets"]
@@ -171,7 +171,7 @@ class FacetsTable(Table):
 
 
 class DrivenTable(Table):
-    """What protocols of all kinds but matrices and channels have."""
+    """Base of tables of protocols of all kinds but matrices and channels."""
 
     number: Annotated[int, _COUNT] | None = None
     name: Word | None = None
@@ -196,7 +196,7 @@ class DrivenTable(Table):
 
 
 class AdjacentTable(DrivenTable):
-    """Of `jeit.protocol.adjacent`."""
+    """Table of `jeit.protocol.adjacent`."""
 
     what = "the protocol 'adjacent'"
     kind: Literal["adjacent"]
@@ -206,7 +206,7 @@ class AdjacentTable(DrivenTable):
 
 
 class SkipTable(DrivenTable):
-    """Of `jeit.protocol.skip`."""
+    """Table of `jeit.protocol.skip`."""
 
     what = "the protocol 'skip'"
     kind: Literal["skip"]
@@ -218,7 +218,7 @@ class SkipTable(DrivenTable):
 
 
 class OppositeTable(DrivenTable):
-    """Of `jeit.protocol.opposite`."""
+    """Table of `jeit.protocol.opposite`."""
 
     what = "the protocol 'opposite'"
     kind: Literal["opposite"]
@@ -228,7 +228,7 @@ class OppositeTable(DrivenTable):
 
 
 class AgainstOneTable(DrivenTable):
-    """Of `jeit.protocol.all_against_one`."""
+    """Table of `jeit.protocol.all_against_one`."""
 
     what = "the protocol 'all_against_one'"
     kind: Literal["all_against_one"]
@@ -239,7 +239,7 @@ class AgainstOneTable(DrivenTable):
 
 
 class ReferenceTable(DrivenTable):
-    """Of `jeit.protocol.reference_electrode`. `number`: on the boundary."""
+    """Table of `jeit.protocol.reference_electrode`. `number`: on the boundary."""
 
     what = "the protocol 'reference_electrode'"
     kind: Literal["reference_electrode"]
@@ -250,7 +250,7 @@ class ReferenceTable(DrivenTable):
 
 
 class TwoTerminalTable(DrivenTable):
-    """Of `jeit.protocol.two_terminal`."""
+    """Table of `jeit.protocol.two_terminal`."""
 
     what = "the protocol 'two_terminal'"
     kind: Literal["two_terminal"]
@@ -258,14 +258,14 @@ class TwoTerminalTable(DrivenTable):
 
 
 class AllAtOnceTable(DrivenTable):
-    """What protocols that drive all electrodes have: what is read of their potentials."""
+    """Base of tables of protocols that drive all electrodes: the reading of their potentials."""
 
     measurement: Reading = "mean-removed"
     reference: Annotated[int, _INDEX] | None = None
 
 
 class TrigonometricTable(AllAtOnceTable):
-    """Of `jeit.protocol.trigonometric`."""
+    """Table of `jeit.protocol.trigonometric`."""
 
     what = "the protocol 'trigonometric'"
     kind: Literal["trigonometric"]
@@ -273,14 +273,14 @@ class TrigonometricTable(AllAtOnceTable):
 
 
 class HaarTable(AllAtOnceTable):
-    """Of `jeit.protocol.haar`."""
+    """Table of `jeit.protocol.haar`."""
 
     what = "the protocol 'haar'"
     kind: Literal["haar"]
 
 
 class OptimalTable(Table):
-    """Of `jeit.protocol.optimal`. `transfer`, `other`: ohm; `drives`: how many; `power`: watts."""
+    """Table of `jeit.protocol.optimal`. `transfer`, `other`: ohm; `drives`: how many; `power`: watts."""
 
     what = "the protocol 'optimal'"
     kind: Literal["optimal"]
@@ -302,7 +302,7 @@ class OptimalTable(Table):
 
 
 class MeasuredTable(Table):
-    """Of currents that lie in the data file. `drive_key`, `measurement_key`: the names of its matrices."""
+    """Table of currents that lie in the data file. `drive_key`, `measurement_key`: the names of its matrices."""
 
     what = "a protocol of measured currents"
     kind: Literal["measured"]
@@ -316,7 +316,7 @@ class MeasuredTable(Table):
 
 
 class BipolarTable(DrivenTable):
-    """Of `jeit.protocol.bipolar`."""
+    """Table of `jeit.protocol.bipolar`."""
 
     what = "the protocol 'bipolar'"
     kind: Literal["bipolar"]
@@ -327,7 +327,7 @@ class BipolarTable(DrivenTable):
 
 
 class MatricesTable(Table):
-    """Of every drive pattern, amperes, with every measurement pattern that `select` says."""
+    """Table of every drive pattern, amperes, with every measurement pattern that `select` says."""
 
     what = "a protocol of matrices"
     kind: Literal["matrices"]
@@ -338,7 +338,7 @@ class MatricesTable(Table):
 
 
 class ChannelsTable(Table):
-    """Of a drive pattern, amperes, and a measurement pattern for each channel, by their numbers from 0."""
+    """Table of a drive pattern, amperes, and a measurement pattern for each channel, by their numbers from 0."""
 
     what = "a protocol of channels"
     kind: Literal["channels"]
@@ -350,7 +350,7 @@ class ChannelsTable(Table):
 
 
 class DataTable(Table):
-    """Of how numbers lie in a file."""
+    """Table of the arrangement of the numbers in a file."""
 
     what = "[data]"
     frames_in: Literal["rows", "columns"] = "rows"
@@ -379,7 +379,7 @@ class DataTable(Table):
 
 
 class NotesTable(Table):
-    """Of sentences to carry along."""
+    """Table of sentences to carry along."""
 
     what = "[notes]"
     text: Annotated[list[Annotated[str, Field(max_length=10_000)]], FailFast()] = Field(default=[])
@@ -410,7 +410,7 @@ _PROTOCOL = OneOf(
 
 
 class DescriptionTable(Table):
-    """Of a whole description."""
+    """Table of a whole description."""
 
     what = "a description"
     title: Annotated[str, Field(max_length=1000)] = ""

@@ -1,7 +1,8 @@
-"""Whether electrodes on an edge are numbered as they follow each other along it.
+"""Check that electrodes on an edge are numbered in the order in which they follow each other along it.
 
-A layout may be numbered in any order. But two rows of a table of positions exchanged look just like that, spoil every
-image, and are noticed by nobody; so it is said, and what the voltages say of it, whose signs hang on the order.
+A layout may be numbered in any order. But two exchanged rows of a table of positions look the same, spoil every image,
+and go unnoticed; so such an order is reported, with what the signs of the voltages, which depend on the order, say of
+it.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jeit.data.quality import boundary_order, impossible_signs
 
 # Electrodes that are listed, at most.
 _MOST = 40
-# What noise does to the share of impossible signs from one order to another.
+# Difference that noise alone makes to the share of impossible signs between two orders.
 _CHANCE = 0.01
 
 
@@ -45,7 +46,7 @@ def follows(order: Int[np.ndarray, " L"]) -> bool:
 
 
 def _from_the_first(order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
-    """From the first electrode on, in the sense in which most numbers go up."""
+    """The order from the first electrode on, in the sense in which most numbers increase."""
     steps = (np.roll(order, -1) - order) % len(order)
     if (steps == len(order) - 1).sum() > (steps == 1).sum():
         order = order[::-1]

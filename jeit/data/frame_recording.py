@@ -18,9 +18,9 @@ from jeit.files import npz_arrays
 
 
 def join(measurements: Sequence[Measurement]) -> Measurement:
-    """All frames of measurements of one set-up, one after the other, with their times if all have some that rise.
+    """Join the frames of measurements of one set-up, one after the other, with their times if all have times that rise.
 
-    What is said of the body, and notes, are those of the first. Raises `ValueError` for none, and where two drive or
+    The body, the electrodes and the notes are those of the first. Raises `ValueError` for none, and where two drive or
     read differently.
     """
     if not measurements:
@@ -103,7 +103,7 @@ def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> np
 
 
 def _frames(given: np.ndarray, layout: TableLayout, name: str, channels: int | None) -> Float[np.ndarray, "F M"]:
-    """Of a table, in volts."""
+    """Frames of a table, in volts."""
     if given.dtype.kind not in "iufc":
         raise ValueError(f"frames are {given.dtype}; give numbers, in volts.")
     frames = table.frames_from(given, layout, name)

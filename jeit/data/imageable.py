@@ -1,4 +1,4 @@
-"""May this frame be imaged against this reference? The same set-up, and more signal than noise."""
+"""Checks whether a frame can be imaged against a reference: the same set-up, and more signal than noise."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _LEAST_COSINE = -0.5
 
 @dataclass(frozen=True)
 class FrameQuality:
-    """What `assess` found about one frame and its difference from the reference.
+    """Result of `assess` for one frame and its difference from the reference.
 
     - `difference`: ‖v - v_reference‖ / ‖v_reference‖ over usable channels.
-    - `difference_noise`: noise of the difference in volts, and relative to it; None when it cannot be told.
-    - `trusted_noise`: noise of the difference in units of `jeit.inverse.relative_noise` of the reference, what channels
-      may be off by relative to each other; None when it cannot be told.
+    - `difference_noise`: noise of the difference in volts, and relative to it; None when it cannot be estimated.
+    - `trusted_noise`: noise of the difference in units of `jeit.inverse.relative_noise` of the reference, the expected
+      error of channels relative to each other; None when it cannot be estimated.
     - `difference_reciprocity_error`: relative reciprocity error of the difference, or None.
     - `impossible_signs`: the larger fraction, of frame and reference, of voltages of a sign that no passive
       body gives; or None.
@@ -214,6 +214,6 @@ def _reason(
 
 
 def _cosine(one: np.ndarray, other: np.ndarray) -> float:
-    """Of the angle between two frames, 1 where they are alike but for their size; 0 where one is zero."""
+    """Cosine of the angle between two frames, 1 where they are alike but for their size; 0 where one is zero."""
     size = float(np.linalg.norm(one) * np.linalg.norm(other))
     return float(np.real(np.vdot(one, other))) / size if size > 0 else 0.0

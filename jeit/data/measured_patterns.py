@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 AXES = ("electrodes", "patterns", "frames")
 """What the axes of an array of voltages are called; in this order unless a description says otherwise."""
-# Of the largest potential of a pattern: what the mean of all may be where it was said to be removed.
+# Greatest mean of a pattern's potentials where it should have been removed, relative to the largest potential.
 _MOST_MEAN = 0.01
 _UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
 
@@ -39,7 +39,7 @@ def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
     check_electrodes(path.name, drive.shape[1])
     rows = own[0] if own else measurement_patterns(drive.shape[1], table.measurement, table.reference)
     check_memory(f"{path.name}: the protocol", 64 * len(drive) * len(rows))
-    # What an instrument has measured of its currents sums to zero only within its errors.
+    # Currents that an instrument has measured sum to zero only within its errors.
     drive = _balanced(drive, table.drive_key, path) * _UNITS[table.current_unit]
     read = table.measurement_key or table.measurement
     name = table.name or f"{len(drive)} measured currents, {read}, {drive.shape[1]} electrodes"

@@ -1,4 +1,4 @@
-"""How good voltages are, judged from themselves: reciprocity, noise, and signs that no passive body gives.
+"""Quality of voltages, computed from themselves alone: reciprocity, noise, and signs that no passive body gives.
 
 Everything here works on one measurement alone; no model of the body is needed.
 """
@@ -37,7 +37,7 @@ class NoiseEstimate:
 def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M"] | None = None) -> float | None:
     """Relative departure from reciprocity: ‖T - Tᵀ‖ / ‖T‖ with T the transfer between drives.
 
-    `deviation` (M,): what channels may be off by, relative to each other; T is divided by what that makes of it. All
+    `deviation` (M,): expected errors of the channels, relative to each other; T is divided by its errors for those. All
     alike unless given.
 
     T_ij is what drive pattern i would read while drive j flows, combined from the measured channels (see
@@ -56,7 +56,7 @@ def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M
 
 
 def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F M"]:
-    """(F, M) volts: each voltage minus what its reciprocal channel says it should be; NaN without one."""
+    """(F, M) volts: each voltage minus the value predicted by its reciprocal channel; NaN without one."""
     pairs, ratio = measurement.protocol.reciprocal_pairs()
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     result = np.full(voltages.shape, np.nan, dtype=voltages.dtype)
@@ -156,8 +156,8 @@ def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
 
 
 def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M"]) -> float | None:
-    """The noise of channels by reciprocity, in units of `deviation` (M,), what they may be off by relative to each
-    other; None where the protocol ties no two usable channels together. Robust, as `estimate_noise` is."""
+    """The noise of channels by reciprocity, in units of `deviation` (M,), their expected errors relative to each other;
+    None where the protocol ties no two usable channels together. Robust, as `estimate_noise` is."""
     error, noise, _ = _asymmetry(measurement, deviation)
     return _robust_deviation(error / noise) if error.size else None
 
@@ -168,7 +168,7 @@ def _asymmetry(
     """Entries of T - Tᵀ (watts); what noise of such `deviation`, or of one volt per channel, adds to them; and what
     they are compared with: those entries of T and its diagonal, over that noise where `deviation` is given.
 
-    The diagonal is all there is of a change where currents are those that tell it best (`jeit.protocol.optimal`).
+    With the currents that show a change best (`jeit.protocol.optimal`), the change lies in the diagonal alone.
     """
     protocol = measurement.protocol
     frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MOST_FRAMES).round().astype(int))
@@ -190,7 +190,7 @@ def _asymmetry(
         noise = np.hypot(gain[row, column], gain[column, row])
         size = np.sqrt((np.abs(upper) ** 2 + np.abs(lower) ** 2) / 2)
         own = np.flatnonzero(np.diag(known))
-        # Of ‖T‖² the diagonal is counted once, and each pair, here one entry, twice.
+        # In ‖T‖² the diagonal is counted once, and each pair, here one entry, twice.
         diagonal = np.abs(transfer[:, own, own]) / np.sqrt(2)
         if deviation is not None:
             size, diagonal = size / noise, diagonal / (np.sqrt(2) * gain[own, own])

@@ -1,4 +1,4 @@
-"""One door for all files: `read` finds the format from the content, or takes it from you."""
+"""Registry of file formats: `read` recognises the format from the content, or takes the one given."""
 
 from __future__ import annotations
 

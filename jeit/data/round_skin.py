@@ -1,4 +1,4 @@
-"""Simulated skins: what a round piezoresistive skin would read while it is pressed.
+"""Simulated skins: the voltages of a round piezoresistive skin while it is pressed.
 
 No openly licensed measurement of a tactile skin exists; this stands in where one is needed, and says so in its notes.
 """

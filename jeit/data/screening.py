@@ -1,4 +1,4 @@
-"""From raw voltages to a `Measurement`: what is unusable is masked, and said."""
+"""Screening of raw voltages into a `Measurement`: unusable voltages are masked, and the reason is noted."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from jeit.protocol import Protocol
 
 DESCRIPTION = "table (.csv, .txt, .npy, .npz) with a TOML description beside it"
 SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
-# What `write_table` puts beside the voltages and the protocol.
+# Arrays that `write_table` adds to the voltages and the protocol.
 _WORDS = ("mask", "protocol_name", "frame_names", "notes", "times")
 # Bytes in memory of a number of two letters, twice: as rows, and as the table that they make.
 _IN_MEMORY = 8
@@ -85,7 +85,7 @@ def read(path: Path, description: str | Path | None = None, like: Measurement | 
 
 
 def _borrowed(like: Measurement) -> Description:
-    """What is said of another measurement of the same sensor, but for its protocol and the names of its frames."""
+    """Description of another measurement of the same sensor, without its protocol and the names of its frames."""
     beside = find_description(Path(like.source)) if like.source and recognises(Path(like.source)) else None
     layout = TableLayout() if beside is None else replace(load_description(beside).layout, frame_names=(), keys=())
     return Description(
@@ -199,7 +199,7 @@ def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
 
 
 def _no_number(cells: list[str], delimiter: str | None, *, first: bool) -> str:
-    """What is wrong with the cells of a line, the `first` of the file or a later one, that are not all numbers."""
+    """Message about a line, the `first` of the file or a later one, whose cells are not all numbers."""
     wrong = [k for k, cell in enumerate(cells) if not _is_number(cell)]
     cell = cells[wrong[0]].strip()
     said = f"{cell[:40]!r} is no number" if cell else "nothing stands there"
@@ -219,7 +219,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Of a text file, one after the other."""
+    """Lines of a text file, one after the other."""
     try:
         with path.open(encoding="utf-8") as file:
             yield from file
@@ -228,7 +228,7 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def _from_numpy(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Those arrays of a file that are asked for by name; the one of an NPY is its voltages."""
+    """Arrays of a file that are asked for by name; the one of an NPY file is its voltages."""
     try:
         if path.suffix.lower() == ".npy":
             return {"voltages": npy_array(path)}
@@ -261,14 +261,14 @@ def _own_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
 
 
 def _with_words(described: Description, arrays: dict[str, np.ndarray]) -> Description:
-    """With the frames' names, where the description has none, and the notes of a file of `write_table`."""
+    """The description with the frames' names, where it has none, and the notes of a file of `write_table`."""
     names = described.layout.frame_names or _texts(arrays, "frame_names")
     notes = (*described.notes, *_texts(arrays, "notes"))
     return replace(described, layout=replace(described.layout, frame_names=names), notes=notes)
 
 
 def _times(arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
-    """Of a file of `write_table`, if it has them."""
+    """Times of a file of `write_table`, if it has them."""
     times = arrays.get("times")
     if times is not None and times.dtype.kind not in "iuf":
         raise ValueError(f"{name}: 'times' holds {times.dtype}; give seconds.")

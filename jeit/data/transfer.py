@@ -1,7 +1,7 @@
-"""The transfer impedance behind a measurement, and what the same body would read under other patterns.
+"""The transfer impedance of a measurement, and the voltages of the same body under other patterns.
 
 L electrodes have a symmetric Z (L, L) with rows that sum to zero: L (L - 1) / 2 numbers. Any set of patterns that
-determines it, L - 1 independent currents on all electrodes say, tells what every other set would read.
+determines it, such as L - 1 independent currents on all electrodes, determines the readings of every other set.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 from jeit.protocol import Protocol
 
-# Of the largest singular value: what is smaller is not measured.
+# Share of the largest singular value below which a combination is not measured.
 _UNKNOWN = 1e-9
 # Copies of the equations while they are solved.
 _COPIES = 4
@@ -51,8 +51,9 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
 
 
 def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
-    """A reference, as the protocol of a measurement on the same electrodes would have read it, if it was measured with
-    other patterns and they tell that; as it is where they do not, or differ by nothing but how large currents are."""
+    """The reference converted to the protocol of a measurement on the same electrodes, where it was measured with other
+    patterns that determine those readings; else, or where only the size of the currents differs, the reference
+    unchanged."""
     ours, theirs = measurement.protocol, reference.protocol
     if ours.num_electrodes != theirs.num_electrodes or ours.same_patterns(theirs) or _proportional(ours, theirs):
         return reference
@@ -76,9 +77,9 @@ def _proportional(ours: Protocol, theirs: Protocol) -> bool:
 def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
     """The same frames as another `protocol` on the same electrodes would have read them.
 
-    For a reference that was measured with other currents than the frames. Noise is carried along: where the patterns
-    measured hardly tell what the others read, it grows. Raises `ValueError` for another number of electrodes, and as
-    `transfer_impedance`.
+    For a reference that was measured with other currents than the frames. Noise is carried along: it grows where the
+    measured patterns hardly determine what the others read. Raises `ValueError` for another number of electrodes, and
+    as `transfer_impedance`.
     """
     if protocol.num_electrodes != measurement.protocol.num_electrodes:
         raise ValueError(

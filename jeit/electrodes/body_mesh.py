@@ -1,4 +1,4 @@
-"""The mesh of a body for electrodes on it, fine where they end: there the current density is without bound."""
+"""The mesh of a body for electrodes on it, fine at their edges, where the current density is unbounded."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jeit.electrodes.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh, OwnMesh, Rectangle, Solid
 from jeit.mesh.sizes import size_checked
 
-# How far from a face a position may be and yet lie on it, relative to the body's size; as a check of electrodes has it.
+# Distance from a face within which a position lies on it, relative to the body's size; as in the check of electrodes.
 _ON = 1e-3
 # Places round a patch on a lid that say where it ends.
 _ROUND = 16
@@ -55,16 +55,16 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
 
 
 def _ends(place: Float[np.ndarray, " L"], half: Float[np.ndarray, " L"], some) -> Float[np.ndarray, " e"]:
-    """Where some electrodes begin and end along an axis."""
+    """Places where some electrodes begin and end along an axis."""
     return np.concatenate([(place - half)[some], (place + half)[some]])
 
 
 def _rim(outline, place, half, flat: bool) -> Float[np.ndarray, "p 2"]:
-    """Where an electrode ends, seen from above: all round on a horizontal face, at its two ends on the wall."""
+    """Places where an electrode ends, seen from above: all round on a horizontal face, at its two ends on the wall."""
     if flat:
         angle = 2 * np.pi * np.arange(_ROUND) / _ROUND
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        # Of a rectangle, those where rays meet its sides.
+        # For a rectangle, the points where rays meet its sides.
         return place[:2] + circle * half / np.abs(circle).max(axis=1, keepdims=True)
     nearest = np.asarray(outline.nearest(place[None, :2]))[0]
     step = 1e-3 * half[0]

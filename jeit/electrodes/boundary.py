@@ -96,7 +96,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         before = 1 - after
         share = (end - start) * np.array([1.0, 4.0, 1.0], start.dtype)[:, None, None, None] / 6
 
-        # Over the turns, (b, L), written out: XLA makes a slow matrix product of a sum over so short an axis.
+        # The sum over the turns, (b, L), is written out: XLA makes a slow matrix product of a sum over so short an
+        # axis.
         def integral(values):
             values = share[0] * values[0] + share[1] * values[1] + share[2] * values[2]
             return values[0] + values[1] + values[2]

@@ -58,12 +58,12 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         return {"parts": [part.describe() for part in self.parts]}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """All parts, one after the other."""
+        """Draw all parts, one after the other."""
         for part in self.parts:
             part.draw(mesh, pen)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """That of all parts."""
+        """Refinement of all parts."""
         return tuple(refine for part in self.parts for refine in part.refinement(body))
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:

@@ -211,7 +211,7 @@ def disc_window(points, position, radius, edge):
 
 
 def squared_distances(points, position):
-    """Of quadrature points (q, p, d) from `position` (q, k, d): (q, k, p), m²."""
+    """Squared distances of quadrature points (q, p, d) from `position` (q, k, d): (q, k, p), m²."""
     return sum((points[:, None, :, i] - position[..., None, i]) ** 2 for i in range(points.shape[-1]))
 
 

@@ -1,4 +1,4 @@
-"""Electrodes as what they are: discs, patches, facets and arcs as polygons on the surface, in their places."""
+"""Shapes of electrodes: discs, patches, facets and arcs as polygons on the surface, in their places."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ElectrodeShapes:
 
     @property
     def number(self) -> int:
-        """Of electrodes."""
+        """Number of electrodes."""
         return int(self.electrode.max()) + 1 if len(self.electrode) else 0
 
     def polygons(self) -> list[Float[np.ndarray, "k d"]]:
@@ -38,7 +38,7 @@ class ElectrodeShapes:
         return np.split(self.corners, np.cumsum(self.sizes)[:-1])
 
     def middles(self) -> Float[np.ndarray, "L d"]:
-        """Of every electrode, the mean of its corners."""
+        """Mean of the corners of every electrode."""
         of_corner = np.repeat(self.electrode, self.sizes)
         count = np.bincount(of_corner, minlength=self.number)
         return np.stack([np.bincount(of_corner, one, self.number) / count for one in self.corners.T], axis=1)
@@ -112,7 +112,7 @@ class Draped:
         self._tree = KDTree(self._corners.mean(axis=1))
 
     def normals(self, places: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3"]:
-        """Of the nearest triangle, outward."""
+        """Outward normals of the nearest triangle."""
         return self._normal[self._tree.query(places)[1]]
 
     def frames(self, places: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3 3"]:

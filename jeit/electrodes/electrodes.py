@@ -1,4 +1,4 @@
-"""What every kind of electrode has in common, and the integrals the forward model asks of it."""
+"""Base classes of electrodes, and the contact integrals that the forward model uses."""
 
 import abc
 from typing import Any, Protocol
@@ -34,7 +34,7 @@ class Contact(eqx.Module):
 
 
 class ElectrodePen(Protocol):
-    """What electrodes are drawn with, as seen from above: one stroke each, round its middle (d,), all in metres."""
+    """Interface to draw electrodes, as seen from above: one stroke each, round its middle (d,), all in metres."""
 
     def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
         """An electrode on the edge of a sheet, which covers these lines (k, 2) of it."""
@@ -50,7 +50,7 @@ class ElectrodePen(Protocol):
 
 
 class AbstractElectrodes(eqx.Module):
-    """Base of all electrodes: something that turns itself and a mesh into contact integrals."""
+    """Base of all electrodes, which compute contact integrals on a mesh."""
 
     contact_impedance: eqx.AbstractVar[Float[Array, " L"]]
     """(L,) ohm·m² (ohm·m for arcs on the edge of a sheet). Point electrodes have none: `AttributeError`."""
@@ -86,7 +86,7 @@ class AbstractElectrodes(eqx.Module):
 
     @abc.abstractmethod
     def geometry(self) -> dict[str, Any]:
-        """Where they are and how large: names and values of the fields that say so, metres."""
+        """Positions and sizes of the electrodes: names and values of the fields, metres."""
 
     @abc.abstractmethod
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
@@ -94,7 +94,7 @@ class AbstractElectrodes(eqx.Module):
 
     @abc.abstractmethod
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Where a plane mesh made for them should be finer; nothing where that is not known."""
+        """Refinement of a plane mesh made for the electrodes; empty where it is not known."""
 
     def describe(self) -> dict[str, Any]:
         """Kind, number, places and sizes in metres."""
@@ -106,7 +106,7 @@ class AbstractCompleteElectrodes(AbstractElectrodes):
 
     @property
     def is_point(self) -> bool:
-        """No."""
+        """False."""
         return False
 
     @property
@@ -138,7 +138,7 @@ class AbstractPointElectrodes(AbstractElectrodes):
 
     @property
     def is_point(self) -> bool:
-        """Yes."""
+        """True."""
         return True
 
     @property

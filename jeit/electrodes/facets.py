@@ -2,9 +2,9 @@
 
 Integrals of P1 functions over what a rectangle covers of triangles: exact, and differentiable in both.
 
-A triangle is cut by pushing what lies beyond a side of the rectangle back onto the line of that side. The closed line
-of its edges stays closed, and goes round the part within once and along the side to and fro, which adds nothing. So
-every triangle becomes a polygon of as many corners, in one array, whose integrals follow from its corners.
+A triangle is cut by moving the parts beyond a side of the rectangle onto the line of that side. The closed line of its
+edges stays closed: it goes once round the part within, and to and fro along the side, which adds nothing. So every
+triangle becomes a polygon of as many corners, in one array, whose integrals follow from its corners.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, sum_into, undifferentiated, values_at_once
 
-# Share of a triangle that is taken for none: its digits are few, which the best contacts would show.
+# Covered share of a triangle that counts as none: it has few correct digits, which would matter for the best contacts.
 _TOUCHED = 1e-12
 
 
@@ -126,7 +126,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         return replace_contact_impedance(self, contact_impedance)
 
     def geometry(self) -> dict[str, Array]:
-        """Nothing but in facets of a mesh."""
+        """Empty: the electrodes are defined by facets of a mesh."""
         return {}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:

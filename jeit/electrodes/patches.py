@@ -25,7 +25,7 @@ from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated, values_at_once
 
-# Of an electrode's smaller size: as far apart as this are two that were meant to be one.
+# Distance within which two electrodes are at the same place, as a share of their smaller size.
 _SAME = 1e-3
 
 Distance = Callable[[Float[np.ndarray, "L 3"]], Float[np.ndarray, " L"]]
@@ -196,7 +196,7 @@ class FacePatches(AbstractPlacedElectrodes):
 
 
 def _reached(mesh: Mesh, position, half_size, frames):
-    """Which patches (b, k) may cover something of each boundary triangle, the nearest first, and whether they do.
+    """Patches (b, k) that may cover a part of each boundary triangle, the nearest first, and whether they do.
 
     On the same side of the body: facing as the patch does, and no deeper than it is large. Not differentiated.
     """

@@ -117,7 +117,7 @@ class NodeElectrodes(AbstractPointElectrodes):
         return self.nodes.shape[0]
 
     def geometry(self) -> dict[str, Array]:
-        """Nothing but nodes of a mesh."""
+        """Empty: the electrodes are defined by nodes of a mesh."""
         return {}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
@@ -203,7 +203,7 @@ class IntegratedElectrodes(AbstractElectrodes):
         raise ValueError("IntegratedElectrodes cannot be changed; change the electrodes and integrate them anew.")
 
     def geometry(self) -> dict[str, Any]:
-        """Nothing is known any more."""
+        """Empty: positions and sizes are not kept."""
         return {}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:

@@ -29,12 +29,12 @@ _FACING = float(np.cos(1.0))
 class SurfaceDiscs(AbstractDiscs):
     """Complete electrodes that are discs in a curved sheet, a surface of triangles in space, free of its nodes.
 
-    `SheetDiscs` of curved sheets. A disc is what of the surface lies within its radius along it, where what lies round
-    its middle can be laid flat without stretching, as sheets that were bent, and tubes, can: exactly, so that bending
-    changes nothing. Elsewhere ways by which triangles can be laid into a plane lead apart, and a disc is what lies
-    within its radius straight through space and faces as its middle does: with a radius of curvature R longer along
-    the surface by a part radius² / 24 R², and nothing of what lies opposite. Differentiable in position, of which only
-    moves along the surface count: a move off it changes nothing to first order.
+    `SheetDiscs` of curved sheets. Where the surface round its middle can be laid flat without stretching, as bent
+    sheets and tubes can, a disc is the part of the surface within its radius along the surface: exactly, so that
+    bending changes nothing. Elsewhere the ways by which triangles can be laid into a plane disagree, and a disc is the
+    part of the surface within its radius straight through space that faces as its middle does: with a radius of
+    curvature R longer along the surface by a part radius² / 24 R², and nothing of what lies opposite. Differentiable in
+    position, of which only moves along the surface count: a move off it changes nothing to first order.
 
     **Fields**: `position` (L, 3) metres, on the surface; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
     """

@@ -1,7 +1,8 @@
-"""Files from anywhere: what is read, within limits and as plain numbers and text; what is written, whole or not at all.
+"""Safe reading and writing of files: files from any source are read within limits, as plain numbers and text, and files
+are written whole or not at all.
 
 Nothing that a file holds is executed, and nothing in it decides how much memory is taken before its size has been
-looked at: see `jeit/files/limits.py` for how much, and how to allow more.
+checked: see `jeit/files/limits.py` for how much, and how to allow more.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Limits of what a file may ask for, and errors of files that exceed them."""
+"""Limits of the memory and the electrodes that a file may ask for, and errors of files that exceed them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _VARIABLE, _USUAL = "JEIT_FILE_GB", 1.0
 
 
 class TooLarge(ValueError):
-    """What is in a file would take more memory than a file may."""
+    """Raised for a file whose content would take more memory than allowed."""
 
 
 def check_memory(name: str, size: float) -> None:
@@ -55,7 +55,8 @@ def _most() -> float:
 
 KEY = 40
 """Letters of a key in a message, at most."""
-# Letters of a whole message, at most; how many faults are told in sentences, and how many more by their keys.
+# Greatest number of letters of a whole message, of faults reported in sentences, and of further faults named by their
+# keys.
 _LONGEST, _FAULTS, _KEYS = 390, 4, 10
 ALL = "; there are "
 """What goes before all the words that there are."""
@@ -79,7 +80,7 @@ def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) 
 
 
 def _more(keys: Sequence[str], number: int, most: int) -> list[str]:
-    """What is said of a `number` of faults that there is no room for, of which at most so many are named by key."""
+    """Text about a `number` of faults that there is no room for, of which at most so many are named by key."""
     named = keys[:most]
     said = [f"Wrong too: {', '.join(named)}."] if named else []
     return [*said, f"And {number - len(named)} more."] if number > len(named) else said

@@ -1,4 +1,5 @@
-"""The arrays of NPZ and NPY files: plain numbers and text, nothing that would be executed, of no more than they say."""
+"""Arrays of NPZ and NPY files: plain numbers and text, nothing that would be executed, no larger than their headers
+say."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ _COPIES = 2
 # Bytes of a member that is no array, such as a head of JSON.
 _MOST_TEXT = 2**24
 _ARRAY, _ARCHIVE = b"\x93NUM", b"PK\x03\x04"
-# What NumPy, and zipfile beneath it, say of files that are broken, encrypted, or compressed in ways they do not know.
+# Errors that NumPy, and zipfile beneath it, raise for files that are broken, encrypted, or compressed in unknown ways.
 FAULTS = (
     ValueError,
     EOFError,
@@ -130,7 +131,7 @@ class _Header(NamedTuple):
 
 
 def _header(file: IO[bytes]) -> _Header:
-    """What an array says of itself."""
+    """Read the header of an array."""
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0), (3, 0)):
         raise ValueError(f"an array of it is in format {version}")
@@ -144,7 +145,7 @@ def _header(file: IO[bytes]) -> _Header:
 
 
 def _member_header(archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo) -> _Header:
-    """What a member says of itself; as much has to be in the archive."""
+    """Read the header of a member of an archive, and check that the archive holds as much."""
     if not member.filename.endswith(".npy"):
         raise ValueError(f"'{name[:40]}' in it is a file of another kind")
     with archive.open(member) as file:

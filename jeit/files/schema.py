@@ -1,4 +1,4 @@
-"""What a person writes into a file, as tables of keys with types, ranges and units; and all that is wrong, at once.
+"""Validation of hand-written files: tables of keys with types, ranges and units, whose faults are reported all at once.
 
 A table is a class derived from `Table`, a line for each key:
 
@@ -39,7 +39,8 @@ _UNKNOWN = 100
 
 
 class Table(BaseModel):
-    """Base of tables of keys: no other keys than those named, no text for a number, and no truth value either."""
+    """Base of tables of keys: only the keys named are allowed, and neither text nor a truth value in place of a
+    number."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True, defer_build=True)
 
@@ -51,7 +52,7 @@ class Table(BaseModel):
     def _in_words(cls, given: Any, made: Callable[[Any], Any]) -> Any:
         """Say what is wrong as a sentence that begins with the key."""
         if isinstance(given, Mapping) and len(given) > len(cls.model_fields) + _UNKNOWN:
-            # Each of a million would be told.
+            # Each of a million would be reported.
             unknown = itertools.islice((key for key in given if key not in cls.model_fields), _UNKNOWN)
             given = {key: given[key] for key in [*(key for key in cls.model_fields if key in given), *unknown]}
         try:
@@ -108,14 +109,15 @@ Words = Annotated[list[Word], FailFast()]
 
 
 def fault(said: str, key: str = "") -> PydanticCustomError:
-    """What a check of a table raises: `said` of the `key` in it, or of the table, whose name goes before."""
+    """Error that a check of a table raises: the message `said` about the `key` in it, or about the table, whose name
+    goes before."""
     return PydanticCustomError("fault", "{said}", {"said": said, "key": key})
 
 
 @dataclass(frozen=True)
 class Number:
-    """Of a key that is a number from `low` to `high`: whole, where its type is int. Where its type is a list it is
-    swept: one number, or a list of them, each once. `beyond`: what is said of larger numbers."""
+    """Annotation of a key that is a number from `low` to `high`: whole, where its type is int. Where its type is a list
+    it is swept: one number, or a list of them, each once. `beyond`: message about larger numbers."""
 
     low: float
     high: float
@@ -150,14 +152,14 @@ class Number:
 
     @property
     def span(self) -> str:
-        """From where to where, and in which unit."""
+        """The range and the unit, in words."""
         low = "above 0" if 0 < self.low < 1e-300 else f"from {_plain(self.low)}"
         high = " up" if low[0] == "f" else ""
         high = high if math.isinf(self.high) else f" to {_plain(self.high)}"
         return f"{low}{high}{f' {self.unit}' if self.unit else ''}"
 
     def _hint(self, given: float) -> str:
-        """What a number would be that is off by a factor of 1000."""
+        """Hint at the correct value of a number that is off by a factor of 1000."""
         if not self.unit or math.isinf(self.high) or abs(given) > 1e100:
             return ""
         for larger, metric in ((True, "metres"), (False, "micrometres")):
@@ -172,7 +174,8 @@ class Number:
 
 @dataclass(frozen=True)
 class Numbers:
-    """Of a key that is an array of numbers from `low` to `high`, or of whole numbers or truth values, as `kind` says.
+    """Annotation of a key that is an array of numbers from `low` to `high`, or of whole numbers or truth values, as
+    `kind` says.
 
     `axes`: how many along each axis, at least and at most. `single`: one number for all will do as well.
     """
@@ -232,7 +235,7 @@ class Numbers:
 
 
 class Swept:
-    """Of a key that is a list, each thing in it once; what is no list stands for a list of one."""
+    """Annotation of a key that is a list, each item in it once; a value that is no list stands for a list of one."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         def read(given: Any, inner: Callable[[list], list]) -> list:
@@ -254,9 +257,9 @@ Several = Annotated[list[Item], FailFast(), Swept()]
 
 
 class OneOf:
-    """Of a key that is one of several tables, as the word under `key` in it says; one that has a default for the word
-    is meant where there is none, and `other` where there is `mark`. `meant`: other words that people write, and which
-    of those there are is likely meant."""
+    """Annotation of a key that is one of several tables, chosen by the word under `key` in it; without that word the
+    table that has a default for it is chosen, and `other` where there is `mark`. `meant`: other words that people
+    write, and the valid word that each likely means."""
 
     def __init__(
         self,
@@ -289,7 +292,7 @@ class OneOf:
         return self.tables[word].model_validate(given)
 
     def _likely(self, word: Any) -> str:
-        """What is likely meant by a word that people write, with the sizes that it needs."""
+        """The word that is likely meant by another word that people write, with the sizes that it needs."""
         meant = self.meant.get(word.lower().rstrip("s")) if isinstance(word, str) else None
         if meant is None:
             return ""
@@ -298,8 +301,8 @@ class OneOf:
 
 
 def validated(table: type[T], given: Any, origin: str) -> T:
-    """What is `given`, checked as a whole. Raises one `ValueError` that begins with `origin`, the file's name, and has
-    a sentence on each key at fault, or on some of them, in 400 characters at most."""
+    """Check `given` as a whole, and return the table. Raises one `ValueError` that begins with `origin`, the file's
+    name, and has a sentence on each key at fault, or on some of them, in 400 characters at most."""
     try:
         return table.model_validate(given)
     except ValidationError as error:
@@ -310,14 +313,14 @@ def validated(table: type[T], given: Any, origin: str) -> T:
 
 
 def not_among(given: Any, words: Iterable[str], likely: str = "") -> str:
-    """What is said of a word that is none of `words`; `likely`: which of them is meant, if that is known."""
+    """Message about a word that is none of `words`; `likely`: the one that is meant, if that is known."""
     known = [*words]
     meant = likely or did_you_mean(given[:KEY] if isinstance(given, str) else given, known)
     return f"must be one of {_few(known)}; it is {describe(given)}{meant}."
 
 
 def _steps(one: Any) -> tuple[int | str, ...]:
-    """Where a fault is."""
+    """Path of keys to a fault."""
     key = one.get("ctx", {}).get("key")
     return (*one["loc"], key) if key else one["loc"]
 

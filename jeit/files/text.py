@@ -17,10 +17,11 @@ _LONGEST = 120
 
 @contextmanager
 def read_as(said: str) -> Iterator[None]:
-    """Within it only other packages read: whatever they raise becomes a `ValueError`, `said` (such as "not a readable
-    WAV file") with their reason in brackets; that there is no such file, or that it may not be read, stays as it is.
+    """Context for reading by other packages: whatever they raise becomes a `ValueError`, `said` (such as "not a
+    readable WAV file") with their reason in brackets; errors that there is no such file, or that it may not be read,
+    are passed on.
 
-    What they print as warnings is not shown: a file that is read is as it should be.
+    Warnings of the packages are not shown: a file that can be read is as it should be.
     """
     try:
         with warnings.catch_warnings():
@@ -33,7 +34,7 @@ def read_as(said: str) -> Iterator[None]:
 
 
 def reason(error: Exception) -> str:
-    """What an error says, in one short line: its kind where it says nothing."""
+    """Message of an error, in one short line: its type where it has no message."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
@@ -94,7 +95,7 @@ def _dots(line: str) -> int:
 
 
 def read_json(path: str | Path, *, most: int = 2**26) -> Any:
-    """What a JSON file of at most `most` bytes holds. Raises `ValueError`, with its name and place, for what is none,
+    """Content of a JSON file of at most `most` bytes. Raises `ValueError`, with its name and place, for what is none,
     and `OSError` where there is no such file."""
     path = Path(path)
     try:

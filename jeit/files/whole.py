@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all: beside what was there, and put in its place when all is on the disk."""
+"""Atomic writing of files: a new file is written beside the old one, and replaces it when all of it is on the disk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 
 def boot() -> str:
-    """Which run of the system this is: containers with names of their own share it; "" where it is not known."""
+    """Identifier of this run of the system: containers with names of their own share it; "" where it is not known."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:

@@ -31,8 +31,8 @@ _CELLS = 256
 
 
 class Change(NamedTuple):
-    """How conductivity changes by q coefficients: by `slope` (k, q), S/m (2-D: S), in `cells` (k,), not elsewhere; in
-    all cells where `cells` is None."""
+    """Change of conductivity by q coefficients: by `slope` (k, q), S/m (2-D: S), in `cells` (k,), not elsewhere; in all
+    cells where `cells` is None."""
 
     cells: Any
     slope: Float[np.ndarray, "k q"]

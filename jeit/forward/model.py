@@ -299,7 +299,7 @@ _COMPILED = {
 
 
 class IntegratedModel(NamedTuple):
-    """What a forward model is made of, the integrals in place of the electrodes."""
+    """The parts of a forward model, with the integrals in place of the electrodes."""
 
     mesh: Mesh
     electrodes: IntegratedElectrodes

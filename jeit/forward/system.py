@@ -27,7 +27,7 @@ from jeit_solvers.engines import namespace, undifferentiated
 
 
 class System(eqx.Module):
-    """Where the entries of the system matrix go, and the lineax solver that solves with it.
+    """The sparsity pattern of the system matrix, and the lineax solver that solves with it.
 
     Made once for a mesh and a kind of electrode (`System.create`); holds no physics, so the same system serves
     every conductivity, contact impedance, electrode position and size.

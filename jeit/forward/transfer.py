@@ -1,4 +1,4 @@
-"""From conductivity to the transfer impedance of the electrodes, with its derivative rule.
+"""Transfer impedance of the electrodes computed from the conductivity, with its derivative rule.
 
 Let a_θ(u, w) be the energy form of the electrode model, θ standing for everything it depends on (conductivity,
 contact impedance, electrode positions, mesh points), and F_l the potential for a unit current into electrode l
@@ -31,8 +31,8 @@ from jeit_solvers.engines import namespace, undifferentiated
 
 
 class ElectrodeImpedance(NamedTuple):
-    """Z, but for what currents that sum to zero do not see, in two parts: a contact that is all but open has a
-    resistance beside which what the body adds would be lost.
+    """Z, up to terms that cancel over currents that sum to zero, in two parts: a contact that is nearly open has a
+    resistance beside which the body's part would be lost.
 
     **Fields**: `body` (L, L), the mean potentials under the electrodes for unit currents, and `contact` (L,), what
     contacts add to the potential of their own electrode, z / |e|, zeros for point electrodes; ohms.
@@ -113,7 +113,7 @@ class SolvedSystem(NamedTuple):
         return self.load.T @ self.solution
 
     def impedance(self) -> ElectrodeImpedance:
-        """Of the electrodes."""
+        """Impedance of the electrodes."""
         return electrode_impedance(self.product, self.resistance)
 
     def fields(self) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
@@ -161,10 +161,11 @@ def contact_resistance(electrodes: AbstractElectrodes, contact: Contact) -> Inex
 
 
 def electrode_impedance(product: Inexact[Array, "c c"], resistance: Inexact[Array, " L"] | None) -> ElectrodeImpedance:
-    """From the product loadᵀ A⁻¹ load, A and the loads being those of `System.grounded`, and the contacts' resistance.
+    """Impedance computed from the product loadᵀ A⁻¹ load, A and the loads being those of `System.grounded`, and the
+    contacts' resistance.
 
     The mean potentials under complete electrodes are D⁻¹ Bᵀ u = D⁻¹ BᵀA⁻¹B U with their loads B and D⁻¹, the contacts'
-    resistance; that of what U has more, D⁻¹ I, nothing is lost at large contact impedance.
+    resistance; so that of the remainder of U, D⁻¹ I, nothing is lost at large contact impedance.
     """
     if resistance is None:
         return ElectrodeImpedance((product + product.T) / 2, namespace(product).zeros_like(product[0]))
@@ -192,7 +193,7 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
 
 
 def _correction(others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"], current: Inexact[Array, "c c"]):
-    """What one step of refinement adds to the impedance of terminals, where pairs short-circuit each other.
+    """Correction of the impedance of terminals by one step of refinement, where pairs short-circuit each other.
 
     What flows between two terminals goes with the difference of their potentials: rounded in whatever way, what leaves
     the one enters the other; and `current`, less all that flows, keeps the digits that tie the pair to the rest.

@@ -1,4 +1,5 @@
-"""Images: rasters of what lives on a mesh, planes and surfaces through a solid, inclusions, and regions over time."""
+"""Analysis of images: rasters of values on a mesh, planes and surfaces through a solid, inclusions, and regions over
+time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images of one body at many times: what a region does over time, and where anything happens at all."""
+"""Series of images of one body: the mean change of a region over time, and the functional image."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ImageSeries:
 
     @property
     def unit(self) -> str:
-        """Of the changes."""
+        """Unit of the changes."""
         return "S" if self.mesh.dimension == 2 else "S/m"
 
     def functional(self) -> Float[np.ndarray, " m"]:

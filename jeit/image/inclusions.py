@@ -1,4 +1,4 @@
-"""Inclusions: where an image departs from its background, as regions with sign, centroid, and area or volume."""
+"""Inclusions: regions where an image departs from its background, with sign, centroid, and area or volume."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Inclusion(eqx.Module):
 
     @property
     def radius(self) -> float:
-        """Of the disk of the same area, or in 3-D of the ball of the same volume, metres."""
+        """Radius of the disk of the same area, or in 3-D of the ball of the same volume, metres."""
         if self.is_solid:
             return float(np.cbrt(3 * self.area / (4 * np.pi)))
         return float(np.sqrt(self.area / np.pi))
@@ -98,7 +98,7 @@ def inclusion_regions(
     noise: Float[Array, " m"] | None = None,
     least_significance: float = 5.5,
 ) -> list[tuple[Inclusion, Bool[np.ndarray, " m"]]]:
-    """What `find_inclusions` finds, each with its cells. Raises `ValueError` as that does."""
+    """The inclusions of `find_inclusions`, each with its cells. Raises `ValueError` as that does."""
     values = np.asarray(image)
     if values.shape != (mesh.num_cells,):
         raise ValueError(f"image has shape {values.shape}; give one value for each of the {mesh.num_cells} cells.")

@@ -1,4 +1,4 @@
-"""What oscillates in a series of values: spectra, and amplitude and phase at a frequency.
+"""Oscillations in a series of values: spectra, and amplitude and phase at a frequency.
 
 With weights w (a window over the time measured) the values x are fitted, at a frequency f, by
 
@@ -6,7 +6,7 @@ With weights w (a window over the time measured) the values x are fitted, at a f
 
 least squares weighted by w: for even times and whole periods that is the discrete Fourier transform at f, and for any
 other it has neither its leak from the mean, nor from the drift, nor from -f. Frequencies nearer to each other than the
-resolution, 1 / T without a window and 2 / T with Hann's, T the time measured, are not told apart.
+resolution, 1 / T without a window and 2 / T with Hann's, T the time measured, are not distinguished.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _finite(values, times) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _weight(times: np.ndarray, window: Window) -> np.ndarray:
-    """Of each time; at both ends Hann's is not quite zero, where frames are."""
+    """Weight of each time; Hann's window is not quite zero at the first and last frames."""
     if window == "none":
         return np.ones(len(times))
     step = (times[-1] - times[0]) / (len(times) - 1)
@@ -153,7 +153,7 @@ def _fit(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: f
 def _strongest(values: np.ndarray, times: np.ndarray, weight: np.ndarray, band: tuple[float, float, float]) -> float:
     """The frequency within a band (lowest, highest, resolution) at which all values together oscillate most."""
     low, high, resolution = band
-    # As many combinations of the values as matter, which carry all their power.
+    # The combinations of the values that carry all their power.
     rest = values - values.mean(axis=0)
     left, size, _ = np.linalg.svd(rest @ rest.T if rest.shape[1] > len(rest) else rest, full_matrices=False)
     size = np.sqrt(size) if rest.shape[1] > len(rest) else size

@@ -47,7 +47,7 @@ class Pieces(NamedTuple):
     cell: Int[np.ndarray, " p"]
 
     def at_corners(self, values: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "p c ..."]:
-        """What is linear between nodes, such as their places (n, d), at the corners."""
+        """Values at the corners of a quantity that is linear between nodes, such as their places (n, d)."""
         share = self.share.reshape(*self.share.shape, *[1] * (values.ndim - 1))
         return (1 - share) * values[self.ends[..., 0]] + share * values[self.ends[..., 1]]
 
@@ -162,7 +162,7 @@ def _normals(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
 
 
 AXES = ("x", "y", "z")
-# Over the size of the body: what lies so near a plane lies in it.
+# Distance from a plane within which points lie in it, over the size of the body.
 _IN_IT = 1e-9
 
 
@@ -215,7 +215,7 @@ class Plane:
         return cls(place, toward, *_page(toward), f"through ({where}) mm across ({across})")
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Of places (n, 3) from the plane, metres, positive towards the viewer."""
+        """Distance of places (n, 3) from the plane, metres, positive towards the viewer."""
         return (points - self.point) @ self.toward
 
     def on_page(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
@@ -225,7 +225,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Cut:
-    """What a plane cuts a solid into.
+    """Section of a solid by a plane.
 
     **Fields**: `polygons` (p, 4, 2), metres on the page of the plane, the last corner twice in triangles; `cell` (p,),
     the cell that each is of; `outline` (s, 2, 2), lines where the plane meets the surface of the body.
@@ -237,7 +237,7 @@ class Cut:
 
     @property
     def area(self) -> float:
-        """Of all polygons together, m²."""
+        """Area of all polygons together, m²."""
         corners = self.polygons
         x, y = corners[..., 0], corners[..., 1]
         return float(0.5 * np.abs(np.sum(x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y, axis=1)).sum())

@@ -12,7 +12,7 @@ from jeit_solvers.engines import as_array, either_engine, namespace
 
 
 class Raster(eqx.Module):
-    """Which cell every pixel lies in: made once for a mesh, used for every image on it.
+    """Grid of pixels with the cell that each lies in: made once for a mesh, used for every image on it.
 
     **Fields**: `cell` (rows, columns), index of the cell that holds the pixel's centre, or -1 outside the mesh; row 0
     at the top (largest y), column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres, the outer edges of

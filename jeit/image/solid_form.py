@@ -1,4 +1,4 @@
-"""What a body in a solid was fitted as, an ellipsoid or a column, and the surface that pictures draw of it."""
+"""Form of a body fitted in a solid, an ellipsoid or a column, and the surface that pictures draw of it."""
 
 from __future__ import annotations
 

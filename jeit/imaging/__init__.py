@@ -1,9 +1,9 @@
-"""From two frames to a picture in one call, `image_difference`, and what every rule for λ would choose on the way.
+"""Imaging in one call: `image_difference` makes an image of two frames, `compare_on_data` compares the rules for λ on
+them.
 
-`settings` says how to image, `preparation` checks, meshes and calibrates, `wiring` finds what is not wired as told,
-`method` images, `automatic` decides how, `difference` looks for inclusions, `sequence` images many frames at once;
-`stream_preparation` makes ready for frame after frame. And from a stream of a touched skin to what it means:
-`touch_images`, `gesture_learning`, `touch_watch`; `health_learning`, what it is like while it is healthy.
+`settings` holds the settings, `preparation` checks, meshes and calibrates, `wiring` finds wiring that is not as
+described, `method` images, `automatic` chooses the method, `difference` finds inclusions, `sequence` images many frames
+at once and `stream_preparation` prepares for imaging frame after frame. Streams of a touched skin are in `jeit.touch`.
 """
 
 from __future__ import annotations

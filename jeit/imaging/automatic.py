@@ -1,4 +1,5 @@
-"""Linear or not: one step where that is sound, Gauss-Newton and shapes of strong bodies where it is not; and why."""
+"""Automatic choice of the method: one step where it is sound, else Gauss-Newton and shapes of strong bodies; and the
+reason."""
 
 from __future__ import annotations
 
@@ -14,15 +15,16 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.prior.defaults import MEASURED
 from jeit.inverse.shapes import ShapeReconstruction
 
-# Change relative to the background beyond which voltages are far from linear in it; and beyond which that must be
-# expected where noise is so large a share of the difference that images are damped to far less than there is.
+# Change relative to the background beyond which voltages are far from linear in it; and beyond which the same is
+# assumed where noise is such a share of the difference that images are damped far below the true change.
 _STRONG, _STRONG_IN_NOISE, _NOISY = 0.3, 0.1, 0.3
-# What a linear image may miss of the voltages: over what it misses if they are taken to be linear in it, and in all.
+# Share of the voltages that a linear image may miss: relative to the share missed if voltages are linear in it, and in
+# all.
 _WORSE, _MUCH = 1.1, 0.1
 # Share of the background that conductivity is kept above where a linear image claims less.
 _LEAST = 0.01
 # Change relative to the background beyond which bodies are looked for in a solid, where smooth images are poorest.
-_TELLING = 0.05
+_LEAST_FOR_BODIES = 0.05
 # Step along the linear image that gives its derivative.
 _STEP = 1e-4
 
@@ -40,9 +42,9 @@ class Chosen(NamedTuple):
 def image_automatically(prepared: PreparedDifference, asked: Asked, segmented: bool = False) -> Chosen:
     """The one-step image, unless it is unsound; then Gauss-Newton's with its bodies as shapes, unless that fails.
 
-    In a solid, bodies are looked for beside a sound one too, unless a prior was asked for: it would only be that of the
-    field beside them. Each with its default λ, not the one asked for. To be `segmented`, and no shapes: the image by
-    total variation.
+    In a solid, bodies are also looked for where the one-step image is sound, unless a prior was asked for, which would
+    only apply to the field beside them. Each method uses its default λ, not the one asked for. Where the image is to be
+    `segmented` and there are no shapes, it is made by total variation.
     """
     imaged = _by("one-step", prepared, asked)
     if np.iscomplexobj(prepared.difference):
@@ -73,10 +75,11 @@ def _by(name: str, prepared: PreparedDifference, asked: Asked) -> Imaged:
 
 
 def _bodies_in_solid(prepared: PreparedDifference, asked: Asked, change: Float[Array, " m"]) -> Chosen | None:
-    """Bodies that the data of a solid tell of, where a sound linear image shows more than a trace and noise allows."""
+    """Bodies that the data of a solid support, where a sound linear image shows more than a trace and the noise allows
+    it."""
     noise = prepared.quality.difference_noise
     strongest = np.abs(np.asarray(change)).max() / float(prepared.calibration.conductivity)
-    if prepared.mesh.dimension < 3 or strongest < _TELLING or (noise is not None and noise.relative > _NOISY):
+    if prepared.mesh.dimension < 3 or strongest < _LEAST_FOR_BODIES or (noise is not None and noise.relative > _NOISY):
         return None
     try:
         smooth = _by("gauss-newton", prepared, asked)
@@ -97,7 +100,7 @@ def _with_bodies(prepared: PreparedDifference, why: str, smooth: Imaged, shapes:
 
 
 def _edges(prepared: PreparedDifference) -> str:
-    """What bodies end at."""
+    """Name of the bodies' boundaries."""
     return "surfaces" if prepared.mesh.dimension == 3 else "outlines"
 
 
@@ -110,7 +113,7 @@ def _shapes(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked) 
 
 
 def unsound(prepared: PreparedDifference, change: Float[Array, " m"]) -> str:
-    """What is wrong with a linear image, S/m (2-D: S) per cell, in half a sentence; empty if nothing is."""
+    """Fault of a linear image, S/m (2-D: S) per cell, in half a sentence; empty if there is none."""
     background, relative = float(prepared.calibration.conductivity), np.asarray(change)
     relative = relative / background
     lowest, highest = float(relative.min()), float(relative.max())

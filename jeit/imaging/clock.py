@@ -1,4 +1,4 @@
-"""Says what is being done, and keeps how long it took."""
+"""Progress reports and timing of the steps of imaging."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 
 class Clock:
-    """Tells `progress` of each step and keeps the seconds that it took, in `seconds`."""
+    """Reports each step to `progress` and keeps the seconds that it took in `seconds`."""
 
     def __init__(self, progress: Callable[[str], None] | None):
         self.progress = progress

@@ -1,4 +1,4 @@
-"""Every rule for the hyperparameter on one measured difference: what each chooses, and the image that comes of it.
+"""Comparison of the rules for the hyperparameter on one measured difference: the λ that each chooses, and its image.
 
 This is what `jeit choose` runs, as one function; on simulated data use `jeit.inverse.compare_rules`.
 """
@@ -27,7 +27,7 @@ from jeit.inverse.linearisation import Linearisation
 
 @dataclass(frozen=True)
 class RuleOutcome:
-    """What one rule makes of a difference.
+    """Result of one rule for a difference.
 
     - `choice`: the λ chosen, and the curve it was chosen by.
     - `residual`: ‖w (v - Jx)‖ / ‖w v‖, the share of the difference that its image leaves unexplained.
@@ -45,12 +45,12 @@ class RuleOutcome:
 
 @dataclass(frozen=True)
 class ComparedRules:
-    """What `compare_on_data` found.
+    """Result of `compare_on_data`.
 
     - `prepared`: the difference that was imaged.
-    - `settings`: how it was imaged; the prior is in it.
-    - `outcomes`: what each rule made of it, by name.
-    - `refused`: rules that could not choose, by name, and why.
+    - `settings`: the settings used; the prior is in them.
+    - `outcomes`: the result of each rule, by name.
+    - `refused`: rules that could not choose, by name, with the reason.
     """
 
     prepared: PreparedDifference

@@ -1,4 +1,4 @@
-"""From two frames to a picture: check, mesh, calibrate, image, and say what is in it.
+"""Difference imaging of two frames: check, mesh, calibrate, image, and find inclusions.
 
 This is what `jeit reconstruct` runs, as one function. Its steps are the public functions of `jeit.data`,
 `jeit.imaging.preparation`, `jeit.inverse` and `jeit.image`; take them from there for anything out of the ordinary.
@@ -36,19 +36,21 @@ from jeit_solvers import Status
 from jeit_solvers.engines import as_array
 
 _MIDDLE = 0.5
-# Standard deviations by which the voltages of an image may miss the data.
+# Greatest misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
-# Share of the voltages that is to be left; and S/m, from tap water and fat to brine, with room on both sides.
+# Least share of usable voltages, and range of plausible conductivities in S/m, from tap water and fat to brine, with a
+# margin on both sides.
 _FEW_CHANNELS, _CONDUCTIVITIES = 0.5, (1e-3, 30.0)
 
 
 @dataclass(frozen=True)
 class ImagedDifference:
-    """What `image_difference` found.
+    """Result of `image_difference`.
 
     - `measurement`, `reference`: the two frames compared, one frame each.
-    - `quality`: what was found about the data before imaging.
-    - `settings`: how it was imaged, with what was decided on the way filled in; `why` the method, if that was decided.
+    - `quality`: the quality of the data, assessed before imaging.
+    - `settings`: the settings used, with automatic choices filled in; `why`: the reason for the method, where it was
+      chosen automatically.
     - `wiring`: how electrodes and channels seem to be connected.
     - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
     - `reconstruction`: the reconstruction matrix, or what the iteration found, or the shapes; with the hyperparameter
@@ -59,8 +61,8 @@ class ImagedDifference:
     - `inclusions`: regions of changed conductivity, strongest first; iterative images are looked at on the scale of the
       logarithm, which weighs both signs alike, and for what stands out of the noise; complex ones in the real part.
       Where there are `shapes`, those.
-    - `unlike_electrodes`: electrodes, counted from 0, of which the model misses far more than of the others, and how
-      many times as much; channels that read them count less.
+    - `unlike_electrodes`: electrodes, counted from 0, which the model fits far worse than the others, with the ratio of
+      the misfits; channels that read them count less.
     - `shapes`: bodies with their outlines, and what each explains; None where none were fitted, or they do not
       explain the voltages.
     - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
@@ -94,8 +96,8 @@ class ImagedDifference:
 
     @property
     def peak_ranges(self) -> tuple[tuple[float, float], ...]:
-        """From where to where the change in each inclusion may lie, S/m (2-D: S), a standard deviation either way, of
-        either kind where the data do not tell an ellipsoid from a column; empty where the data do not tell it."""
+        """Range of the change in each inclusion, S/m (2-D: S): one standard deviation either way, over both kinds where
+        the data do not distinguish an ellipsoid from a column; empty where the data do not determine it."""
         if self.shapes is None or not all(one.contrast_is_determined for one in self.shapes.bodies):
             return ()
         background, bodies = float(self.calibration.conductivity), self.shapes.bodies
@@ -115,21 +117,21 @@ class ImagedDifference:
 
     @property
     def electrodes(self) -> AbstractElectrodes:
-        """On that mesh."""
+        """The electrodes on the mesh imaged on."""
         return _imaged_on(self.reconstruction, self.calibration).electrodes
 
     @property
     def chosen_by(self) -> str:
-        """What chose the hyperparameter: a rule's name, "default" where it is the method's own number, "given" for any
-        other number; "none" for methods without one."""
+        """Source of the hyperparameter: a rule's name, "default" for the method's own number, "given" for any other
+        number; "none" for methods without one."""
         rule, asked = self.reconstruction.rule, self.settings.hyperparameter
         own = asked is None or asked == METHODS[self.settings.method].hyperparameter
         return "default" if rule == "given" and own else rule
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What speaks against believing the image, in sentences: channels too few or in another unit, an iteration that
-        did not converge, voltages that it does not explain, bodies that may as well be of another kind."""
+        """Reasons to doubt the image, in sentences: channels too few or in another unit, an iteration that did not
+        converge, voltages that it does not explain, bodies that may as well be of another kind."""
         found, said = self.reconstruction, _doubts_of_data(self)
         if isinstance(found, LinearReconstruction):
             return tuple(said)
@@ -171,14 +173,15 @@ class ImagedDifference:
 
     @property
     def departure(self) -> Float[Array, " m"]:
-        """What stands out, per cell: the change of conductivity, or of its logarithm in iterative images."""
+        """Values per cell in which inclusions are found: the change of conductivity, or of its logarithm in iterative
+        images."""
         if not self.iterative:
             return self.change
         return as_array(np.log1p(np.asarray(self.change) / float(self.calibration.conductivity)))
 
 
 def _imaged_on(found, calibration: Calibration) -> ForwardModel:
-    """The model on whose mesh something was found."""
+    """The model whose mesh the result is on."""
     finer = found.finer if isinstance(found, ShapeReconstruction) else None
     return calibration.model if finer is None else finer.model
 
@@ -274,7 +277,7 @@ def image_difference(
 def _inclusions(
     found: ImagedDifference, grid: Raster
 ) -> tuple[list[Inclusion], UInt8[np.ndarray, "rows columns"] | None]:
-    """What an image shows as inclusions, with changes of conductivity for peaks; and labels, if they are asked for."""
+    """Inclusions of an image, with changes of conductivity as peaks; and labels, if they are asked for."""
     settings, reconstruction, background = found.settings, found.reconstruction, found.calibration.conductivity
     if found.shapes is not None:
         bodies = found.shapes.bodies
@@ -293,7 +296,7 @@ def _inclusions(
 
 
 def _form(body: Star | Ellipsoid) -> SolidForm | None:
-    """What pictures draw of a body in a solid."""
+    """Form by which pictures draw a body in a solid."""
     if isinstance(body, Star):
         return None
     axes = sorted(body.axes.tolist(), key=lambda axis: abs(axis[2])) if body.column else body.axes.tolist()
@@ -301,7 +304,7 @@ def _form(body: Star | Ellipsoid) -> SolidForm | None:
 
 
 def _covered(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
-    """Which pixels lie in a region of either sign."""
+    """Pixels that lie in a region of either sign."""
     cell = np.asarray(grid.cell)
     labels = np.zeros(cell.shape, np.uint8)
     for one, region in regions:
@@ -310,7 +313,7 @@ def _covered(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
 
 
 def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
-    """Which pixels lie in a body of either sign, of the strongest where two meet; of a solid half way up."""
+    """Pixels that lie in a body of either sign, of the strongest where two meet; of a solid half way up."""
     centres, inside = grid.pixel_centres(), np.asarray(grid.cell) >= 0
     if mesh.dimension == 3:
         z = np.asarray(mesh.points)[:, 2]

@@ -22,8 +22,8 @@ from jeit_solvers.engines import as_array
 
 @dataclass(frozen=True)
 class ImagedFrequencies:
-    """What `image_frequencies` found: `image`, the change from the first frequency, scaled, to the second, and `weight`
-    α, the factor between the two: how the body as a whole has changed, 1 where it was left at that."""
+    """Result of `image_frequencies`: `image`, the change from the first frequency, scaled, to the second, and `weight`
+    α, the factor between the two, by which the body as a whole has changed; 1 for plain differences."""
 
     image: ImagedDifference
     weight: complex
@@ -37,7 +37,7 @@ def image_frequencies(
     weighted: bool = True,
     frame: int | str | None = None,
 ) -> ImagedFrequencies:
-    """Image what is in a body by how it changes between two frequencies, more or less than the body as a whole does.
+    """Image the change of a body between two frequencies, relative to the change of the body as a whole.
 
     `first`, `second`: the same body, electrodes and protocol at two frequencies, in volts; complex voltages give an
     image of admittivity. `weighted`: v₂ - αv₁, else v₂ - v₁. The background is that of the second frequency, fitted to

@@ -1,4 +1,5 @@
-"""Methods of imaging by name: what each makes of a prepared difference, what it takes, and its λ unless given."""
+"""Methods of imaging by name: the function that images a prepared difference, the settings it uses, and its default
+λ."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ NamedWeight = float | str | None
 
 
 class Asked(NamedTuple):
-    """What is asked of a method: the `prior` and λ, `hyperparameter`; `kinds` of bodies of a solid, see
+    """Settings passed to a method: the `prior` and λ, `hyperparameter`; `kinds` of bodies of a solid, see
     `jeit.inverse.shapes.EllipsoidPrior`; `progress`, called with the name of each stage of what takes long."""
 
     prior: NamedPrior
@@ -44,13 +45,13 @@ class Asked(NamedTuple):
     progress: Callable[[str], None] | None = None
 
 
-# What shapes start from: as many peaks of a smooth image as may be bodies, ghosts among them.
+# Starts of shapes: all peaks of a smooth image that may be bodies, ghosts among them.
 _PEAK, _AREA, _MOST = 0.15, 0.002, 8
 
 
 @dataclass(frozen=True)
 class Method:
-    """How to image a difference.
+    """A method to image a difference.
 
     - `image`: the function that does it, given what the settings ask.
     - `takes_prior`: whether it uses the prior of the settings; `prior`, what it is called where the method has its own.
@@ -75,7 +76,8 @@ def prior_for(prior: NamedPrior, domain: Body) -> AbstractPrior:
 
 
 def rule_for(name: str, prepared: PreparedDifference) -> Rule:
-    """The rule of that name, told of the noise in the data if it needs to know. Raises `ValueError` if none does."""
+    """The rule of that name, with the noise of the data where the rule needs it. Raises `ValueError` if the noise is
+    not known."""
     if name != "discrepancy":
         return RULES[name]
     if prepared.noise is None:
@@ -120,7 +122,7 @@ def _iterated(
 ) -> Imaged:
     """The conductivity whose voltages differ from the model's own as the frame differs from its reference.
 
-    So what the model gets wrong alike with and without objects is left out. `own`: the method's own prior, in place of
+    Errors of the model that are the same with and without objects cancel. `own`: the method's own prior, in place of
     that asked for. Raises `ValueError` if the solver fails.
     """
     model, background = prepared.model, prepared.calibration.conductivity
@@ -145,9 +147,10 @@ def _iterated(
 
 
 def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked) -> ShapeReconstruction:
-    """The bodies that explain a difference, started from all that a smooth image of it shows.
+    """Estimate the bodies that explain a difference, starting from all inclusions of a smooth image of it.
 
-    How much a body has to be missed, beyond what the evidence asks, is for errors of the model, which no noise tells.
+    The factor by which the objective must rise without a body, besides the test by evidence, allows for errors of the
+    model, which the noise does not include.
     """
     model, background = prepared.model, prepared.calibration.conductivity
     solid = prepared.mesh.dimension == 3
@@ -161,7 +164,7 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked
         noise=prepared.sharp_noise,
         mask=prepared.mask,
         prior=EllipsoidPrior(kinds=asked.kinds) if solid else None,
-        # Errors of the model are let stay in a solid, as a smooth field.
+        # In a solid, errors of the model are modelled as a smooth field.
         least_rise=1 if solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
         smooth=smooth if solid else None,
         progress=asked.progress,
@@ -175,7 +178,7 @@ def _shapes(prepared: PreparedDifference, asked: Asked) -> Imaged:
 
 
 def of_shapes(prepared: PreparedDifference, found: ShapeReconstruction) -> Imaged:
-    """Shapes with the change that they are, of a solid per cell of the finer mesh."""
+    """Shapes and their change of conductivity; of a solid, per cell of the finer mesh."""
     drawn = found if found.finer is None else found.finer
     return found, drawn.conductivity - prepared.calibration.conductivity
 

@@ -28,8 +28,8 @@ from jeit_solvers.engines import as_array
 
 
 def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> int:
-    """The number, from 0, of the frame to image: the one asked for, by number or name, or the first that is not the
-    file's own reference. Raises `ValueError` for a frame that there is not."""
+    """Number, from 0, of the frame to image: the one given by number or name, else the first that is not the file's own
+    reference. Raises `ValueError` for a frame that there is not."""
     if frame is not None:
         return measurement.frame_number(frame)
     return int(measurement.num_frames > 1 and measurement.frame_names[:1] == ("reference",))
@@ -37,7 +37,7 @@ def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> in
 
 @contextmanager
 def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
-    """A `ValueError` that names the measurement and is raised within names the frame too, where there are several."""
+    """Context in which a `ValueError` that names the measurement also names the frame, where there are several."""
     try:
         yield
     except ValueError as error:
@@ -47,13 +47,14 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
         raise ValueError(str(error).replace(name, f"{name}, frame {number}", 1)) from error
 
 
-# Nodes unless asked for, of a solid body and of a sheet.
+# Default number of nodes of a solid body and of a sheet.
 SOLID_POINTS, SHEET_POINTS = 10_000, 2000
-# Of a difference, what no model is taken to explain better than.
+# Share of a difference that every model is assumed to miss.
 _LEAST_MISFIT = 0.03
-# How many times as much of it sharp outlines may miss.
+# Factor by which sharp outlines may miss more of it.
 _SHARP = 3.0
-# How many times as much the model misses of an electrode that is not like the others; of sound tanks at most 2.6.
+# Misfit of an electrode, relative to the others', from which it counts as unlike them; in sound tanks it is at most
+# 2.6.
 _UNLIKE = 3.0
 
 
@@ -95,16 +96,17 @@ class PreparedDifference:
 
     @property
     def relative_noise(self) -> Float[Array, " M"]:
-        """How far channels are trusted relative to each other: `relative_noise` of the reference, volts; as many times
-        that as the model misses more of an unlike electrode that a channel reads."""
+        """Relative noise of the channels, volts: `relative_noise` of the reference, multiplied for channels that read
+        an unlike electrode by that electrode's relative misfit."""
         trusted = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
         reads = np.asarray(self.model.protocol.channel_measurement) != 0
         return as_array(trusted * np.max(np.where(reads, self._doubt, 1), axis=1))
 
     @property
     def unlike_electrodes(self) -> dict[int, float]:
-        """Electrodes, counted from 0, of whose channels the model misses far more of the reference than of the others',
-        and how many times as much: of an uneven gain, loose, or out of place. Channels that read them count less."""
+        """Electrodes, counted from 0, whose channels the model fits far worse in the reference than the others', each
+        with the ratio of the misfits: their gain is uneven, or they are loose or out of place. Channels that read them
+        count less."""
         return {int(one): float(self._doubt[one]) for one in np.flatnonzero(self._doubt > 1)}
 
     @functools.cached_property
@@ -121,22 +123,22 @@ class PreparedDifference:
 
     @property
     def modelled_noise(self) -> Float[Array, " M"]:
-        """What channels of the difference may be off by when the model explains it, volts: the noise found in it, and
-        of itself the share that the model misses of the reference, but not less than 3 %.
+        """Expected deviation of the difference from a model that explains it, volts: the noise found in the difference,
+        and the share of the difference that equals the model's misfit of the reference, at least 3 %.
 
-        Where no noise can be found, a tenth of the difference, at most 1 % of what channels read, is taken for it.
+        Where no noise can be found, a tenth of the difference, at most 1 % of the channels' voltages, is used instead.
         """
         return self._off_by(1.0)
 
     @property
     def sharp_noise(self) -> Float[Array, " M"]:
-        """The same where bodies with sharp outlines explain it, volts: three times the share. Smooth images bend to
-        what a model gets wrong, sharp ones do not."""
+        """`modelled_noise` for bodies with sharp outlines, volts: three times the model's share. Smooth images adapt to
+        errors of the model, sharp ones do not."""
         return self._off_by(_SHARP)
 
     @property
     def modelled_share(self) -> float:
-        """How much of the variance of `sharp_noise` is the model's fault, from 0 to 1; 1 where no noise is known."""
+        """Share of the variance of `sharp_noise` that is due to the model, from 0 to 1; 1 where no noise is known."""
         sharp = np.asarray(self.sharp_noise)[0] / np.asarray(self.relative_noise)[0]
         return 1 - (0 if self.noise is None else self.noise / float(sharp)) ** 2
 
@@ -178,7 +180,7 @@ def prepare_difference(
         model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("wiring"):
         wiring = find_wiring(model, base)
-        if wiring.explanation or quality.imageable:  # noise may look like another wiring, but not be explained by it
+        if wiring.explanation or quality.imageable:  # noise may resemble another wiring, but is not explained by it
             check_wiring(wiring, base, as_is)
         if not quality.imageable:
             with naming_frame(measurement, number):
@@ -192,7 +194,7 @@ def prepare_difference(
 def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
     """Raise `ValueError` for a wiring that is not as described, as found on `reference`; not if taken `as_is`."""
     if wiring.fault and not as_is:
-        # With the opposite sign nothing can be calibrated, as it is or not.
+        # With the opposite sign nothing can be calibrated, whatever `as_is` says.
         otherwise = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
         raise ValueError(
             f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description"
@@ -214,7 +216,7 @@ def calibrated_model(
         voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
         calibration = calibrate(model, voltages, mask=mask, contact=chosen)
         if contact is None and chosen == "each" and not calibration.distinguishes_contacts:
-            chosen = "common"  # the data do not tell so many impedances apart
+            chosen = "common"  # the data do not determine so many impedances
             calibration = calibrate(model, voltages, mask=mask, contact=chosen)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
@@ -231,8 +233,8 @@ def select_frames(
     """The frame to image and the reference to image it against, one frame each.
 
     A frame named "reference" in `measurement` is never imaged unless asked for, and is what the others are compared
-    with when no `reference` is given. A reference that was measured with other currents, which tell what those of the
-    measurement would have read, is turned into that (`jeit.data.driven_by`), and its notes say so. Raises `ValueError`
+    with when no `reference` is given. A reference that was measured with other currents is converted to those of the
+    measurement where it determines their voltages (`jeit.data.driven_by`), and its notes say so. Raises `ValueError`
     when there is no reference, no such frame, or no measurement.
     """
     check_measurement("measurement", measurement)
@@ -265,7 +267,7 @@ def imaging_mesh(
 
 
 def default_contact(measurement: Measurement) -> str:
-    """How to calibrate contact impedance: "each" if driven electrodes are read, else "fixed".
+    """Default calibration of contact impedance: "each" if driven electrodes are read, else "fixed".
 
     Only the voltage of an electrode that carries current drops across its contact; without such channels the fit would
     bend contact impedances to explain something else.

@@ -1,4 +1,4 @@
-"""Every frame of a measurement against one reference, in one factorisation: a series of linear images."""
+"""Series of linear images: every frame of a measurement against one reference, with one factorisation."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _MOST_FRAMES = 0.5
 
 @dataclass(frozen=True)
 class ImagedSequence:
-    """What `image_sequence` found: the `series` of images; `prepared`, how the body was modelled; the `reconstruction`
+    """Result of `image_sequence`: the `series` of images; `prepared`, the model of the body; the `reconstruction`
     matrix that made all of them; `refused` (F,), True for frames that lack channels and have no image; `regions`, (m,)
     True for the cells of each that was asked for, by name."""
 

@@ -1,4 +1,5 @@
-"""How to image: the method, the prior, λ, the mesh. The defaults here are jeit's, for Python and command line alike."""
+"""Settings of imaging: the method, the prior, λ, the mesh. The defaults here are jeit's, for Python and command line
+alike."""
 
 from __future__ import annotations
 
@@ -18,11 +19,11 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class ImagingSettings:
-    """How to image. The defaults here are jeit's defaults, for Python and command line alike.
+    """Settings of imaging. The defaults here are jeit's defaults, for Python and command line alike.
 
-    - `method`: "auto", the one-step image where it is sound, where it is not Gauss-Newton's, its bodies outlined; in
-      solids, bodies as ellipsoids wherever the data tell of them (`jeit.inverse.shapes`); or one of `METHODS`: linear
-      ones, iterative ones that solve for conductivity itself, and "shapes", outlines alone.
+    - `method`: "auto", the one-step image where it is sound, else Gauss-Newton's with its bodies outlined; in solids,
+      bodies as ellipsoids wherever the data support them (`jeit.inverse.shapes`); or one of `METHODS`: linear ones,
+      iterative ones that solve for conductivity itself, and "shapes", outlines alone.
     - `prior`: a name in `jeit.inverse.prior.defaults.PRIORS`, or a quadratic prior; used by one-step, Gauss-Newton and
       Levenberg-Marquardt imaging. With "auto", one that is not the default asks in solids for an image by it, and no
       bodies.
@@ -79,7 +80,7 @@ class ImagingSettings:
 
 
 def as_settings(given: ImagingSettings | None) -> ImagingSettings:
-    """What is given, or all the defaults. Raises `ValueError` for something else."""
+    """The settings given, or the defaults. Raises `ValueError` for something else."""
     settings = ImagingSettings() if given is None else given
     check_kind("settings", settings, ImagingSettings, "ImagingSettings, such as ImagingSettings(method='gauss-newton')")
     return settings

@@ -1,4 +1,4 @@
-"""Frame after frame to images: an imager for a measured sensor, and frames as they come from a file or a pipe."""
+"""Preparation of streams: an imager for a measured sensor, and the frames of a file or a pipe, one by one."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
 from jeit.inverse.prior.defaults import MEASURED
 from jeit.inverse.streaming.imager import check_memory
 
-# Of the mesh of a body that is not one itself, unless another number is given.
+# Default number of nodes of the mesh, for a body that is not a mesh itself.
 STREAM_POINTS = 1200
 
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """How to image frame after frame. The defaults here are jeit's defaults, for Python and command line alike.
+    """Settings of imaging frame after frame. The defaults here are jeit's defaults, for Python and command line alike.
 
     - `solver`: `GaussNewton()`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or the name of one
       ("gauss-newton", "levenberg-marquardt", "one-step"). `max_steps`: most iterations for a frame, where the solver
@@ -76,7 +76,8 @@ def prepare_imager(
     measurement: Measurement | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Imager, Calibration]:
-    """An imager for the sensor whose undisturbed frames are `reference`, and the model calibrated on them.
+    """Prepare an imager for the sensor whose undisturbed frames are `reference`; return it and the model calibrated on
+    them.
 
     `measurement`: what is to be imaged, if it is known already: its protocol must be the reference's. `progress` is
     called with the name of each step as it begins. Raises `ValueError` for another protocol, and as `image_difference`.

@@ -1,11 +1,12 @@
-"""Wiring errors: exchanged wires, channels in another order, opposite signs, and which correction explains the frame.
+"""Wiring errors: exchanged wires, channels in another order, opposite signs, and the correction that explains the
+frame.
 
-Drives or measurements exchanged in a frame, and not in its reference: which exchange makes the two alike.
+Drives or measurements exchanged in a frame, and not in its reference: the exchange that makes the two alike is found.
 
 Where every drive is read by every measurement, a frame is a matrix F (drives, measurements), as its reference R is.
 With two drives exchanged two of its rows are; that breaks reciprocity, as noise does, or not, and no image explains it.
 
-Wires exchanged, channels in another order, signs turned: which way of wiring explains a frame of the empty body.
+Wires exchanged, channels in another order, signs turned: the wiring that explains a frame of the empty body is found.
 
 A uniform body is known but for its conductivity and its contacts. Its transfer impedance Z (L, L) is computed once for
 each of a few contact impedances; with electrode k standing where p(k) should, it is Z[p, p], and all ways of wiring are
@@ -28,12 +29,13 @@ from jeit.forward.model import select_channels
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
-# What an exchange must lower the difference to: each, and all that are told of; and how many are looked for.
+# Share of the difference that may be left after each exchange, and after all reported exchanges; and the greatest
+# number of exchanges searched for.
 _STEP, _BETTER, _MOST = 0.9, 0.5, 4
 
 
 def exchanges_message(frame: Measurement, reference: Measurement) -> str:
-    """Which drives, or which measurements of every drive, look exchanged in a frame, in a sentence, counted from 1;
+    """A sentence that names drives, or measurements of every drive, that look exchanged in a frame, counted from 1;
     empty where no exchange halves its difference from the reference, and where some drive has other readings than
     others."""
     order = _order(frame)
@@ -70,7 +72,7 @@ def _order(frame: Measurement) -> np.ndarray | None:
 def _exchanges(
     measured: Inexact[np.ndarray, "n k"], rest: Inexact[np.ndarray, "n k"]
 ) -> tuple[float, list[tuple[int, int]]]:
-    """How much is left between rows once some are exchanged, and which, the one that makes most of it first."""
+    """Difference left between rows once some are exchanged, and the exchanges, the most effective first."""
     square = np.sum(np.abs(measured) ** 2, axis=1)[:, None] + np.sum(np.abs(rest) ** 2, axis=1)
     apart: Float[np.ndarray, "n n"] = np.maximum(square - 2 * np.real(measured @ rest.conj().T), 0)
     left, pairs = float(np.trace(apart)), []
@@ -88,10 +90,10 @@ def _exchanges(
 
 MOST_MISFIT = 0.15
 """Relative misfit of the empty body above which something is taken to be wrong."""
-# What another wiring must lower the misfit to: each exchange, and all that is told of.
+# Share of the misfit that may be left with another wiring: after each exchange, and after all that is reported.
 _STEP, _BETTER = 0.85, 0.6
 _MOST_EXCHANGES = 4
-# A misfit of the empty body with which no image is to be had, though nothing explains it.
+# Misfit of the empty body above which imaging is refused even though no other wiring explains it.
 _HOPELESS = 0.5
 # Contact impedance times conductivity, in units of the body's size: from hardly any to what drowns the body.
 _CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
@@ -99,12 +101,12 @@ _CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
 @dataclass(frozen=True)
 class Wiring:
-    """How electrodes and channels seem to be connected.
+    """Estimated connection of electrodes and channels.
 
     - `places`: electrode k stands where electrode `places[k]` should, counted from 0.
     - `order`: how channels follow each other, where not as described: a name in `channel_orders`; else empty.
     - `reversed_signs`: whether all voltages have the other sign.
-    - `misfit`: what a uniform body wired so misses of the frame, relative to it; `described`, wired as described.
+    - `misfit`: relative misfit of the frame by a uniform body with this wiring; `described`, with the wiring described.
     """
 
     places: tuple[int, ...]
@@ -120,7 +122,7 @@ class Wiring:
 
     @property
     def fault(self) -> str:
-        """What is wrong, in a sentence; empty where nothing is, or nothing that would not do for an image."""
+        """The fault of the wiring, in a sentence; empty where there is none, or none that prevents imaging."""
         if self.explanation or self.described < _HOPELESS:
             return self.explanation
         return (
@@ -130,7 +132,7 @@ class Wiring:
 
     @property
     def explanation(self) -> str:
-        """What was found, in a sentence, electrodes counted from 1; empty where all is as described."""
+        """The wiring found, in a sentence, electrodes counted from 1; empty where all is as described."""
         found = [_exchanged_places(self.places, self._cycles())]
         found.append(self.order and f"the channels look ordered {self.order}")
         found.append("all voltages look to have the opposite sign" if self.reversed_signs else "")
@@ -166,7 +168,7 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
     misfit_of = _comparison(model, measurement, orders)
 
     def least(tried: Iterable[Wiring], so_far: Wiring) -> Wiring:
-        # The first of those that rounding alone tells apart, as of orders that hold the same voltages by reciprocity.
+        # The first of those that differ by rounding alone, as of orders that hold the same voltages by reciprocity.
         best = min((misfit_of(one) for one in tried), key=lambda one: round(one.misfit, 9))
         return best if best.misfit < _STEP * so_far.misfit else so_far
 
@@ -192,8 +194,8 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
 
 
 def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
-    """Ways in which channels (M,) may be ordered in a file, by what they are called: where each of the protocol's
-    channels is found then. As it is described comes first, under no name."""
+    """Possible orders of the channels (M,) in a file, by name: the index at which each of the protocol's channels is
+    found. The order as described comes first, under an empty name."""
     drive, measurement = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
     channels = np.arange(len(drive))
     first = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
@@ -263,7 +265,7 @@ def _exchanged(places: tuple[int, ...], first: int, second: int) -> tuple[int, .
 
 
 def _exchanged_places(places: tuple[int, ...], cycles: list[list[int]]) -> str:
-    """Which electrodes stand where, in words."""
+    """The places of exchanged electrodes, in words."""
     if cycles and places in _turns(len(places)):
         way = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
         first = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""

@@ -22,9 +22,9 @@ from jeit.inverse.nonlinear.checks import check_steps
 from jeit_solvers import Status, as_minimum, ended_number, symmetric_inverse
 from jeit_solvers.engines import as_array, has_values, on_device, on_host, undifferentiated
 
-# Logarithm of a contact impedance over the model's, beyond which it is all the same.
+# Logarithm of a contact impedance over the model's, beyond which it no longer changes the voltages.
 FARTHEST = 50.0
-# Of the parameters and the misfit: as exact as double precision lets it be.
+# Tolerance of the parameters and the misfit: as small as double precision allows.
 _TOLERANCE = 1e-12
 
 
@@ -43,7 +43,8 @@ class TracedFit(NamedTuple):
 
 @eqx.filter_jit
 def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact: str, max_steps: int) -> TracedFit:
-    """Logarithms of σ and of z·σ over the model's z for the least misfit of the channels `used`; see `calibrate`."""
+    """Fit the logarithms of σ and of z·σ over the model's z to the channels `used` by least squares; see
+    `calibrate`."""
     problem = on_device((model, measured, used))
     unit = jnp.where(used, model.voltages(1.0), 0)
     size = {"fixed": 1, "common": 2, "each": 1 + model.electrodes.num_electrodes}[contact]
@@ -92,7 +93,7 @@ def _normal(contact: str, parameters, problem):
 
 
 def _inverse(contact: str, parameters, problem):
-    """Of Gauss-Newton's matrix."""
+    """Inverse of Gauss-Newton's matrix."""
     inverse = symmetric_inverse(_normal(contact, parameters, problem))
     return lambda vector: inverse @ vector
 
@@ -105,7 +106,7 @@ _TRACED = "It was fitted inside a transformation of JAX; the status says how tha
 
 # A relative misfit that measured tanks of known geometry do not reach: 1 % of KIT4's, 8 % of the Kuopio challenge's.
 _MUCH = 0.12
-# Volts that no frame has; nor one over them.
+# Bounds of the largest voltage of a frame, volts: this number and its inverse.
 _SMALLEST = 1e-30
 # Relative change of misfit, or of the parameters, that ends a fit; and of a fit on a large mesh.
 _TOLERANCE, _SOLID = 1e-8, 1e-4
@@ -147,7 +148,7 @@ class Calibration(eqx.Module):
 
     @property
     def note(self) -> str:
-        """What a large misfit means, in a sentence; empty where it is not large."""
+        """The meaning of a large misfit, in a sentence; empty where it is not large."""
         if not float(self.misfit) > _MUCH:
             return ""
         if self.model.mesh.dimension == 3:
@@ -261,7 +262,7 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
 
 
 def _deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
-    """Standard deviations of fitted parameters, taking what is left of the data for independent errors."""
+    """Standard deviations of fitted parameters, treating the residuals as independent errors."""
     _, size, rows = np.linalg.svd(solution.jac, full_matrices=False)
     freedom = max(np.count_nonzero(solution.fun) - len(solution.x), 1)
     return np.linalg.norm(rows / size[:, None], axis=0) * np.sqrt(2 * solution.cost / freedom)
@@ -282,14 +283,14 @@ class _Problem:
 
     @property
     def num_parameters(self) -> int:
-        """One for the conductivity, or two, and those of the contacts."""
+        """Number of parameters: one for the conductivity, or two if it is complex, and those of the contacts."""
         return (
             self.first_contact + {"fixed": 0, "common": 1, "each": self.given.electrodes.num_electrodes}[self.contact]
         )
 
     @property
     def first_contact(self) -> int:
-        """Which parameter is the first contact impedance."""
+        """Index of the first contact impedance among the parameters."""
         return 2 if self.is_complex else 1
 
     def model(self, parameters) -> tuple[ForwardModel, float | complex]:
@@ -307,7 +308,7 @@ class _Problem:
         return self.select(self._fields(parameters)[2])
 
     def jacobian(self, parameters):
-        """Of the voltages in the parameters, (M, p) volts."""
+        """Derivatives of the voltages in the parameters, (M, p) volts."""
         model, fields, impedance = self._fields(parameters)
         by_conductivity = -self.select(impedance)[:, None]
         if self.sensitivity is None:

@@ -27,7 +27,7 @@ _RANK = 1e-9
 
 
 class Data(eqx.Module):
-    """Voltages of independent channels, their noise, and what no body explains.
+    """Voltages of independent channels, their noise, and the residual that no body explains.
 
     **Fields**: `voltages` ŷ (r,) volts; `weight` (r,), 1 / volts; `covariance` and `precision` (r, r) of weight · ŷ,
     inverse to each other, the precision with a unit diagonal; `rest`, the sum of squares that all conductivities leave.
@@ -45,14 +45,14 @@ class Data(eqx.Module):
 
 
 class IndependentChannels(eqx.Module):
-    """Which channels determine all the others: v = `combination` (M, r) · v[`index` (r,)] for every body."""
+    """Channels that determine all the others: v = `combination` (M, r) · v[`index` (r,)] for every body."""
 
     index: Int[Array, " r"]
     combination: Float[Array, "M r"]
 
     @classmethod
     def create(cls, protocol: Protocol) -> "IndependentChannels":
-        """By a pivoted QR factorisation of the channels as linear forms of Z; every channel, where the protocol is
+        """Choose channels by a pivoted QR factorisation of their linear forms of Z; all channels, where the protocol is
         traced and the forms have no values."""
         if not has_values(protocol):
             number = protocol.num_measurements
@@ -74,12 +74,13 @@ class IndependentChannels(eqx.Module):
         return cls(as_array(order[:rank][sort]), as_array(combination[:, sort]))
 
     def weigh(self, noise: Float[Array, " M"]) -> "Weighing":
-        """How to combine voltages of this standard deviation, (M,) volts; the same for all frames of equal noise."""
+        """Weights that combine voltages of this standard deviation, (M,) volts; the same for all frames of equal
+        noise."""
         return _weigh(self.combination, noise)
 
 
 class Weighing(eqx.Module):
-    """From voltages to `Data`: all that depends on the noise alone.
+    """Map from voltages to `Data`: everything that depends on the noise alone.
 
     **Fields**: `noise` (M,) volts; `estimator` (r, M) with ŷ = estimator · y; the rest as in `Data`.
     """
@@ -91,7 +92,7 @@ class Weighing(eqx.Module):
     precision: Float[Array, "r r"]
 
     def combine(self, voltages: Float[Array, " M"]) -> Data:
-        """The data ŷ that voltages (M,) amount to."""
+        """Combine voltages (M,) into the data ŷ."""
         return _combine(self, voltages)
 
 
@@ -119,11 +120,12 @@ def _weigh(combination, noise) -> Weighing:
 def relative_noise(
     voltages: Float[Array, " M"], mask: Bool[Array, " M"] | None = None, *, relative: float = 0.01, floor: float = 0.3
 ) -> Float[Array, " M"]:
-    """Standard deviation of channels whose errors grow with what they read: relative · √(v² + (floor · median|v|)²).
+    """Standard deviation of channels whose errors grow with their voltages: relative · √(v² + (floor · median|v|)²).
 
-    What spoils a difference image of a real tank is rarely the voltmeter: gains, electrode shapes and depth that the
-    model lacks leave errors in proportion to the voltage, largest where the driven electrodes are read. `voltages` (M,)
-    of the reference, volts; `mask`: True for usable channels, the others do not count in the median and come out as 1.
+    The errors of a difference image of a real tank rarely come from the voltmeter: gains, electrode shapes and depth
+    that the model lacks leave errors in proportion to the voltage, largest where driven electrodes are read. `voltages`
+    (M,) of the reference, volts; `mask`: True for usable channels, the others do not count in the median and come out
+    as 1.
     """
     xp = namespace(voltages, mask)
     size = abs(xp.asarray(voltages))
@@ -135,11 +137,11 @@ def relative_noise(
 def electrode_misfits(
     protocol: Protocol, residual: Float[Array, " M"], noise: Float[Array, " M"], mask: Bool[Array, " M"]
 ) -> Float[np.ndarray, " L"]:
-    """How much of the channels that read an electrode a model misses, (L,), over the median of all electrodes.
+    """Misfit (L,) of the channels that read each electrode, over the median of all electrodes.
 
     `residual` (M,): predicted less measured, volts; `noise` (M,) volts, see `relative_noise`; `mask`: True for usable
-    channels. 1 for electrodes that none of those reads. An electrode far above 1 has a gain, an offset or a place of
-    its own.
+    channels. 1 for electrodes that none of those reads. An electrode far above 1 has another gain, offset or place than
+    the model assumes.
     """
     used = np.asarray(mask)
     reads = (np.asarray(protocol.channel_measurement) != 0) & used[:, None]

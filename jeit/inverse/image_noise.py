@@ -1,4 +1,5 @@
-"""How much of an iterative image the noise of the data would make by itself: what tells a body from a ghost."""
+"""Noise of an iterative image: its standard deviation due to the noise of the data, to distinguish bodies from
+ghosts."""
 
 from __future__ import annotations
 
@@ -13,10 +14,10 @@ _ROWS = 32
 
 
 def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
-    """Standard deviation (m,), from the noise alone, of what an image shows in every cell, on the link's scale.
+    """Standard deviation (m,) of an image in every cell due to the noise of the data alone, on the link's scale.
 
-    Coefficients end at c = K (Jc - r), K = Jᵀ(JJᵀ + C)⁻¹, so that noise of covariance C makes K C Kᵀ of them. It is
-    taken to be as large as it was said to be, or as what the image leaves unexplained, if that is more. Raises
+    The solution satisfies c = K (Jc - r), K = Jᵀ(JJᵀ + C)⁻¹, so that noise of covariance C gives its coefficients the
+    covariance K C Kᵀ. The noise is as large as given, or as the residual of the image, if that is larger. Raises
     `ValueError` for total variation and bounded solvers, whose images are not of that kind.
     """
     if not reconstruction.inversion.penalty.is_standard_normal:

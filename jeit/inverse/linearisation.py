@@ -2,8 +2,8 @@
 
 The linear problem in the space of the data, solved for one hyperparameter without an eigendecomposition.
 
-What is differentiated goes this way: eigenvectors of equal eigenvalues, which symmetric bodies have, have no
-derivative, but the images made of them have. In the notation of `jeit.inverse.spectrum`
+Derivatives take this path: eigenvectors of equal eigenvalues, which symmetric bodies have, have no derivative, but the
+images made of them have. In the notation of `jeit.inverse.spectrum`
 
     R_λ = ΓJᵀK⁻¹(1 - BGᵀ) + NGᵀ,   G = K⁻¹B(BᵀK⁻¹B)⁻¹,   K = JΓJᵀ + λ²,   B = JN.
 """
@@ -32,7 +32,7 @@ from jeit_solvers.engines import adjoint, as_array, has_values, namespace, on_ho
 
 
 class DirectProblem(eqx.Module):
-    """The whitened problem in orthonormal combinations of the channels, with the answers of a `Spectrum` that images
+    """The whitened problem in orthonormal combinations of the channels, with those methods of a `Spectrum` that images
     need.
 
     **Fields**: `directions` (M, r), the combinations; `jacobian` J (r, m) of them; `product` ΓJᵀ (m, r); `null_space` N
@@ -90,7 +90,8 @@ class Linearisation(eqx.Module):
         noise: Float[Array, " M"] | float = 1.0,
         mask: Bool[Array, " M"] | None = None,
     ) -> "Linearisation":
-        """At `conductivity`; arguments as in `one_step`. Raises `ValueError` for those that do not fit."""
+        """Linearise at `conductivity`, S/m (2-D: S); arguments as in `one_step`. Raises `ValueError` for those that do
+        not fit."""
         prior = PRIOR if prior is None else prior
         check_model(model)
         check_prior(prior)
@@ -142,10 +143,10 @@ class Linearisation(eqx.Module):
         return as_array(images @ weights)
 
     def factors(self, hyperparameter) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "k M"]]:
-        """The same as images (m, k) and their weights (k, M), 1 / volts, of which it is the product: the smaller of two
-        things to keep. Of a problem that has values."""
+        """Factors of the reconstruction matrix: images (m, k) and their weights (k, M), 1 / volts, the smaller of the
+        two forms to keep. For a problem that has values."""
         assert isinstance(self.spectrum, Spectrum)
-        known, chosen = on_host((self.spectrum, hyperparameter))  # what is NumPy's stays so, and is not copied
+        known, chosen = on_host((self.spectrum, hyperparameter))  # NumPy arrays stay so, and are not copied
         images, whitened = (np.asarray(part) for part in known.factors(chosen))
         weights: Any = np.zeros((whitened.shape[0], self.num_channels), whitened.dtype)
         weights[:, self.channels] = whitened * self.root_weight
@@ -155,8 +156,7 @@ class Linearisation(eqx.Module):
 def combined_blocks(
     model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
 ) -> Iterator[tuple[slice, Any]]:
-    """Weighted sums (r, b) of channels' Jacobians in some cells after others: more of these than memory likes are never
-    there at a time; in NumPy.
+    """Weighted sums (r, b) of channels' Jacobians, in blocks of b cells to limit the memory; in NumPy.
 
     `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
     """
@@ -175,7 +175,7 @@ def combined_blocks(
 def combined_jacobian(
     model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
 ) -> Inexact[Any, "r m"]:
-    """The same in every cell, (r, m); `conductivity` in S/m (2-D: S)."""
+    """Weighted sums of channels' Jacobians in every cell, (r, m); `conductivity` in S/m (2-D: S)."""
     kind = complex if np.iscomplexobj(conductivity) else float
     found = np.empty((len(weights), model.mesh.num_cells), kind)
     for cells, block in combined_blocks(model, conductivity, channels, weights):
@@ -209,8 +209,8 @@ def check_mask(mask) -> None:
 
 
 def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:
-    """An orthonormal basis of all that changes of conductivity can do to whitened data: L electrodes have L(L - 1)/2
-    transfer impedances, of which all channels are combinations, however many.
+    """An orthonormal basis of the changes of whitened data that changes of conductivity can make. All channels, however
+    many, are combinations of the L(L - 1)/2 transfer impedances of L electrodes.
 
     Drive d and measurement m, which sum to zero, see Σ_ab d_a m_b G_ab = Σ_a<b (d_a m_b + d_b m_a)(G_ab - (G_aa +
     G_bb)/2) of a symmetric G, be it the transfer impedance or its derivative.
@@ -220,7 +220,7 @@ def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarr
 
 
 def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array, "K r"]:
-    """The same, differentiable in the weights; as many as channels where the protocol has no values."""
+    """`data_directions`, differentiable in the weights; as many as channels where the protocol has no values."""
     if not has_values(protocol):
         return jnp.eye(len(channels))
     directions, size, _ = np.linalg.svd(_seen(protocol, channels), full_matrices=False)
@@ -228,7 +228,7 @@ def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array
 
 
 def _seen(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]:
-    """What channels see of every pair of electrodes."""
+    """Coefficients of the channels for every pair of electrodes."""
     first, second = np.triu_indices(protocol.num_electrodes)
     return _forms(protocol, channels)[:, first < second]
 

@@ -1,4 +1,5 @@
-"""The linear problem in the space of the data, decomposed once, from which images for any hyperparameter are cheap.
+"""Eigendecomposition of the linear problem in the space of the data, from which images for any hyperparameter are
+cheap.
 
 For complex admittivities J and data are complex, ᵀ stands for the conjugate transpose, and the image is the minimum of
 the same sum of squares. With whitened Jacobian J (M, m), prior covariance Γ and null space N, the reconstruction is
@@ -63,7 +64,7 @@ class Spectrum(eqx.Module):
 
     @property
     def freedom(self) -> int:
-        """How many components of the data may say something: all but those that are repeated."""
+        """Number of independent components of the data: all but those that are repeated."""
         return self.eigenvalues.shape[0] - self.repeated
 
     @property
@@ -82,7 +83,7 @@ class Spectrum(eqx.Module):
         return images @ weights
 
     def factors(self, hyperparameter) -> tuple[Float[Array, "m k"], Float[Array, "k M"]]:
-        """Images (m, k), no more than data can tell apart, and their weights: R_λ = images · weights."""
+        """Images (m, k), no more than the data can distinguish, and their weights: R_λ = images · weights."""
         return _factors(self, hyperparameter)
 
     def image(self, data: ArrayLike, hyperparameter) -> Float[Array, " m"]:
@@ -140,7 +141,7 @@ def _factors(spectrum: Spectrum, hyperparameter):
     weights = spectrum.directions.T @ inverse
     if spectrum.null_space.shape[1] == 0:
         return spectrum.images, weights
-    # What the penalised part leaves of the data, seen by the null space: its least-squares coefficients.
+    # Least-squares coefficients of the null space for the data that the penalised part leaves.
     coefficients = xp.linalg.pinv(spectrum.seen)
     rest = np.eye(basis.shape[0]) - spectrum.outer @ inverse
     images = xp.concatenate([spectrum.images, spectrum.null_space], axis=1)

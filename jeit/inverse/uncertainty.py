@@ -1,4 +1,4 @@
-"""Uncertainty: what the data leave open about an image, by the Laplace approximation.
+"""Uncertainty of an image: its posterior distribution by the Laplace approximation.
 
 At the solution ĉ of ½ rᵀGr + penalty(c) the posterior is taken for the Gaussian of the linearised problem, with
 covariance
@@ -11,9 +11,9 @@ Inverse Problem Theory (SIAM 2005), ch. 3; Kaipio and Somersalo, Statistical and
 
 Of total variation Q is the form that touches its energy at ĉ from above, that of lagged diffusivity (Vogel and Oman,
 SIAM J. Sci. Comput. 17 (1996) 227-238): a jump of height d between cells is held at it with a stiffness of 1 / √(d² +
-β²), a jump of none with that of 1 / β. So Σ is what would be left open if one knew where the edges are, and how high
-about: conditional on the edges found. Where an edge lies the energy itself bends less than Q, and the data may be as
-well explained by an edge elsewhere: there the truth is spread wider.
+β²), a jump of none with that of 1 / β. So Σ is conditional on the edges found: the uncertainty if the places of the
+edges, and roughly their heights, were known. Where an edge lies the energy itself bends less than Q, and the data may
+be as well explained by an edge elsewhere: there the truth is spread wider.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _ROWS = 32
 
 
 class Posterior(eqx.Module):
-    """What is known of an image after the data: a Gaussian of its coefficients, with mean ĉ. Made by `posterior`.
+    """Posterior of an image: a Gaussian of its coefficients, with mean ĉ. Made by `posterior`.
 
     **Fields**: `inversion`; `coefficients` ĉ (n,); `jacobian` J (r, n) there; `root` W (r, r) with WᵀW =
     (JQ⁻¹Jᵀ + C)⁻¹; `cross` JQ⁻¹ (r, n), J itself where Q is 1; `prior`, the normal distribution of precision Q.
@@ -53,12 +53,13 @@ class Posterior(eqx.Module):
     prior: AbstractNormal
 
     def standard_deviation(self) -> Float[Array, " m"]:
-        """Of the conductivity of every cell, S/m (2-D: S), to first order in the link."""
+        """Standard deviation of the conductivity of every cell, S/m (2-D: S), to first order in the link."""
         estimate, deviation = _estimate(self)
         return self.inversion.link.slope(estimate) * deviation
 
     def credible_interval(self, probability: float = 0.95) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Lower and upper conductivity of every cell that hold it with this probability, one cell at a time.
+        """Lower and upper bounds of every cell's conductivity, between which it lies with this probability, one cell at
+        a time.
 
         Gaussian on the link's scale, so that bounds and positivity are kept. Raises `ValueError` for a probability that
         is not between 0 and 1.
@@ -116,10 +117,10 @@ class Posterior(eqx.Module):
 def posterior(reconstruction: Reconstruction) -> Posterior:
     """The posterior round a reconstruction, by the Laplace approximation.
 
-    With a smooth prior its standard deviations are as honest as the noise, the prior and the forward model are: with
-    λ = 1 and a prior of the right variance they hold at their nominal rate; λ = 2 says that the image varies half as
-    much. With total variation they are conditional on the edges found: what would be left open were it known where the
-    image has edges, and how high about. At an edge, which may lie elsewhere, the truth is spread wider. Raises
+    With a smooth prior its standard deviations are as accurate as the noise, the prior and the forward model are: with
+    λ = 1 and a prior of the right variance they hold at their nominal rate; λ = 2 assumes that the image varies half as
+    much. With total variation they are conditional on the edges found: the uncertainty if the places of the edges, and
+    roughly their heights, were known. At an edge, which may lie elsewhere, the truth is spread wider. Raises
     `ValueError` for bounded solvers, whose posterior is not near a Gaussian, and for a reconstruction that has failed,
     or is none.
     """
@@ -130,7 +131,7 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
     in_pieces = inversion.model.mesh.dimension == 3 or not inversion.penalty.is_standard_normal
     if not (has_values(inversion, coefficients) and in_pieces):
         return _posterior(inversion, coefficients)
-    # Of a solid body compiled programs would hold the Jacobian several times over; those of factors take seconds.
+    # For a solid body compiled programs would hold the Jacobian several times over; those of factors take seconds.
     with np.errstate(all="ignore"):
         known, ended = on_host((inversion, coefficients))
         jacobian, cross, inner, normal = _within_data(known, ended)

@@ -1,4 +1,4 @@
-"""Where electrodes are: arrangements as arrays of positions, and `Layout`, a design with sizes, labels and an outline.
+"""Layouts of electrodes: arrangements as arrays of positions, and `Layout`, a design with sizes, labels and an outline.
 
 Arrangements: `ring`, `ring_and_centre`, `perimeter`, `grid`, `quasi_uniform`, and `spread` over surfaces in space.
 Layouts: `named_layout`, or from and to a CSV, DXF or SVG file (`read_layout`, `write_layout`); `SurfaceLayout` of

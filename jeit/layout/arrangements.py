@@ -1,4 +1,4 @@
-"""Layouts: positions for electrodes of any kind, as arrays (L, d) in metres."""
+"""Arrangements: positions for electrodes of any kind, as arrays (L, d) in metres."""
 
 from __future__ import annotations
 

@@ -16,10 +16,10 @@ from jeit.layout.csv_file import MOST_BYTES
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
-# What needs the extra, and what does not.
+# The task that needs the extra, and the formats that do not.
 _DRAWINGS = ("a DXF drawing", "CSV and SVG files need nothing more.")
 _OUTLINE, _ELECTRODES, _LABELS = "OUTLINE", "ELECTRODES", "LABELS"
-# AutoCAD's colour numbers: laser cutters tell lines to cut from lines to engrave by their colour.
+# AutoCAD's colour numbers: laser cutters distinguish lines to cut from lines to engrave by their colour.
 _COLOURS = {_OUTLINE: 1, _ELECTRODES: 5, _LABELS: 8}
 
 
@@ -62,7 +62,7 @@ class _Pen:
 
 
 class _Entity(NamedTuple):
-    """What is drawn on one of the layers: of what kind, and what of it is looked at, in the drawing's unit."""
+    """A drawn entity on one of the layers: its kind, and the values of it that are used, in the drawing's unit."""
 
     kind: str
     circle: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -14,8 +14,8 @@ from jeit.mesh.geodesic import Geodesics, Triangles
 _NODES = 30
 # Halved no further than this many nodes.
 _MOST = 60_000
-# More places than this lie so near each other that ways between them are as good as straight: what is nearest is told
-# by space, and by the side that it faces.
+# More places than this lie so near each other that ways between them are nearly straight: the nearest is found by
+# distance in space, and by the side that it faces.
 _BY_WAYS = 128
 
 
@@ -58,7 +58,7 @@ def spread(
 
 
 def _nearest(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.ndarray:
-    """Of each node the nearest position: as far away again, half a pitch, where they face opposite sides."""
+    """Nearest position of each node, by distance in space and by the side that they face."""
     half = 0.5 * np.sqrt(triangles.areas.sum() / len(position))
     facing = half * triangles.normals[triangles.nearest(position).triangle]
     tree = KDTree(np.hstack([position, facing]))

@@ -1,4 +1,4 @@
-"""Layouts from and to files, in millimetres: CSV for spreadsheets, DXF and SVG for the laser cutter.
+"""Reading and writing of layouts, in millimetres: CSV for spreadsheets, DXF and SVG for laser cutters.
 
 | | electrodes | labels | contact impedance | outline |
 |---|---|---|---|---|

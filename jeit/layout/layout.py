@@ -1,4 +1,4 @@
-"""`Layout`: where round electrodes sit on a flat skin."""
+"""`Layout`: positions and sizes of round electrodes on a flat skin."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from jeit.layout.labels import check_labels
 from jeit.mesh import Domain
 from jeit_solvers.engines import has_values
 
-# A skin outside these is not known to exist: its lengths would be in millimetres, or have been divided by 1000 twice.
+# Range of sizes of skins: outside it, lengths are likely in millimetres, or have been divided by 1000 twice.
 SMALLEST, LARGEST = 1e-3, 5.0  # m
 # Lengths come and go as decimal millimetres; a disc may miss its bounds by so much.
 _ROUNDING = 1e-9  # m
 
 
 class Layout(eqx.Module):
-    """Round electrodes on a flat skin: what a designer compares, optimises, and sends to the laser cutter.
+    """Round electrodes on a flat skin: a design to be compared, optimised, and sent to the laser cutter.
 
     **Fields**
 

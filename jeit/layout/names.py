@@ -1,4 +1,4 @@
-"""The layouts that have a name: two of the literature's, and regular ones made for any skin."""
+"""Named layouts: two of the literature, and regular ones made for any skin."""
 
 from __future__ import annotations
 

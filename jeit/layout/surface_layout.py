@@ -1,4 +1,4 @@
-"""`SurfaceLayout`: where round electrodes sit on a curved skin."""
+"""`SurfaceLayout`: positions and sizes of round electrodes on a curved skin."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class SurfaceLayout(eqx.Module):
 
     @property
     def face(self) -> str:
-        """Of a layer, that electrodes are on: "inner" or "outer"."""
+        """Face of a layer that electrodes are on: "inner" or "outer"."""
         return "inner" if self.outward else "outer"
 
     def lengths(self) -> Float[np.ndarray, "L L"]:

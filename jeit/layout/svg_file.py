@@ -1,4 +1,4 @@
-"""Layouts as SVG drawings: written with one user unit a millimetre, read as drawn by hand too."""
+"""Layouts as SVG drawings: written with one user unit per millimetre; drawings made by hand can be read as well."""
 
 from __future__ import annotations
 
@@ -118,7 +118,8 @@ class _Builder(ElementTree.TreeBuilder):
 
 
 def _shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str | None, np.ndarray]]:
-    """What is drawn, in its order: element, role (of it or of a group round it), matrix (2, 3) to metres, y up."""
+    """Shapes of a drawing, in their order: element, role (of it or of a group round it), matrix (2, 3) to metres, y
+    up."""
     waiting: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [(root, None, _to_metres(root))]
     while waiting:
         element, role, to = waiting.pop()
@@ -168,7 +169,7 @@ def _style(element: ElementTree.Element) -> str:
 
 
 def _outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
-    """Of what is in the group OUTLINE: one circle, or shapes of straight sides, holes in the largest."""
+    """Outline from the content of the group OUTLINE: one circle, or shapes of straight sides, holes in the largest."""
     if len(drawn) == 1 and tag_of(drawn[0][0]) in ROUND:
         x, y, radius = disc_of(*drawn[0])
         return Disk(radius, (x, y))

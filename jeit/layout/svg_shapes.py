@@ -12,7 +12,7 @@ from jeit.arguments import describe
 
 # Possessive: what is no number is found so in one pass, however long it is.
 NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
-# Of numbers in a drawing, whose squares are still of use when they have been moved and scaled.
+# Greatest number in a drawing: its square can still be computed after moving and scaling.
 LARGEST = 1e30
 ROUND = ("circle", "ellipse")
 
@@ -57,7 +57,7 @@ def moved(points, to: np.ndarray) -> np.ndarray:
 
 
 def tag_of(element: ElementTree.Element) -> str:
-    """What kind of element it is."""
+    """The kind of an element."""
     return element.tag.split("}")[-1]
 
 

@@ -1,4 +1,4 @@
-"""Checks on the raw arrays of a mesh: every fault is named, with what to do about it."""
+"""Checks on the raw arrays of a mesh, with errors that name the fault and what to do about it."""
 
 from __future__ import annotations
 

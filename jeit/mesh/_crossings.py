@@ -53,7 +53,7 @@ def _near(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
             number = np.fromiter(map(len, found), int, len(found))
             first = np.repeat(asked, number)
             second = members[np.concatenate([np.asarray(each, int) for each in found])]
-            # Of one kind each pair is found twice.
+            # Each pair within one size class is found twice.
             once = np.where(size[first] == size[second], first < second, True)
             overlap = (low[first] <= high[second]).all(axis=1) & (low[second] <= high[first]).all(axis=1)
             yield np.column_stack([first, second])[once & overlap]

@@ -1,4 +1,5 @@
-"""Mesh files from anywhere, before meshio opens them: which lead to no other file, and do not grow beyond memory."""
+"""Checks of mesh files from any source before meshio opens them: no references to other files, and no content beyond
+memory."""
 
 from __future__ import annotations
 
@@ -34,10 +35,10 @@ FORMATS = {
     ".xdmf": "xdmf",
     ".xmf": "xdmf",
 }
-# Times its size in the file that a mesh takes in memory.
+# Memory that a mesh takes, over its size in the file.
 _GROWTH = 4
 _INCLUDE = re.compile(rb"^[ \t]*\*[ \t]*include", re.IGNORECASE | re.MULTILINE)
-# Sets of an Abaqus file told by their first and last number; what a VTK file counts, in a grid along each axis.
+# Sets of an Abaqus file given by their first and last number; the counts in a VTK file, of a grid along each axis.
 _GENERATED = re.compile(rb"^[ \t]*\*.*generate", re.IGNORECASE | re.MULTILINE)
 _VTK_COUNTS = re.compile(
     rb"^[ \t]*(DIMENSIONS|POINTS|CELLS|CELL_TYPES|\w+_COORDINATES)((?:[ \t]+\d+)+)", re.IGNORECASE | re.MULTILINE
@@ -52,8 +53,8 @@ _reading = threading.Lock()
 
 
 def check_foreign(path: Path) -> str:
-    """What meshio calls the format of a file. Raises `ValueError` for a format that is not among `FORMATS`, for a file
-    that leads to others or declares entities, and for one too large for memory."""
+    """Name that meshio uses for the format of a file. Raises `ValueError` for a format that is not among `FORMATS`, for
+    a file that leads to others or declares entities, and for one too large for memory."""
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Which cells share a facet, and which facets make the boundary (NumPy; done once per mesh)."""
+"""Topology of meshes: cells that share a facet, and facets of the boundary (NumPy; done once per mesh)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""`bisect`: a mesh made finer where that is asked for; `cut`: a mesh cut along a surface. Of triangles, in the plane or
-in space, or tetrahedra.
+"""Refinement of meshes of triangles, in the plane or in space, or tetrahedra: `bisect` refines where a size function
+asks for it, `cut` divides cells along a surface.
 
 Edges are split, each in all the cells round it, so that cells go on meeting side to side. At their middles only where
 they are the longest of all those cells: Rivara, International Journal for Numerical Methods in Engineering 20 (1984)
@@ -20,7 +20,7 @@ from jeit.mesh._checks import MOST_POINTS
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.sizes import size_checked
 
-# Of an edge that a surface crosses nearer to its end than so many times its length, the end is moved onto it.
+# If a surface crosses an edge nearer to its end than this share of its length, the end is moved onto the surface.
 _NEAR = 0.25
 # Least volume of a cell, of what it was, after its corners have moved.
 _LEAST = 0.1
@@ -31,9 +31,9 @@ _HALVINGS = 30
 def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.ndarray, " m"]]) -> Mesh:
     """The mesh, with no cell whose longest edge is longer than asked for.
 
-    `size` takes the corners of cells (m, k, s), metres, and tells how long the longest edge of each may be, metres;
-    infinite where cells stay as they are. Neighbours are divided as far as that needs. Tags stay; the boundary is that
-    of the given mesh, of more facets.
+    `size` takes the corners of cells (m, k, s), metres, and returns the greatest length allowed for the longest edge of
+    each, metres; infinite where cells stay as they are. Neighbours are divided as far as that needs. Tags stay; the
+    boundary is that of the given mesh, of more facets.
 
     Raises `ValueError` for a `size` that is not one number per cell, above zero, or asks for more than 2,000,000 nodes.
     """
@@ -41,8 +41,8 @@ def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.nda
 
 
 def bisected(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]) -> tuple[Mesh, Int[np.ndarray, " m"]]:
-    """What `bisect` gives, and the cell of the given mesh that each of its cells comes from. Raises `ValueError` as it
-    does."""
+    """The mesh of `bisect`, and the cell of the given mesh that each of its cells comes from. Raises `ValueError` as
+    `bisect` does."""
     division = _Division.of(mesh)
     parent = np.arange(len(division.cells))
     wanted = _too_long(division, slice(None), size)
@@ -109,7 +109,7 @@ class _Division:
 
     @classmethod
     def of(cls, mesh: Mesh) -> _Division:
-        """Nothing split yet."""
+        """The division of a mesh of which nothing is split yet."""
         check_kind("mesh", mesh, Mesh, "a mesh, such as jeit.mesh.disk or jeit.mesh.read return")
         points, cells, facets = (np.asarray(one) for one in (mesh.points, mesh.cells, mesh.facets))
         return cls(points, cells, facets, np.arange(len(facets)))
@@ -121,7 +121,8 @@ class _Division:
             return Mesh.create(self.points, self.cells, tags=named)
 
     def split(self, edges: Int[np.ndarray, "e 2"], middles: Float[np.ndarray, "e s"]) -> tuple[_Division, np.ndarray]:
-        """With `edges`, no two of one cell, split at their `middles`, metres; and the cell that each comes from."""
+        """The division with `edges`, no two of one cell, split at their `middles`, metres; and the cell that each new
+        cell comes from."""
         node = len(self.points) + np.arange(len(edges))
         cells, came = _halved(self.cells, edges, node, len(self.points))
         facets, side = _halved(self.facets, edges, node, len(self.points))
@@ -129,7 +130,7 @@ class _Division:
 
 
 def _too_long(division: _Division, some, size) -> Bool[np.ndarray, " m"]:
-    """Which of some cells have longer edges than they may. Raises `ValueError`."""
+    """Whether cells have longer edges than allowed. Raises `ValueError`."""
     cells = division.cells[some]
     most = np.asarray(size(division.points[cells]))
     if most.shape != (len(cells),) or not (most > 0).all():
@@ -141,8 +142,8 @@ def _too_long(division: _Division, some, size) -> Bool[np.ndarray, " m"]:
 
 
 def _moved_onto(division: _Division, level) -> tuple[_Division, Float[np.ndarray, " n"]]:
-    """With nodes near the surface moved onto it, along edges, but for those of the boundary and where cells would be
-    crushed; and the level at all nodes."""
+    """The mesh with nodes near the surface moved onto it, along edges, except for those of the boundary and where cells
+    would be crushed; and the level at all nodes."""
     points, cells = division.points, division.cells
     value = np.asarray(level(points))
     if value.shape != (len(points),) or not np.isfinite(value).all():
@@ -168,7 +169,7 @@ def _moved_onto(division: _Division, level) -> tuple[_Division, Float[np.ndarray
 
 
 def _crossing(ends: Float[np.ndarray, "e 2 s"], first: Float[np.ndarray, " e"], level) -> Float[np.ndarray, "e s"]:
-    """Where the level, `first` (e,) at the first ends and of the other sign at the others, is zero on edges."""
+    """Points on edges where the level, `first` (e,) at the first ends and of the other sign at the others, is zero."""
     low, high = np.zeros((len(ends), 1)), np.ones((len(ends), 1))
     start, along = ends[:, 0], ends[:, 1] - ends[:, 0]
     for _ in range(_HALVINGS):
@@ -195,7 +196,7 @@ def _ends(simplices) -> Int[np.ndarray, "m k 2"]:
 
 
 def _lengths(ends: Float[np.ndarray, "... 2 s"]) -> Float[np.ndarray, "..."]:
-    """Of edges."""
+    """Lengths of edges."""
     return np.linalg.norm(ends[..., 1, :] - ends[..., 0, :], axis=-1)
 
 
@@ -215,14 +216,14 @@ def _first_of_all(number, rank) -> Bool[np.ndarray, " e"]:
 
 
 def _nodes(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
-    """Those of some simplices."""
+    """Nodes of some simplices."""
     there = np.zeros(num_points, bool)
     there[simplices] = True
     return there
 
 
 def _volumes(points, cells) -> Float[np.ndarray, " m"]:
-    """Of cells, up to a factor; negative where turned round, but for triangles in space, which have no sign."""
+    """Volumes of cells, up to a factor; negative where turned round, but for triangles in space, which have no sign."""
     sides = points[cells[:, 1:]] - points[cells[:, :1]]
     if sides.shape[1] < sides.shape[2]:
         return np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)

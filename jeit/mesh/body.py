@@ -1,4 +1,4 @@
-"""`Body`: what is measured on, an outline of a sheet or a solid, as readers and images ask for it."""
+"""`Body`: the body that is measured, an outline of a sheet or a solid; the interface for readers and images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well shaped the cells of a mesh are."""
+"""Shape measures of the cells of a mesh."""
 
 from __future__ import annotations
 

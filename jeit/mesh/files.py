@@ -26,7 +26,7 @@ _CELLS = {2: "triangle", 3: "tetra"}
 _FACETS = {2: "line", 3: "triangle"}
 # Files of triangles whose neighbours are to be found.
 _LOOSE = (".stl", ".obj")
-# Of what a file holds that meshio did not look at; and letters of what is said of it.
+# Errors that meshio raises for content that it does not check; and greatest number of letters of their messages.
 _FAULTS = (LookupError, TypeError, AttributeError, ArithmeticError, MemoryError)
 _SAID = 80
 
@@ -146,7 +146,7 @@ def _quietly(path: Path, action: Any, *, writing: bool = False) -> Any:
 
 
 def _short(error: BaseException | str) -> str:
-    """What is said, in one short line."""
+    """A message in one short line."""
     said = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return said if len(said) <= _SAID else f"{said[: _SAID - 1]}…"
 

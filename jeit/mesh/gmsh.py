@@ -16,7 +16,7 @@ from jeit.mesh.outline import Domain
 
 CAD = (".step", ".stp", ".iges", ".igs", ".brep")
 """Files of geometry without cells, by the ends of their names."""
-# Of these Gmsh reads the geometry, whatever is in the file; all else it takes for a script.
+# Endings of files that Gmsh always reads as geometry; it takes all others for scripts.
 _PLAIN = (*CAD, ".stl")
 
 
@@ -89,7 +89,7 @@ def _write(
     path: Path,
     name: str,
 ) -> None:
-    """To `path`; what is said of the geometry calls it `name`."""
+    """Write to `path`; messages call the geometry `name`."""
     try:
         if isinstance(source, (str, Path)):
             gmsh.open(str(source))

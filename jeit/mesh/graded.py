@@ -1,4 +1,4 @@
-"""Solid meshes that are fine at given planes, where electrodes end and the current density is without bound.
+"""Solid meshes that are fine at given planes, where electrodes end and the current density is unbounded.
 
 Along each axis cells are smallest at the planes and grow away from them, up to a largest size that the number of nodes
 decides. A box is divided along x, y and z; what stands above another outline along z, its plane mesh being refined
@@ -45,8 +45,8 @@ def graded_box(outline: Rectangle, height: float, planes: Sequence[Float[np.ndar
 def graded_layers(
     outline: Domain, height: float, planes: Float[np.ndarray, " k"], rims: Float[np.ndarray, "p 2"], num_points: int
 ) -> Mesh:
-    """What stands above any outline, in layers that are thin at `planes` across z, its cells small at `rims`, seen from
-    above: those on the edge of a disk are nodes. Tags as of `jeit.mesh.layer`."""
+    """Mesh of a solid above any outline, in layers that are thin at `planes` across z, its cells small at `rims`, seen
+    from above: those on the edge of a disk are nodes. Tags as of `jeit.mesh.layer`."""
     stops = _stops(planes, 0.0, height)
     area = float(outline.area)
 
@@ -85,7 +85,7 @@ def _divided(stops: Float[np.ndarray, " s"], size: float) -> Float[np.ndarray, "
     """Places along an axis: the stops, and cells between that grow away from them up to a `size`."""
     places = [stops[:1]]
     for low, high in pairwise(stops):
-        # How many cells lie before each of many places.
+        # Number of cells before each of many places.
         fine = np.linspace(low, high, 400)
         middle = (fine[1:] + fine[:-1]) / 2
         width = np.minimum(size, _FINEST * size + _GROWTH * np.minimum(middle - low, high - middle))

@@ -39,10 +39,9 @@ _HEADER = 84
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 # Nodes that are nearer, relative to the largest coordinate, are one: such files keep six digits of them.
 _SEAM = 2e-6
-# Letters of what is said of a file's content.
+# Greatest number of letters of messages about a file's content.
 _LONGEST = 120
-# Times its size in the file that what is read of one takes in memory, at most: faces of an .obj file are told in few
-# letters.
+# Greatest memory that a file takes when read, over the file's size: faces of an .obj file are written in few letters.
 _GROWTH = {".stl": 8, ".obj": 16}
 
 

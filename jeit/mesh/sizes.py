@@ -1,4 +1,5 @@
-"""Sizes of more than ten metres, nearly always of another unit: they are told of once, where they are given."""
+"""Check of sizes: those of more than ten metres are nearly always in another unit, and warned of once, where they are
+given."""
 
 from __future__ import annotations
 
@@ -23,8 +24,8 @@ def size_checked() -> Iterator[None]:
 
 
 def warn_large(extent: float, name: str, across: float = 1.0, *, of_file: bool = False) -> None:
-    """Warn if a length in metres, of something `across` times as large, looks like one of another unit, unless it was
-    told of; `of_file`: where it may come from a file, which can be read in its own unit."""
+    """Warn if a length in metres, of something `across` times as large, looks like one of another unit, unless a
+    warning was given already; `of_file`: where it may come from a file, which can be read in its own unit."""
     if not across * extent > LARGE or _CHECKED.get():
         return
     scale = [f" (a file is read with scale={one})" if of_file else "" for one in ("1e-3", "1e-2", "0.0254")]

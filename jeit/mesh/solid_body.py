@@ -18,7 +18,7 @@ from jeit_solvers.engines import as_array
 
 
 class Solid(Body):
-    """What stands upright above a plane outline, from z = 0 up to `thickness`, metres: a tank, a box, a layer.
+    """Solid that stands upright above a plane outline, from z = 0 up to `thickness`, metres: a tank, a box, a layer.
 
     `Solid(Disk(radius), height)` is a cylinder, `Solid(Rectangle(width, depth), height)` a box.
     """
@@ -33,7 +33,7 @@ class Solid(Body):
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """That of the outline."""
+        """Bounding box of the outline."""
         return self.outline.extent
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
@@ -70,7 +70,7 @@ class OwnMesh(Body):
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Of its nodes."""
+        """Bounding box of the nodes."""
         points = np.asarray(self.given.points)[:, :2]
         (x_min, y_min), (x_max, y_max) = points.min(axis=0), points.max(axis=0)
         return float(x_min), float(x_max), float(y_min), float(y_max)

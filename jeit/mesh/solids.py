@@ -115,10 +115,10 @@ def box(
 ) -> Mesh:
     """Mesh of a box of `width` (x) by `depth` (y) by `height` (z) metres, centred at x = y = 0, from z = 0 up.
 
-    Give `num_points`, the number of nodes (4,000 if nothing is said; met within about 10 %), or `cell_size` in metres;
-    `num_layers` along z follows from them unless told. `refine` as in `jeit.mesh.disk`, seen from above. Tags: 'left',
-    'right' (across x), 'front', 'back' (across y), 'bottom', 'top' (across z), and 'side'. Raises `ValueError`
-    on bad or contradicting arguments.
+    Give `num_points`, the number of nodes (4,000 by default; met within about 10 %), or `cell_size` in metres;
+    `num_layers` along z follows from them unless given. `refine` as in `jeit.mesh.disk`, seen from above. Tags: 'left',
+    'right' (across x), 'front', 'back' (across y), 'bottom', 'top' (across z), and 'side'. Raises `ValueError` on bad
+    or contradicting arguments.
     """
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
@@ -141,10 +141,10 @@ def cylinder(
 ) -> Mesh:
     """Mesh of an upright cylinder of `radius` and `height` metres around the z axis, from z = 0 up.
 
-    Give `num_points`, the number of nodes (4,000 if nothing is said; met within about 10 %), or `cell_size` in metres;
-    `num_layers` along z follows from them unless told. `refine`, `num_boundary` and `boundary_points` (angles) as in
-    `jeit.mesh.disk`, seen from above. Tags: 'bottom', 'top', 'side'. Raises `ValueError` on bad or
-    contradicting arguments.
+    Give `num_points`, the number of nodes (4,000 by default; met within about 10 %), or `cell_size` in metres;
+    `num_layers` along z follows from them unless given. `refine`, `num_boundary` and `boundary_points` (angles) as in
+    `jeit.mesh.disk`, seen from above. Tags: 'bottom', 'top', 'side'. Raises `ValueError` on bad or contradicting
+    arguments.
     """
     radius, height = check_length("radius", radius, 2), check_length("height", height)
     base_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
@@ -161,7 +161,7 @@ def cylinder(
 
 
 def in_plane(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
-    """How many of a solid's nodes its base has."""
+    """Number of a solid's nodes in its base."""
     return lambda number: choose_layers(area, height, number, None, num_layers)[0] or number
 
 

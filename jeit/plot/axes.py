@@ -1,4 +1,4 @@
-"""Axes: of plane pictures, no ticks but a scale bar and a colour bar; of graphs, no more lines than needed."""
+"""Style of axes: plane pictures have a scale bar and a colour bar in place of ticks, graphs few lines."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SOFT = "#8b9098"
 # Red is more conductive, blue more resistive; white is no change.
 DIVERGING = "RdBu_r"
 SEQUENTIAL = "viridis"
-# Of series drawn side by side: up to six methods.
+# Colours of series drawn side by side: up to six methods.
 SERIES_COLOURS = ("#1f6fb4", "#d1495b", "#2a9d6f", "#8a5cb8", "#d98a1c", "#5b6470")
 SERIES_MARKERS = ("o", "s", "^", "D", "v", "P")
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
@@ -31,7 +31,7 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes
     return pyplot.subplots(figsize=size, layout="constrained")[1]
 
 
-# Over the size of a body: how far numbers stand from it, and how long a digit is in a small picture.
+# Distance of numbers from a body, and length of a digit in a small picture, over the size of the body.
 _AWAY, _LETTER = 0.04, 0.021
 
 
@@ -60,7 +60,7 @@ def extent_of(points: np.ndarray) -> tuple[float, float, float, float]:
 
 
 def soften_axes(ax: Axes) -> None:
-    """Of a graph: lines at the left and below only, in grey, and labels of the ticks in ink."""
+    """Style the axes of a graph: lines at the left and below only, in grey, and labels of the ticks in ink."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_color(SOFT)
     ax.tick_params(color=SOFT, labelcolor=INK, which="both")

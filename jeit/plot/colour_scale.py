@@ -1,4 +1,4 @@
-"""Colour scales: which values get which colours, and what the colour bar says of them."""
+"""Colour scales: the map from values to colours, and the label of the colour bar."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from jeit.plot.axes import DIVERGING, SEQUENTIAL, draw_colour_bar, prefixed
 
 
 class ColourScale(eqx.Module):
-    """How values become colours.
+    """Map from values to colours.
 
     **Fields**
 
     - `difference`: values are changes, drawn on a diverging map centred at zero; otherwise on a perceptually uniform
       sequential one, from the least to the greatest.
-    - `quantity`: what the colour bar says, the conductivity or its change unless given.
+    - `quantity`: label of the colour bar, the conductivity or its change unless given.
     - `unit`: of the values, that of the conductivity unless given ("S" of a sheet, "S/m" of a body), "" for none; the
       colour bar finds the prefix.
     - `limit`: value at the end of the colour bar, in `unit`; the largest magnitude drawn unless given.

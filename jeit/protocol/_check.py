@@ -1,4 +1,4 @@
-"""Checks of patterns, with errors that say what to do."""
+"""Checks of patterns, currents and indices, with errors that say what to do."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def check_indices(index, size: int, name: str, of: str) -> None:
 
 
 def check_current(current, where: str) -> None:
-    """One amplitude in amperes, positive, and not milliamperes by mistake."""
+    """Check one amplitude in amperes: positive, and not milliamperes by mistake."""
     if not has_values(current):
         return
     value = np.asarray(current)

@@ -18,7 +18,7 @@ from jeit.protocol.patterns import Current
 from jeit.protocol.potentials import Reading, measurement_patterns
 from jeit.protocol.protocol import Protocol
 
-# Patterns of a difference that tell less than this of the best: rounding.
+# Patterns whose effect is a smaller share than this of the best one's are rounding.
 _NOTHING = 1e-12
 
 
@@ -31,9 +31,9 @@ def trigonometric(
 ) -> Protocol:
     """Sinusoidal currents in all electrodes at once: L - 1 drives, L(L - 1) channels.
 
-    Drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L and amplitude `current` in amperes: the
-    patterns that best tell a centred inclusion in a disk (Isaacson 1986; Gisser, Isaacson and Newell 1988).
-    16 electrodes: 240. On a solid θ goes by the electrodes' numbers: complete, but no longer the best.
+    Drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L and amplitude `current` in amperes: the patterns
+    that best distinguish a centred inclusion in a disk (Isaacson 1986; Gisser, Isaacson and Newell 1988). 16
+    electrodes: 240. On a solid θ goes by the electrodes' numbers: complete, but no longer the best.
 
     - `measurement`, `reference`: as in `measurement_patterns`.
 
@@ -87,7 +87,7 @@ def optimal(
     reference: int | None = None,
     current: Current = 1e-3,
 ) -> Protocol:
-    """The currents that best tell two bodies apart, best first: at most L - 1 drives.
+    """The currents that best distinguish two bodies, best first: at most L - 1 drives.
 
     - `transfer`, `other`: (L, L) ohm, the transfer impedances of both bodies (`ForwardModel.transfer_impedance`, or
       measured: `jeit.data.transfer_impedance`). Without `other`, the eigenvectors of `transfer` itself.
@@ -136,7 +136,7 @@ def optimal(
 
 
 def _for_power(dissipated, change, power: float, alone: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Directions and how much they tell, best first, for a given power."""
+    """Directions and their squared distinguishability, best first, for a given power."""
     if alone:
         raise ValueError("power needs other: with one body alone the currents for a given power are those of no power.")
     if isinstance(power, bool) or not isinstance(power, int | float) or not 0 < power < np.inf:

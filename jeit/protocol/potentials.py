@@ -1,4 +1,4 @@
-"""What is made of the potentials of all electrodes, where an instrument reads them all at once."""
+"""Measurement patterns for instruments that read the potentials of all electrodes at once."""
 
 from __future__ import annotations
 

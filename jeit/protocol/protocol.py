@@ -158,11 +158,11 @@ class Protocol(eqx.Module):
         )
 
     def repeated_facts(self, channels: ArrayLike | None = None) -> int:
-        """How many channels, of all or of these (K,) indices, say nothing that others of their drive do not say.
+        """Number of channels, of all or of these (K,) indices, that are linear combinations of others of their drive.
 
-        Where readings are computed from the potentials of many electrodes, less their mean say, L of them hold L - 1
-        facts, and their noise as many. Where a drive is read by differences of two electrodes alone, these are taken
-        for measured one by one, each with noise of its own, though they may close a ring.
+        Where readings are computed from the potentials of many electrodes, such as less their mean, L of them hold L -
+        1 independent values, and their noise as many. Where a drive is read by differences of two electrodes alone,
+        these are taken for measured one by one, each with noise of its own, though they may close a ring.
         """
         rows = np.asarray(self.measurement)
         kept = np.arange(self.num_measurements) if channels is None else np.asarray(channels)

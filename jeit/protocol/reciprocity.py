@@ -53,7 +53,8 @@ def transfer_between_drives(
     mask: np.ndarray,
     deviation: np.ndarray | None = None,
 ) -> tuple[Inexact[np.ndarray, "F S S"], Bool[np.ndarray, "S S"], Float[np.ndarray, "S S"]]:
-    """What every drive pattern would read while every other drive flows: symmetric for any body.
+    """Voltage that every drive pattern, used as a measurement, reads while every other drive flows: symmetric for any
+    body.
 
     `voltages` (F, M) volts and `mask` (M,) usable channels; `deviation` (M,) of each channel's independent noise, one
     volt unless given; the other arguments are those of `Protocol`.

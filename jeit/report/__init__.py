@@ -1,5 +1,5 @@
-"""What is told of results, and all that is written to a folder: measurements, images, streams, compared rules,
-calibrations of microphones, tracks, layouts, studies, learnt skins, gestures, watched skins, networks that image."""
+"""Reports of results and the files written to a folder: measurements, images, streams, compared rules, calibrations of
+microphones, tracks, layouts, studies, learnt skins, gestures, watched skins, networks that image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every rule for the hyperparameter chose on a measured difference, on disk: a picture and a report."""
+"""Files of compared rules for the hyperparameter on a measured difference: a picture and a report."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def draw_choice(result: ComparedRules):
 
 
 def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
-    """One rule's image on a scale of its own; inclusions are marked where there are few enough to tell apart."""
+    """One rule's image on a scale of its own; inclusions are marked where there are few enough to be distinguished."""
     from jeit.plot import ColourScale, plot_image
     from jeit.plot.axes import INK
     from jeit.plot.imaging.hyperparameter import COLOURS
@@ -72,7 +72,7 @@ def _draw_scale(ax, largest: float, unit: str) -> None:
 
 
 def report_choice(result: ComparedRules) -> dict[str, Any]:
-    """All that was found, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    """Report of the comparison as plain numbers, strings, lists and dictionaries; unknown values are None."""
     prepared, settings = result.prepared, result.settings
     unit = "S" if prepared.mesh.dimension == 2 else "S/m"
     rules = []

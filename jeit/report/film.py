@@ -1,4 +1,4 @@
-"""A stream as a film: a small GIF, or an MP4 where ffmpeg is installed."""
+"""Films of streams: a small GIF, or an MP4 where ffmpeg is installed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jeit.mesh import Mesh
 FILMS = (".gif", ".mp4")
 FILM_FRAMES = 120
 """Frames of a film at most."""
-# In a second at most, and where the stream's rate is not known.
+# Frames per second: the greatest number, and the one used where the stream's rate is not known.
 _FASTEST, _PACE = 25.0, 10.0
 
 

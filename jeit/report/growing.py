@@ -1,4 +1,4 @@
-"""What a stream of any length leaves on disk while it goes on, in memory that does not grow with it."""
+"""Files that grow with a stream of any length, in memory that does not grow with it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class GrowingTable:
         self.write(columns)
 
     def write(self, row: Iterable[Any]) -> None:
-        """One line, in one piece."""
+        """Write one line, in one piece."""
         text = io.StringIO()
         csv.writer(text).writerow(row)
         line = text.getvalue().encode("utf-8", "backslashreplace")
@@ -62,12 +62,12 @@ class GrowingRows:
         self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (closed by the context that this is)
 
     def append(self, row: Float[np.ndarray, "*shape"]) -> None:
-        """One more row."""
+        """Append one more row."""
         self._file.write(np.asarray(row, np.float32).tobytes())
         self.number += 1
 
     def read(self, numbers: Iterable[int]) -> Float[np.ndarray, "k *shape"]:
-        """Some of the rows, after the last has been appended."""
+        """Read some of the rows, after the last has been appended."""
         size, rows = 4 * int(np.prod(self.shape)), []
         for number in numbers:
             self._file.seek(size * number)
@@ -133,5 +133,5 @@ class Sample:
         self._number += 1
 
     def values(self) -> Float[np.ndarray, " k"]:
-        """Those that are kept."""
+        """The values that are kept."""
         return np.array(self._values)

@@ -1,4 +1,4 @@
-"""What is left of an imaged difference on disk: a picture, arrays, and a report."""
+"""Files of an imaged difference: a picture, arrays, and a report."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
 
 
 def _arrays(result: ImagedDifference) -> dict[str, Any]:
-    """What the NPZ holds."""
+    """Arrays of the NPZ."""
     arrays: dict[str, Any] = {
         "raster": np.asarray(result.raster),
         "extent": np.asarray(result.extent),
@@ -72,8 +72,8 @@ def _arrays(result: ImagedDifference) -> dict[str, Any]:
 
 
 def _drawn(result: ImagedDifference) -> np.ndarray:
-    """What the picture shows in every cell: iterative images reach from a hundredth to a hundred times the background,
-    and on the scale of the logarithm both show."""
+    """Values of the picture in every cell: iterative images, which range from a hundredth to a hundred times the
+    background, are drawn on a logarithmic scale."""
     return np.asarray(result.departure) / (math.log(10) if result.iterative else 1)
 
 
@@ -126,7 +126,8 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
 
 
 def report_image(result: ImagedDifference) -> dict[str, Any]:
-    """All that was found and decided, as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    """Report of the image and the settings as plain numbers, strings, lists and dictionaries; unknown values are
+    None."""
     reconstruction, quality, settings = result.reconstruction, result.quality, result.settings
     noise = quality.difference_noise
     content = {
@@ -179,7 +180,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
 
 
 def _frame(result: ImagedDifference) -> dict[str, Any]:
-    """Which frame of how many was imaged: its name, or its number from 0 where it has none."""
+    """The frame that was imaged, of how many: its name, or its number from 0 where it has none."""
     names = result.measurement.frame_names
     return {"frame": names[0] if names else result.frame, "frames": result.num_frames}
 
@@ -274,7 +275,7 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
 
 
 def _form(body: Star | Ellipsoid) -> dict[str, Any]:
-    """What its kind has: the outline of a star, the half axes of an ellipsoid or a column."""
+    """Values of a body's form: the outline of a star, the half axes of an ellipsoid or a column."""
     if isinstance(body, Star):
         return {"area": body.area, "outline": body.outline}
     form = "column" if body.column else "ellipsoid"
@@ -282,7 +283,7 @@ def _form(body: Star | Ellipsoid) -> dict[str, Any]:
 
 
 def _evidence_text(body: Star | Ellipsoid) -> str:
-    """Where the conductivity of a body is from."""
+    """Source of the conductivity of a body, in words."""
     if not body.contrast_is_determined:
         return "assumed, as of what is strong"
     if isinstance(body, Ellipsoid) and body.alike:

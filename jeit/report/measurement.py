@@ -1,4 +1,4 @@
-"""What a measured file holds, and how good it is, as plain numbers and words."""
+"""Report of a measured file: its content and quality, as plain numbers and words."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from jeit.imaging import imaging_mesh
 from jeit.imaging.wiring import MOST_MISFIT, find_wiring
 from jeit.report.folder import describe_domain, describe_electrodes, describe_measurement, plain
 
-# Of the mesh on which wirings are compared.
+# Number of nodes of the mesh on which wirings are compared.
 _NODES = 1000
 
 
 def report_measurement(measurement: Measurement) -> dict[str, Any]:
-    """What `jeit info` prints: frames, body, electrodes, protocol and noise of a measurement, in SI units; what is not
-    known is None."""
+    """Report that `jeit info` prints: frames, body, electrodes, protocol and noise of a measurement, in SI units; what
+    is not known is None."""
     protocol, noise, signs = measurement.protocol, estimate_noise(measurement), impossible_signs(measurement)
     content = {
         **describe_measurement(measurement),
@@ -43,7 +43,7 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
 
 
 def _wiring(measurement: Measurement) -> str | None:
-    """How electrodes and channels seem to be wired, from the reference, or else the first frame; None where the file
+    """Estimated wiring of electrodes and channels, from the reference, or else the first frame; None where the file
     does not say where electrodes are."""
     domain, electrodes = measurement.domain, measurement.electrodes
     if domain is None or electrodes is None:

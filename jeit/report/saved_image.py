@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jeit.plot import Camera, ColourScale
 
 _GIVE = "give the image.npz that jeit reconstruct writes"
-# What a file is instead of an image, by the end of its name.
+# Kinds of files that are no images, by the end of their names.
 _OTHERS = {
     "a table of data, which is to be imaged first": (".csv", ".txt", ".mat", ".eit", ".get", ".npy"),
     "a picture, which any viewer shows": (".png", ".gif", ".mp4", ".jpg", ".jpeg", ".svg", ".pdf"),
@@ -54,7 +54,7 @@ _KEPT = (
 
 @dataclass(frozen=True)
 class SavedImage:
-    """What an `image.npz` holds of a body and the image of it.
+    """Content of an `image.npz`: a body and its image.
 
     **Fields**: `mesh`; `change` (m,) of conductivity in every cell, S/m (of a sheet S), complex of admittivity;
     `background`, what it is a change of, None where the file does not say; `departure` (m,), the logarithm to the base
@@ -71,7 +71,7 @@ class SavedImage:
 
     @property
     def unit(self) -> str:
-        """Of conductivity."""
+        """Unit of conductivity."""
         return "S" if self.mesh.dimension == 2 else "S/m"
 
 
@@ -251,7 +251,8 @@ def write_views(
 
 
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
-    """What is drawn of an image, per cell, and its scale: the departure of iterative ones, real parts of complex."""
+    """Values per cell that are drawn of an image, and their scale: the departure of iterative images, the real part of
+    complex ones."""
     from jeit.plot.colour_scale import CHANGE, LOGARITHM, ColourScale
 
     if image.departure is not None:

@@ -1,4 +1,4 @@
-"""What is left of a series of images on disk: curves of regions, maps of amplitude and phase, a picture and a film."""
+"""Files of a series of images: curves of regions, maps of amplitude and phase, a picture and a film."""
 
 from __future__ import annotations
 

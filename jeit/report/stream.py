@@ -1,4 +1,4 @@
-"""What is left of a stream on disk: a line and an image for every frame as it comes, and at the end pictures."""
+"""Files of a stream: a line and an image for every frame as it arrives, and pictures at the end."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from jeit.report.folder import results_folder
 from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_is_left
 
 PICTURES = ("contact sheet", "film")
-"""What is drawn of a stream, by the names that are told."""
+"""Pictures of a stream, by the names that are passed to `drawing`."""
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
 _NOTHING = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
-# Share of the background at the end of a colour scale on which nothing is to be seen.
+# Least end of a colour scale, as a share of the background, so that noise alone stays invisible.
 _FAINT = 0.01
 # Refused frames that are named beneath the sheet, at most.
 _NAMED = 8
@@ -32,9 +32,9 @@ _NAMED = 8
 
 @dataclass(frozen=True)
 class WrittenStream:
-    """What `write_stream` has written: the `number` of frames, `counts` of them by status, the `latency` in seconds of
-    those that were imaged, (K,), of long streams some of them, evenly chosen, and of the others the `first_reason`,
-    empty if there is none."""
+    """Result of `write_stream`: the `number` of frames, `counts` of them by status, the `latency` in seconds of those
+    that were imaged, (K,), of long streams some of them, evenly chosen, and of the others the `first_reason`, empty if
+    there is none."""
 
     number: int
     counts: dict[str, int]
@@ -101,7 +101,7 @@ def write_stream(
 
 
 class _Seen:
-    """What is kept of the frames of a stream, whose number may be any."""
+    """Values kept of the frames of a stream, of which there may be any number."""
 
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
@@ -133,7 +133,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Pictures:
-    """Which are drawn into a folder, and who is told."""
+    """Pictures to draw into a folder, and the function that progress is reported to."""
 
     folder: Path
     film: str | None

@@ -1,4 +1,4 @@
-"""Images for other programs to look into: VTU, a series of them in time (PVD), and XDMF."""
+"""Files of images for other programs: VTU, a series of them in time (PVD), and XDMF."""
 
 from __future__ import annotations
 

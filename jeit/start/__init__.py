@@ -1,5 +1,5 @@
-"""What importing jeit sets up in JAX: double precision, a place where compiled code is kept between runs, flags of
-its compiler, and what happens in forked processes."""
+"""Set-up of JAX on importing jeit: double precision, a place where compiled code is kept between runs, flags of its
+compiler, and what happens in forked processes."""
 
 from __future__ import annotations
 

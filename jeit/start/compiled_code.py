@@ -1,4 +1,4 @@
-"""A place where compiled code is kept between runs: which, for whom, and how much."""
+"""Cache of compiled programs between runs: its folder, its keys and its size."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def keep_compiled_code() -> None:
     """Keep compiled programs in the user's cache folder, so that a program is compiled once on a machine, not in every
     process.
 
-    Does nothing if the user has told JAX where to keep them (`JAX_COMPILATION_CACHE_DIR`, or
-    `jax_compilation_cache_dir`), if `JEIT_COMPILATION_CACHE` is "off", or where no folder can be written to. JAX looks
-    programs up by their text and by its own and the compiler's versions. Those used longest ago go when there are
-    thousands, or a quarter of a gigabyte.
+    Does nothing if the user has set where JAX keeps them (`JAX_COMPILATION_CACHE_DIR`, or `jax_compilation_cache_dir`),
+    if `JEIT_COMPILATION_CACHE` is "off", or where no folder can be written to. JAX looks programs up by their text and
+    by its own and the compiler's versions. Those used longest ago go when there are thousands, or a quarter of a
+    gigabyte.
     """
     given = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     asked = os.environ.get("JEIT_COMPILATION_CACHE", "").strip().lower()
@@ -67,8 +67,8 @@ def _processor() -> str:
 
 
 def _discard_oldest(folder: Path) -> None:
-    """Of the files, as far as they are too many; and those that nothing was written to, as on a full disk: JAX would
-    fail to read them ever after."""
+    """Remove the oldest files where there are too many, and empty ones, as are left by a full disk, which JAX would
+    fail to read."""
     kept = sorted(_used(folder), reverse=True)
     size = 0
     for number, (_, bytes_taken, path) in enumerate(kept):

@@ -1,4 +1,4 @@
-"""What importing jeit sets up in JAX: double precision, compiler flags, and what happens in forked processes."""
+"""Set-up of JAX on importing jeit: double precision, compiler flags, and what happens in forked processes."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import jax
 
 
 def take_double_precision() -> None:
-    """A light touch changes voltages by 1e-4, for which single precision is not enough. A user who has set
-    JAX_ENABLE_X64 has decided already, and is warned of what single precision costs (docs/numerics.md)."""
+    """Set JAX to double precision: a light touch changes voltages by 1e-4, for which single precision is not enough.
+    JAX_ENABLE_X64 set by the user takes precedence, with a warning of the cost of single precision
+    (docs/numerics.md)."""
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", True)
     elif not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
@@ -39,9 +40,9 @@ _refusing = False
 
 
 def refuse_compiled_code_in_forks() -> None:
-    """See to it that compiled code raises `RuntimeError` in processes that `os.fork` makes once JAX has started: its
-    threads are not in them, so that a program would wait for ever. What NumPy answers is answered; and where a process
-    forks before JAX has started, all works."""
+    """Make compiled code raise `RuntimeError` in processes that `os.fork` makes once JAX has started: its threads are
+    not in them, so that a program would wait for ever. Methods that run in NumPy still work; and where a process forks
+    before JAX has started, everything works."""
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=_forked)
 
@@ -62,7 +63,7 @@ def _has_started() -> bool:
 
 
 def _refuse(event: str, duration_secs: float, **_: str | int) -> None:
-    """A listener to what JAX tells of its work: tracing ends before a program is compiled."""
+    """A listener to JAX's monitoring events: raises before a program is compiled, after tracing."""
     del duration_secs
     if event.startswith("/jax/core/compile"):
         raise RuntimeError(

@@ -1,4 +1,5 @@
-"""What `jax.vmap` does to the direct solver: matrices go one after the other on a CPU, right-hand sides all at once.
+"""Batching rules of the direct solver under `jax.vmap`: matrices one after the other on a CPU, right-hand sides all at
+once.
 
 A batch of factorisations side by side streams all of the batch through memory at every stage, and takes more than
 twice as long per matrix as one that stays in the cache. Accelerators do get the whole batch at once.

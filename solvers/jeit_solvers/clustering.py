@@ -21,7 +21,7 @@ from jeit_solvers.engines import has_values
 
 
 class KMeans(eqx.Module):
-    """What k-means found.
+    """Result of k-means.
 
     `centres` (k, d), the means of the clusters; `labels` (n,), which cluster each point belongs to; `inertia`, the sum
     of the squared distances of points to their centres; of the restart that is kept, the `steps` it took and whether
@@ -87,7 +87,7 @@ def _check_count(name: str, count: int) -> None:
 
 @partial(jax.jit, static_argnums=(3, 4))
 def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int) -> KMeans:
-    # Where a point belongs has no derivative; of means with labels held there is one, and no loop in it.
+    # Labels have no derivative; means with labels held have one, without a loop in it.
     find = in_turn(partial(_best_of_all, num_clusters, restarts))
     best = find(jax.lax.stop_gradient(points), key, stop)
     centres = _means(points, best.labels, best.centres)
@@ -101,7 +101,7 @@ def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int
 
 
 class _State(eqx.Module):
-    """Where Lloyd's algorithm stands: the labels are of the nearest centres, at squared `distance` (n,)."""
+    """State of Lloyd's algorithm: the labels are of the nearest centres, at squared `distance` (n,)."""
 
     centres: Float[Array, "k d"]
     labels: Int[Array, " n"]

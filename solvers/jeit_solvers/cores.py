@@ -1,4 +1,4 @@
-"""Long work of many equal parts, shared between the cores of a machine.
+"""Parallel work of many equal parts, shared between the cores of a machine.
 
 XLA spreads one product of large matrices over all cores, but runs gathers, sums and small products of a compiled loop
 on one; two loops side by side, each on a thread of its own, keep two cores busy. So does NumPy, whose products alone
@@ -24,12 +24,12 @@ from jaxtyping import Array, Int
 
 # Threads at most, that work in NumPy side by side: each takes memory of its own, and they share the memory's bandwidth.
 _MOST_THREADS = 4
-# What names of our threads begin with.
+# Prefix of the names of our threads.
 _NAME = "jeit-core"
 
 
 def number_of_cores() -> int:
-    """Of those that this process may use."""
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -51,7 +51,7 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], number: int,
 def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     """`function` of each of some parts, in NumPy, side by side on every core; it puts what it makes in place.
 
-    One part, and what is asked for by a part of other work, is done at once. NaN is told of elsewhere: nothing warns.
+    One part, and what is asked for by a part of other work, is done at once. NaN is reported elsewhere: nothing warns.
     """
 
     def quietly(part: Any) -> None:

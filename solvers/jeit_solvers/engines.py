@@ -1,4 +1,4 @@
-"""One formula, two engines: NumPy where values are at hand, JAX where they are traced, batched or differentiated.
+"""One formula for two engines: NumPy where values are known, JAX where they are traced, batched or differentiated.
 
 JAX traces and compiles a program before it runs, which takes seconds; NumPy runs at once, and is as quick on large
 arrays. So what is asked for once runs in NumPy, and what is asked for a thousand times, or differentiated, in a
@@ -22,7 +22,7 @@ from jaxtyping import Array, Inexact, Int, Shaped
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _PROCESS = os.getpid()
-# So small that its square is nothing beside any number.
+# Complex step, so small that its square vanishes beside any number.
 _COMPLEX_STEP = 1e-100
 
 
@@ -77,7 +77,7 @@ def as_array(values: Any, dtype: Any = None) -> Array:
 
 
 def at_once(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """What `function` returns of arrays that have values, worked out in NumPy."""
+    """Result of `function` for arrays that have values, computed in NumPy."""
     arguments, named = on_host((arguments, named))
     with np.errstate(all="ignore"):  # JAX says nothing of them either
         return function(*arguments, **named)
@@ -126,7 +126,7 @@ class Recent:
         self._kept: list[tuple[list[Any], Any, Any]] = []
 
     def __call__(self, *trees: Any) -> Any:
-        """What `make` returns of these, or has returned."""
+        """The result of `make` for these arguments, computed or remembered."""
         leaves, structure = jax.tree.flatten(trees)
         for known, kind, result in reversed(self._kept):
             if kind == structure and all(one is other for one, other in zip(known, leaves, strict=True)):
@@ -142,7 +142,7 @@ def undifferentiated(values: Any) -> Any:
 
 
 def kept(values: Any) -> Any:
-    """The same pytree of arrays, worked out once: XLA may else work them out anew wherever they are used."""
+    """The same pytree of arrays, computed once: otherwise XLA may compute them again wherever they are used."""
     return values if namespace(values) is np else jax.lax.optimization_barrier(values)
 
 
@@ -184,7 +184,7 @@ def _complex_step(function, x, row: int) -> tuple[Any, Any]:
 
 
 def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
-    """What `function` returns at x (n, F), and its derivatives along each of the n rows; columns are independent.
+    """Values of `function` at x (n, F), and its derivatives along each of the n rows; columns are independent.
 
     In NumPy by complex steps (Squire and Trapp, SIAM Rev. 40, 1998, 110-112), exact to rounding: the function must be
     analytic. In JAX by forward differentiation.

@@ -9,8 +9,8 @@ import pytest
 from scipy.ndimage import label
 
 from jeit.arguments import counted
-from jeit.cli.applications import NETWORK
 from jeit.cli.console import in_one_unit
+from jeit.cli.options import NETWORK
 from jeit.data import read, write_table
 from jeit.imaging import METHODS, StreamSettings
 from jeit.imaging.settings import AUTO

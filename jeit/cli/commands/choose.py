@@ -1,4 +1,4 @@
-"""`jeit choose`: what every rule for the hyperparameter chooses on a measured file, and what comes of it."""
+"""`jeit choose`: the hyperparameter that every rule chooses for a measured file, and the images for them."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def choose(
 
 
 def show(console, result: "ComparedRules") -> None:
-    """Print a row for every rule, and what speaks against its choice."""
+    """Print a row for every rule, and the reason to doubt its choice."""
     from rich.table import Table
 
     from jeit.arguments import percent

@@ -1,4 +1,4 @@
-"""`jeit info`: what a file holds, and how good it is."""
+"""`jeit info`: the content and quality of a data file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import typer
 
 from jeit.cli.options import Description, Format, read_file
 
-# What a solid on an outline is called, and its sizes where a description has other words for them.
+# Names of solids on an outline, and of their sizes where a description uses other words for them.
 _SOLIDS = {
     "rectangle": ("box", {"height": "depth", "thickness": "height"}),
     "disk": ("cylinder", {"thickness": "height"}),

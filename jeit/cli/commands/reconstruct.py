@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.cli.applications import NETWORK, check_method, image_by_network
+from jeit.cli.applications import check_method, image_by_network
 from jeit.cli.options import (
+    NETWORK,
     AsIs,
     Contact,
     Data,
@@ -157,7 +158,7 @@ def reconstruct(
 
 
 def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
-    """Print what was found; `asked`: of a frame that was asked for."""
+    """Print the result; `asked`: whether the frame was given by the user."""
     import numpy as np
 
     from jeit.arguments import counted, percent
@@ -218,7 +219,7 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
 
 
 def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
-    """What was fitted as shapes, in half a sentence: outlines in a sheet, surfaces in a solid."""
+    """The bodies fitted as shapes, in half a sentence: outlines in a sheet, surfaces in a solid."""
     from jeit.arguments import counted, percent
     from jeit.inverse.shapes import Ellipsoid
 
@@ -235,12 +236,12 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
 
 
 def _which(result: "ImagedDifference", asked: bool) -> str:
-    """Which frame of how many was imaged, and how to image others."""
+    """The frame that was imaged, of how many, and how to image others."""
     names = result.measurement.frame_names
     said = f"{names[0]!r}, " if names else ""
     said += f"{result.frame} of {result.num_frames}"
     if asked:
         return said
-    # Frames with names are of different things: nobody wants their mean.
+    # Frames with names are of different things, whose mean is not useful.
     mean = "" if names else ', or their mean: frames = "mean" in [data] of the description'
     return f"{said}, from 0; --frame takes another{mean}"

@@ -1,4 +1,5 @@
-"""`jeit series`: every frame of a recording at once; what regions do over time, and what oscillates where."""
+"""`jeit series`: images of every frame of a recording at once; curves of regions over time, and maps of
+oscillations."""
 
 from __future__ import annotations
 

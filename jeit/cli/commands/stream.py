@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from jeit.cli.applications import NETWORK, check_method, image_by_network
+from jeit.cli.applications import check_method, image_by_network
 from jeit.cli.options import (
+    NETWORK,
     AsIs,
     Contact,
     Description,

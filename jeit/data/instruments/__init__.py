@@ -1,5 +1,5 @@
-"""Readers of what instruments write: a file each, from what is published of its format.
+"""Readers of instruments' files, one module for each format, from what is published of it.
 
 None of these files says where electrodes are: a description beside it (`[geometry]`, `[electrodes]`) does. What is not
-published, the scale of the numbers say, is a note of the measurement.
+published, such as the scale of the numbers, is stated in a note of the measurement.
 """

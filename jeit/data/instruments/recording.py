@@ -26,7 +26,7 @@ _IN_MEMORY = 4
 
 @dataclass(frozen=True)
 class Recording:
-    """What a file holds.
+    """Content of an instrument's file.
 
     - `voltages` (F, M), real or complex; `protocol` of M channels; `usable` (M,), None for all.
     - `times` (F,) seconds, or None; `frame_names`, empty or one a frame; `notes`: what the format leaves open.
@@ -41,7 +41,7 @@ class Recording:
 
 
 def content_of(path: Path) -> bytes:
-    """All of a file, of a size that fits in memory. Raises `TooLarge`."""
+    """Content of a file whose size fits in memory. Raises `TooLarge`."""
     check_memory(path.name, _IN_MEMORY * path.stat().st_size)
     return path.read_bytes()
 
@@ -77,7 +77,7 @@ def measurement_of(path: Path, recording: Recording, described: Description) -> 
 
 
 def frame_at(content: bytes, start: int, size: int, path: Path) -> tuple[int, int]:
-    """How many whole frames of `size` bytes follow `start`, and how many bytes are left over.
+    """Number of whole frames of `size` bytes that follow `start`, and number of bytes left over.
 
     Raises `ValueError` where there is none.
     """
@@ -103,7 +103,7 @@ _CURRENT_NOTE = "a current of 5 mA is assumed; the file does not say it."
 def adjacent_recording(
     values: Float[np.ndarray, "F 208"], times: Float[np.ndarray, " F"] | None, notes: tuple[str, ...]
 ) -> Recording:
-    """Of positive voltages in that order. Channels that are zero in every frame were not measured."""
+    """Recording of positive voltages in that order. Channels that are zero in every frame were not measured."""
     usable = (values != 0).any(axis=0)
     if not usable.all() and usable.any():
         notes = (*notes, f"{int((~usable).sum())} of {CHANNELS} channels were not measured (zero in every frame).")

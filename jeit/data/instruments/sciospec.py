@@ -171,7 +171,7 @@ def _recording(
         raise ValueError(f"{path.name}: its current is {header.current:g} A; it must be positive, and at most 1.")
     drive, every = np.zeros((len(index), len(numbers))), np.arange(len(index))
     drive[every, index[:, 0]], drive[every, index[:, 1]] = header.current, -header.current
-    # Which of the two the current enters, the body says: it takes power.
+    # The electrode that the current enters follows from the sign of the power, which the body takes up.
     notes: list[str] = [*_NOTES]
     if np.median(np.einsum("sl,sfl->sf", drive, np.nan_to_num(np.real(potentials)))) < 0:
         drive = -drive

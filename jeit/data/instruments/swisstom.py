@@ -20,7 +20,7 @@ DESCRIPTION = "Swisstom BB2, Pioneer (.eit, format 4): 32 electrodes, skip 4, co
 _ELECTRODES, _SKIPPED, _FORMAT = 32, 4, 4
 # Bytes before a frame's content, and in it before the voltages; numbers of these; where the time is.
 _HEAD, _BEFORE, _NUMBERS, _TIME = 16, 60 + 12 + 256, 2 * _ELECTRODES**2, 16
-# Of four bytes a microsecond each.
+# Range of a counter of microseconds of four bytes.
 _ROUND = 2**32
 # Volts for the number 1, by those who have read these files: a guess.
 _SCALE = 2.048 / (2**20 * 360 * 1000)

@@ -1,8 +1,7 @@
-"""Solutions of the conductivity equation in closed form or by series: what the forward model is held to.
+"""Solutions of the conductivity equation in closed form or by series, for verification of the forward model.
 
-They are plain NumPy, and none knows of finite elements: agreement with the forward model is an agreement of
-two methods.
-All lengths in metres, currents in amperes, sheet conductivity in siemens, that of solids in siemens per metre;
+They are plain NumPy, and use no finite elements: agreement with the forward model is an agreement of two methods. All
+lengths in metres, currents in amperes, sheet conductivity in siemens, that of solids in siemens per metre;
 admittivities and contact impedances may be complex.
 """
 

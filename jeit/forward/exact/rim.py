@@ -50,7 +50,7 @@ class ConductingDisk:
     inclusion_conductivity: complex = 1.0
 
     def inclusion_kernel(self, angle: np.ndarray) -> np.ndarray:
-        """What the inclusion adds to the kernel N at angular distance `angle`, in ohm."""
+        """Contribution of the inclusion to the kernel N at angular distance `angle`, in ohm."""
         angle = np.asarray(angle, dtype=float)
         if self.inclusion_ratio == 0.0:
             return np.zeros_like(angle)
@@ -82,7 +82,7 @@ def point_transfer_impedance(disk: ConductingDisk, angles: np.ndarray) -> np.nda
 
 
 def point_inclusion_effect(disk: ConductingDisk, angles: np.ndarray) -> np.ndarray:
-    """What the inclusion adds to `point_transfer_impedance`: (L, L), finite on the diagonal too."""
+    """Contribution of the inclusion to `point_transfer_impedance`: (L, L), finite on the diagonal too."""
     return disk.inclusion_kernel(angles[:, None] - angles[None, :])
 
 

@@ -7,7 +7,7 @@ with
     w_n = (P_{n−1}(cos α) − P_{n+1}(cos α)) / ((2n+1)(1 − cos α)),
 
 the mean of P_n over the cap; by the addition theorem the mean of P_n(cos γ) over another cap is w_n P_n of the angle
-between them. What contact impedances do is told in `jeit.forward.exact.cylinder`.
+between them. The effect of contact impedances is described in `jeit.forward.exact.cylinder`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The hyperparameter λ: rules that choose it, the curves they look at, and what all of them say of the same data."""
+"""The hyperparameter λ: rules that choose it, the curves that they use, and their comparison on the same data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What choosing a hyperparameter leaves behind: the λ chosen, how, and the curve that was looked at."""
+"""Result of choosing a hyperparameter: the λ chosen, the rule, and the rule's curve."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from jeit_solvers.engines import as_array
 class Choice(eqx.Module):
     """A hyperparameter λ and how it came about: chosen by a rule on a grid of candidates, or given.
 
-    **Fields**: `hyperparameter` λ; `candidates` (K,), the λ looked at, ascending; `criterion` (K,), what the rule looks
-    at, at every candidate (see the rules in `jeit.inverse.hyperparameter`); `residual` (K,), ‖w (v - Jx)‖ in
+    **Fields**: `hyperparameter` λ; `candidates` (K,), the λ evaluated, ascending; `criterion` (K,), the rule's
+    criterion at every candidate (see the rules in `jeit.inverse.hyperparameter`); `residual` (K,), ‖w (v - Jx)‖ in
     standard deviations, and `penalty` (K,), √(xᵀQx), of the image x at every candidate: the coordinates of the L-curve;
-    `rule`, its name, or "given"; `target`, the value that the criterion is to have, None where the rule takes
-    its least or greatest; `edge`, "smallest" or "largest" where λ is that candidate, so that the rule's own would lie
-    beyond it, else empty.
+    `rule`, its name, or "given"; `target`, the required value of the criterion, None where the rule takes its minimum
+    or maximum; `edge`, "smallest" or "largest" where λ is that candidate, so that the rule's own would lie beyond it,
+    else empty.
 
     A given number is its own only candidate, and its curves are empty, (0,); so are residual and penalty without data.
     """
@@ -34,7 +34,7 @@ class Choice(eqx.Module):
 
     @classmethod
     def given(cls, hyperparameter) -> "Choice":
-        """Of a number that was given."""
+        """Choice of a number that was given."""
         value = as_array(hyperparameter, float)
         nothing = as_array(np.zeros(0))
         return cls(value, as_array(np.reshape(value, 1)), nothing, nothing, nothing, "given")
@@ -43,7 +43,7 @@ class Choice(eqx.Module):
     def among(
         cls, rule: str, candidates, index: int, criterion, curves, *, target: float | None = None, between=None
     ) -> "Choice":
-        """Of candidate number `index`; or of `between`, a λ found between that candidate and the next.
+        """Choice of candidate number `index`, or of `between`, a λ found between that candidate and the next.
 
         `curves`: residual and penalty at every candidate, or empty ones.
         """
@@ -54,7 +54,7 @@ class Choice(eqx.Module):
 
     @property
     def note(self) -> str:
-        """What speaks against the choice, in a sentence; empty when nothing does."""
+        """Reason to doubt the choice, in a sentence; empty when there is none."""
         if not self.edge:
             return ""
         return (

@@ -1,4 +1,4 @@
-"""Which hyperparameter for these data: what one rule chooses, or what all of them do."""
+"""Choice of the hyperparameter for given data by one rule, or by all rules for comparison."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def choose_hyperparameter(
     noise: Float[Array, " M"] | float = 1.0,
     mask: Bool[Array, " M"] | None = None,
 ) -> Choice:
-    """The λ that `one_step` would use with the same arguments, and what it was chosen by, without the image.
+    """Choose the λ that `one_step` would use with the same arguments, without computing the image.
 
     `rule`: a name in `jeit.inverse.RULES`, or a rule: one of `jeit.inverse.hyperparameter` with a setting of its own,
     `functools.partial(noise_figure, target=0.5)`, or your own, a function of (spectrum, data, mesh) to a `Choice`. The
@@ -50,7 +50,8 @@ def compare_rules(
     rules: Mapping[str, Rule] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Choice]:
-    """What every rule chooses for the same data, by name; the problem is decomposed once for all of them.
+    """Choose λ by every rule for the same data; return the choices by name. The problem is decomposed once for all
+    rules.
 
     `rules`: those to compare, `jeit.inverse.RULES` unless given; `progress` is called with the name of each step and
     rule as it begins; other arguments as in `one_step`.

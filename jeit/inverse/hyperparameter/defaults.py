@@ -1,4 +1,4 @@
-"""Which λ is taken where none is given; GREIT and filtered back-projection have scales of their own."""
+"""Default values of λ; GREIT and filtered back-projection have scales of their own."""
 
 from __future__ import annotations
 

@@ -25,8 +25,8 @@ def best_resolution(
     """λ whose point spread functions have the least blur radius, averaged over targets spread through the body.
 
     Without noise the least λ would always be sharpest, so the images of the targets are noisy: each target is strong
-    enough to make the root mean square of its data `signal_to_noise` times the noise. Looks at no data, so that λ
-    belongs to the system and not to the frame: what Graham and Adler, Physiol. Meas. 27 (2006) S65-S79, find by
+    enough to make the root mean square of its data `signal_to_noise` times the noise. No data are used, so that λ
+    depends on the system and not on the frame: what Graham and Adler, Physiol. Meas. 27 (2006) S65-S79, find by
     calibration on a small target in a tank. Criterion: the mean of `blur_radius` over the targets, relative to the size
     of the body. Raises `ValueError` without a mesh, and for settings that are not positive.
     """
@@ -67,7 +67,7 @@ def blur_radius(
     size = np.linalg.norm(signals, axis=0)
     strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(size, np.finfo(float).tiny)
     components = adjoint(np.asarray(spectrum.basis)) @ signals
-    # What the null space sees is imaged whatever λ.
+    # Data in the range of the null space are imaged whatever λ is.
     free = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.seen))
     fixed, fixed_variance = free @ signals, np.sum(abs(free) ** 2, axis=1)
     damping = 1 / (eigenvalues + np.asarray(candidates)[:, None] ** 2)

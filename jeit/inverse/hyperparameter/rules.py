@@ -64,7 +64,7 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     """
     candidates, data = spectrum.candidates(), _needed(data, "gcv")
     residual, penalty = spectrum.curves(data, candidates)
-    # What is repeated is left in no residual, and would be counted among what is: its filter is 1.
+    # Repeated readings leave no residual, but would be counted as if they did: their filter is 1.
     number = len(data) - spectrum.repeated
     score = number * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
     return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))
@@ -111,7 +111,7 @@ def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None
 def noise_figure(
     spectrum: Spectrum, data: ArrayLike | None = None, mesh: Mesh | None = None, *, target: float = 1.25
 ) -> Choice:
-    """λ at which the signal-to-noise ratio of the image is 1 / `target` times that of the data; looks at no data.
+    """λ at which the signal-to-noise ratio of the image is 1 / `target` times that of the data; uses no data.
 
     Signals are drawn from the prior and the noise is white: the ratio of the data is trΛ / r, that of the image
     tr(RJΓJᵀRᵀ) / tr(RRᵀ). Adler and Guardo 1996, with the prior in place of their one central object.
@@ -144,11 +144,10 @@ RULES: dict[str, Rule] = {
 
 
 def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mesh: Mesh | None = None) -> Choice:
-    """λ and how it came about, from a number, the name of a rule, a rule, or a choice made before.
+    """Choice of λ from a number, the name of a rule, a rule, or an earlier choice.
 
-    `spectrum`: a `Spectrum`, which only a rule looks at.
-    Raises `ValueError` for the name of no rule, for a rule where the problem is traced, and for a number that is not
-    positive and finite.
+    `spectrum`: a `Spectrum`, which only rules use. Raises `ValueError` for the name of no rule, for a rule where the
+    problem is traced, and for a number that is not positive and finite.
     """
     if isinstance(hyperparameter, Choice):
         return hyperparameter
@@ -167,7 +166,7 @@ def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mes
 
 
 def _check_problem(problem, name: str) -> None:
-    """A rule looks at values, which a problem that is traced has not."""
+    """Raise `ValueError` for a traced problem, which has no values for a rule to use."""
     instead = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
     check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", instead)
 
@@ -178,7 +177,7 @@ def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
 
 
 def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
-    """Of the L-curve in its parameter t = log λ, from df/dt = 2f(1 - f) for the filter f."""
+    """Curvature of the L-curve in its parameter t = log λ, from df/dt = 2f(1 - f) for the filter f."""
     left, eigenvalues = _filters(spectrum, candidates), np.asarray(spectrum.eigenvalues)
     squared = abs(adjoint(np.asarray(spectrum.basis)) @ data) ** 2
     image = squared * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2  # its sum is the penalty

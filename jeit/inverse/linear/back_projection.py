@@ -1,4 +1,4 @@
-"""Back-projection: the change seen by each channel, smeared over the cells that channel looks at."""
+"""Back-projection: the change of each channel, spread over the cells in the channel's equipotential band."""
 
 from __future__ import annotations
 

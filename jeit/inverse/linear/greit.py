@@ -29,13 +29,14 @@ from jeit.mesh import Mesh, centroids, check_flat, measures
 _EDGE = 0.25
 # Samples of a target along its radius: some fifty of a disc, some sixty of a ball.
 _SAMPLED = {2: 4.0, 3: 2.5}
-# Samples at a time; and how far from a centre they are looked at, in radii: all that are in a ball, and hardly more.
+# Samples at a time; and distance from a centre within which they are searched, in radii: all that are in a ball, and
+# hardly more.
 _AT_ONCE, _CLOSE = 500_000, 1 + 1e-9
 # A training target counts if this share of it lies in the body.
 _INSIDE = 0.9
 # Cells of which a mean is taken, about.
 _ENOUGH = 10_000
-# Smaller targets are alike in a linear model, and cost points to sample them with.
+# Least size of targets: smaller ones give the same in a linear model, but need more points to be sampled.
 _LEAST = 0.01
 
 
@@ -60,12 +61,13 @@ def greit(
     divided by √(number of targets).
 
     `radius` of the desired images and `target_radius` of the targets: fractions of the body's radius, that of the disc
-    with its area (3-D: of the ball with its volume). `radius` is 1/√L unless given, 0.25 for 16 electrodes; smaller
-    buys resolution with ringing and noise. `hyperparameter`: λ itself, or "noise-figure": the λ at which the
-    signal-to-noise ratio of the data is `noise_figure` times that of the image, for a target in the middle of the body;
-    0.5 is what GREIT's authors agreed on. Signal is the mean absolute value, over channels in units of their noise and
-    over the body; noise is the root mean square standard deviation. `noise`: standard deviation of the channels, W =
-    noise⁻²; one number or (M,), in volts (or relative to each other). `mask`: True for the channels to use.
+    with its area (3-D: of the ball with its volume). `radius` is 1/√L unless given, 0.25 for 16 electrodes; a smaller
+    radius gives better resolution, with more ringing and noise. `hyperparameter`: λ itself, or "noise-figure": the λ at
+    which the signal-to-noise ratio of the data is `noise_figure` times that of the image, for a target in the middle of
+    the body; 0.5 is what GREIT's authors agreed on. Signal is the mean absolute value, over channels in units of their
+    noise and over the body; noise is the root mean square standard deviation. `noise`: standard deviation of the
+    channels, W = noise⁻²; one number or (M,), in volts (or relative to each other). `mask`: True for the channels to
+    use.
 
     Raises `ValueError` for arguments that do not fit, and for a noise figure that no λ reaches.
     """
@@ -87,7 +89,7 @@ def greit(
     body_radius, middle = _radius(float(measure.sum()), mesh.dimension), measure @ centre / measure.sum()
     position, covered = _targets(mesh, middle, target_radius * body_radius, num_targets)
     desired = _desired_images(mesh, position, covered.T @ measure, radius * body_radius)
-    # In the directions that a body can move data in, of which there are fewer than channels.
+    # In the directions in which a body can change data, which are fewer than the channels.
     directions = data_directions(model.protocol, channels, root_weight)
     weighted = directions.T * np.asarray(root_weight)  # (r, K)
     response, shares = np.zeros((len(weighted), len(position))), covered.tocsr()
@@ -111,7 +113,7 @@ def greit(
 
 
 def _radius(measure: float, dimension: int) -> float:
-    """Of the disc of an area, or the ball of a volume."""
+    """Radius of the disc of an area, or the ball of a volume."""
     return float(np.sqrt(measure / np.pi) if dimension == 2 else np.cbrt(3 * measure / (4 * np.pi)))
 
 

@@ -22,7 +22,7 @@ from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array, has_values, is_forked, on_device, on_host
 
-# Cells that show which channels are tied, about.
+# Approximate number of cells used to find which channels are tied.
 _ENOUGH = 4000
 
 
@@ -41,9 +41,9 @@ class LinearReconstruction:
 
     **Fields**: `mesh`; `first`, `second` (K,) the channels added to make each combined channel, and `ratio` (K,) the
     weight of the second; `weights` (K, m), siemens per metre (2-D: siemens) per volt of combined channel, or, with a
-    `mixing` (K, r), (r, m) of its combinations;
-    `hyperparameter` λ, and `rule`, how it was chosen; `method`, the name of the reconstruction; `choice`, all that was
-    looked at in choosing λ and whether to trust it (`choice.note`), where λ came from `jeit.inverse.RULES` or a number.
+    `mixing` (K, r), (r, m) of its combinations; `hyperparameter` λ, and `rule`, how it was chosen; `method`, the name
+    of the reconstruction; `choice`, the curves used in choosing λ and whether to trust it (`choice.note`), where λ came
+    from `jeit.inverse.RULES` or a number.
     """
 
     mesh: Mesh
@@ -68,7 +68,8 @@ class LinearReconstruction:
         method: str,
         choice: Choice | None = None,
     ):
-        """From images and their weights, whose product is the reconstruction matrix, without it where it is larger."""
+        """Create from images and their weights, whose product is the reconstruction matrix; the product is not formed
+        where it is larger than they are."""
         images, weights = factors
         some = images[:: max(1, len(images) // _ENOUGH)]  # what ties channels ties them in every cell
         first, second, ratio = _combine(model, some @ weights)
@@ -82,15 +83,16 @@ class LinearReconstruction:
 
     @classmethod
     def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str, choice: Choice | None = None):
-        """From a full reconstruction matrix (m, M)."""
+        """Create from a full reconstruction matrix (m, M)."""
         if not has_values(model.protocol, matrix, hyperparameter):
-            # Which columns are proportional cannot be seen: every channel stays on its own.
+            # It is not known which columns are proportional: every channel stays on its own.
             every, nothing = jnp.arange(matrix.shape[1]), jnp.zeros(matrix.shape[1])
             given = every, every, nothing, jnp.asarray(matrix).T, jnp.asarray(hyperparameter, float)
             return cls(model.mesh, *given, matrix.shape[1], rule, method, choice)
         matrix = np.asarray(matrix)
         first, second, ratio = _combine(model, matrix)
-        # Of two tied columns the mean, not either: their rounding errors are large where λ is small, and opposite.
+        # The mean of two tied columns is used, not either: their rounding errors are large where λ is small, and
+        # opposite.
         tied = matrix.T[first] + ratio[:, None] * matrix.T[second]
         weights = tied / (1 + ratio**2)[:, None]
         return cls(
@@ -137,7 +139,8 @@ class LinearReconstruction:
 
     @functools.cached_property
     def _parts(self) -> tuple[Any, ...]:
-        """What an image takes, once and for all in NumPy: to ask for it frame by frame costs as much as a product."""
+        """The arrays that an image needs, converted once to NumPy: converting them for every frame costs as much as a
+        product."""
         parts = (self.first, self.second, self.ratio, self.mixing, self.weights)
         return on_host(parts) if has_values(parts) else parts
 
@@ -150,8 +153,8 @@ def _product(parts, difference) -> Any:
 
 @jax.jit
 def _handed_over(image) -> Any:
-    """JAX's array of NumPy's, in a quarter of the time of `jax.device_put`, which would be half of an image's; not in
-    forked processes, where nothing compiled runs."""
+    """Convert a NumPy array to a JAX array in a quarter of the time of `jax.device_put`, which would be half of an
+    image's; not in forked processes, where nothing compiled runs."""
     return image
 
 
@@ -174,7 +177,7 @@ def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.nd
     )
 
 
-@np.errstate(all="ignore")  # numbers that overflow are told of below
+@np.errstate(all="ignore")  # numbers that overflow are reported below
 def one_step(
     model: ForwardModel,
     conductivity: ArrayLike,
@@ -198,7 +201,7 @@ def one_step(
     are imaged part by part.
 
     Differentiable, with a number for λ, in all that has a gradient: `jax.grad`, `jax.vmap` and `jax.jit` go through it
-    and through the image. What only values decide, a rule for λ or a mask, has to be settled outside.
+    and through the image. Choices that depend on values, a rule for λ or a mask, have to be made outside.
 
     Computed in data space: R = ΓJᵀ(JΓJᵀ + λ²W⁻¹)⁻¹ with Γ = Q⁻¹; see `jeit.inverse.prior.priors` for a Q with a null
     space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.

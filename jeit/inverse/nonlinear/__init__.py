@@ -1,4 +1,4 @@
-"""Nonlinear least squares for conductivity itself: what is estimated, on which scale, and what solves it."""
+"""Nonlinear least squares for the conductivity itself: parametrisations, links, further unknowns and solvers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is asked of the arguments of reconstructions, before anything is compiled: errors that say what to give."""
+"""Checks of the arguments of reconstructions, before anything is compiled: errors that say what to give."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jeit_solvers.engines import has_values, host, namespace
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
     """Voltages as an array with zeros for what is left out, and which channels are used; raises `ValueError`.
 
-    Values of tracers are not looked at.
+    Values of tracers are not checked.
     """
     check_model(model)
     check_mask(mask)
@@ -79,7 +79,7 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
 
 
 def _array(values):
-    """A copy in NumPy of what has values."""
+    """A NumPy copy of an array that has values."""
     return host.array(values) if has_values(values) else jnp.asarray(values)
 
 

@@ -1,4 +1,4 @@
-"""Coefficients as a function of the problem they solve: what derivatives of a nonlinear image are.
+"""Implicit differentiation: derivatives of a nonlinear image's coefficients in the problem that they solve.
 
 At a minimum the gradient of the objective, Jᵀ G r + penalty'(c), is zero. Between bounds it is so for the coefficients
 that are free; those at a bound which the objective pushes outwards go where the bound goes, and so they do as long as
@@ -17,7 +17,8 @@ from jaxtyping import Array, Float
 from jeit.inverse.nonlinear.problem import Inversion
 from jeit_solvers import as_minimum, symmetric_inverse
 
-# Solvers scale coefficients, and bounds with them: so near a bound, relative to it, one is at it.
+# Relative distance from a bound within which a coefficient counts as at it: solvers scale coefficients, and bounds with
+# them.
 _ROUNDING = 1e-12
 
 
@@ -36,12 +37,13 @@ def as_solution(found: Float[Array, " n"], inversion: Inversion, box: Any = None
 
 
 def _placed(point, box, side):
-    """The coefficients: those that are free, and bounds in place of the others."""
+    """Coefficients with the free values inserted, and bounds in place of the others."""
     return point if box is None else jnp.where(side < 0, box[0], jnp.where(side > 0, box[1], point))
 
 
 def _gradient(point, problem):
-    """Of the objective in the coefficients that are free; the others are held at zero, their bound stands for them."""
+    """Gradient of the objective in the free coefficients; the others are held at zero, and their bounds stand for
+    them."""
     inversion, box, side = problem
     slope = jax.grad(inversion.cost)(_placed(point, box, side))
     return slope if box is None else jnp.where(side == 0, slope, point)

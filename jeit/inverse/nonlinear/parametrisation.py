@@ -1,4 +1,4 @@
-"""Parametrisations: what is estimated, on which scale (links) and within which limits."""
+"""Parametrisations: the estimated quantity, its scale (the link) and its bounds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jeit.inverse.prior.bases import Regions
 from jeit.mesh import Mesh
 from jeit_solvers.engines import has_values, namespace
 
-# Share of the background below which no conductivity is taken where nothing else keeps it from zero.
+# Share of the background that is the least conductivity where nothing else keeps it from zero.
 _LEAST = 1e-6
 
 
@@ -42,8 +42,8 @@ class AbstractLink(eqx.Module):
         """
 
     def ends(self, lower: float, upper: float, reference: Float[Array, " m"]) -> tuple[float, float]:
-        """The estimates that two bounds on σ stand for, in an image about `reference`. Raises `ValueError` for a link
-        that takes none."""
+        """The values of x for two bounds on σ, in an image about `reference`. Raises `ValueError` for a link that takes
+        none."""
         raise ValueError(f"bounds: link {type(self).__name__} takes none; take Log() or Linear().")
 
 
@@ -107,7 +107,7 @@ class Bounded(AbstractLink):
         return self.lower + (self.upper - self.lower) * _logistic(estimate)
 
     def slope(self, estimate):
-        """Its derivative, largest half way between the bounds."""
+        """Derivative of the logistic function, largest half way between the bounds."""
         share = _logistic(estimate)
         return (self.upper - self.lower) * share * (1 - share)
 
@@ -119,7 +119,7 @@ class Bounded(AbstractLink):
         return xp.log(share) - xp.log1p(-share)
 
     def ends(self, lower, upper, reference):
-        """Not beside its own. Raises `ValueError`."""
+        """Not available: the link has bounds of its own. Raises `ValueError`."""
         raise ValueError("bounds: the link is bounded already; give bounds or link=Bounded(lower, upper), not both.")
 
 
@@ -147,7 +147,7 @@ def _tuple(unknowns) -> tuple[AbstractUnknown, ...]:
 
 
 def as_parametrisation(given: "Parametrisation | None") -> "Parametrisation":
-    """What is given, or all the defaults. Raises `ValueError` for something else."""
+    """The parametrisation given, or the default one. Raises `ValueError` for something else."""
     if given is None:
         return Parametrisation()
     check_kind("parametrisation", given, Parametrisation, "a Parametrisation, such as Parametrisation(link=Log())")
@@ -155,7 +155,7 @@ def as_parametrisation(given: "Parametrisation | None") -> "Parametrisation":
 
 
 class Parametrisation(eqx.Module):
-    """What is estimated of a body.
+    """Parametrisation of an image: the quantity that is estimated.
 
     - `link`: the scale on which the prior acts, `Log()` unless given.
     - `bounds`: least and greatest conductivity, S/m (2-D: S), held exactly; for solvers that keep bounds, with priors
@@ -163,9 +163,9 @@ class Parametrisation(eqx.Module):
     - `regions` (m,): integers, cells that share one value; -1 for cells held at the background. See
       `jeit.inverse.prior.bases.pixels`.
     - `unknowns`: what else to estimate, see `jeit.inverse.nonlinear.unknowns`.
-    - `informative`: images are built of combinations of the prior's shapes that the data of the background tell more of
-      than this, in standard deviations of the noise for one of the prior; 0 takes all shapes. None leaves it to who
-      asks: `reconstruct` takes all, an `Imager` those above 0.03.
+    - `informative`: images consist of those combinations of the prior's shapes whose signal at the background exceeds
+      this, in standard deviations of the noise for one of the prior; 0 takes all shapes. None leaves the choice to the
+      caller: `reconstruct` takes all, an `Imager` those above 0.03.
 
     Raises `ValueError` for what does not fit.
     """

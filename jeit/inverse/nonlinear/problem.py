@@ -1,6 +1,6 @@
-"""The nonlinear inverse problem as all solvers see it: coefficients in, misfit, Jacobian and cost out.
+"""The nonlinear inverse problem for all solvers: misfit, Jacobian and cost as functions of the coefficients.
 
-Informed shapes: the combinations of a prior's shapes that data tell of, some dozens, instead of all of them.
+Informed shapes are the combinations of a prior's shapes, some dozens, that the data resolve; they replace the full set.
 
 They are the right singular vectors of the whitened Jacobian at the background, kept in single precision, which alters
 an image by a millionth.
@@ -50,15 +50,16 @@ def independent_data(
     small = observed
     if has_values(observed.protocol):
         small = observed.with_protocol(observed.protocol.subset(np.asarray(channels.index)))
-    # Of a solid body compiled programs would hold the Jacobian several times over.
+    # For a solid body compiled programs would hold the Jacobian several times over.
     if at_once and (model.at_once or model.mesh.dimension == 3) and has_values(small):
-        small, channels = on_host((small, channels))  # and so is all that is made of them
+        small, channels = on_host((small, channels))  # and so is everything computed from them
     return small, channels.weigh(deviation[kept]).combine(measured[kept])
 
 
 def informed(inversion: Inversion, least: float, persistence: float = 0.0) -> Inversion:
-    """The problem on shapes that its data tell more of than `least`, in standard deviations of the noise for one of the
-    prior; as large as expected of a frame when the last one's share of `persistence` is known already.
+    """The problem reduced to the shapes whose signal exceeds `least`, in standard deviations of the noise for one of
+    the prior. The shapes' variances are those expected before a frame when the share `persistence` of the last image
+    persists.
 
     The rest of the image stays at the reference. For penalties that are standard normal.
     """
@@ -72,7 +73,8 @@ def informed(inversion: Inversion, least: float, persistence: float = 0.0) -> In
 
 @either_engine
 def _singular_values(inversion: Inversion):
-    """Of the image's whitened Jacobian at the background: squared singular values, right vectors times their roots."""
+    """Singular values, squared, of the image's whitened Jacobian at the background, and its right singular vectors
+    times them."""
     xp = namespace(inversion)
     start = xp.zeros(inversion.num_coefficients)
     rows = inversion.data.whiten(inversion.linearise(start)[1])[:, : inversion.basis.num_coefficients]
@@ -106,7 +108,7 @@ class Inversion(eqx.Module):
 
     @property
     def runs_at_once(self) -> bool:
-        """Whether it can be solved in NumPy, for all of its values are at hand and nothing needs a derivative."""
+        """Whether the problem can be solved in NumPy: all of its values are known and no derivative is needed."""
         in_pieces = self.model.at_once or namespace(self.model) is np
         return in_pieces and not self.unknowns and has_values(self)
 
@@ -134,7 +136,7 @@ class Inversion(eqx.Module):
         return self._parts(coefficients)[1]
 
     def voltages(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:
-        """What the model predicts for the independent channels, volts."""
+        """Voltages of the independent channels that the model predicts, volts."""
         return self._predict(*self._parts(coefficients))
 
     def residual(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:
@@ -163,7 +165,7 @@ class Inversion(eqx.Module):
         residual = xp.where((conductivity > 0).all(), weight * (voltages - self.data.voltages), xp.nan)
         jacobian = xp.concatenate(columns, axis=1) if self.unknowns else jacobian
         if xp is np:
-            jacobian *= weight[:, None]  # where it is: it may be all that there is room for
+            jacobian *= weight[:, None]  # in place: there may be no room for a second
             return residual, jacobian
         return residual, weight[:, None] * jacobian
 
@@ -173,7 +175,7 @@ class Inversion(eqx.Module):
         return 0.5 * residual @ self.data.precision @ residual + self.penalty.cost(coefficients)
 
     def quadratic_model(self, coefficients: Float[Array, " n"]) -> QuadraticModel:
-        """Cost and step, for `jeit_solvers.Descent`."""
+        """The cost and its step, for `jeit_solvers.Descent`."""
         residual, jacobian = self.linearise(coefficients)
         return self.penalty.model(residual, jacobian, coefficients, self.data)
 

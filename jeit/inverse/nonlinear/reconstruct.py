@@ -30,7 +30,7 @@ from jeit_solvers.engines import as_array, either_engine, has_values, namespace,
 
 
 class Reconstruction(eqx.Module):
-    """What `reconstruct` found, whichever solver ran.
+    """Result of `reconstruct`, of any solver.
 
     **Fields**: `conductivity` (m,), S/m (2-D: S); `voltages` (M,), what the model predicts for it; `misfit`, root mean
     square of predicted - measured over the channels used, in standard deviations (1: as good as the noise lets it be);
@@ -72,12 +72,12 @@ class Reconstruction(eqx.Module):
 
     @property
     def rule(self) -> str:
-        """How λ was chosen."""
+        """Name of the rule that chose λ."""
         return self.choice.rule
 
     @property
     def unknowns(self) -> dict[str, Float[Array, " k"]]:
-        """What was estimated along with the conductivity, by the name of its class.
+        """Values estimated along with the conductivity, by the name of the unknown's class.
 
         `ContactImpedance`: (L,), ohm·m² (2-D: ohm·m); `ElectrodePosition`: how far from the model's, metres; `Scale`:
         the factor; `Background`: what is added to the image, on the link's scale.
@@ -102,7 +102,7 @@ def reconstruct(
     parametrisation: Parametrisation | None = None,
     start: Reconstruction | None = None,
 ) -> Reconstruction:
-    """Conductivity per cell that explains measured `voltages` (M,), in volts: an absolute image.
+    """Estimate the conductivity per cell that explains measured `voltages` (M,), in volts: an absolute image.
 
     - `background`: what the prior expects, one number or (m,), S/m (2-D: S), see `calibrate`; and where to start.
     - `prior`: `Noser()` unless given; `TotalVariation()` for images of few pieces.
@@ -201,7 +201,7 @@ def _solver_for(solver, prior: AbstractPrior, parametrisation: Parametrisation) 
     return solver
 
 
-@np.errstate(all="ignore")  # a problem that is not finite is told of when it is solved
+@np.errstate(all="ignore")  # a problem that is not finite is reported when it is solved
 def pose(
     model: ForwardModel,
     data: Data,
@@ -267,7 +267,7 @@ def _continued(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"
 
 
 def _alike(one: Inversion, other: Inversion) -> bool:
-    """Whether the coefficients of two problems mean the same kind of thing."""
+    """Whether the coefficients of two problems have the same meaning."""
 
     def kinds(inversion):
         return [type(part) for part in (inversion.link, inversion.basis, inversion.penalty, *inversion.unknowns)]

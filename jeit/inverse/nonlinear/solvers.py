@@ -1,6 +1,6 @@
-"""Solvers of the nonlinear problem, as small objects that say how many steps they take and what they can do.
+"""Solvers of the nonlinear problem, as small objects that hold their settings and state what they can do.
 
-`SOLVERS` has them by name, and `as_solver` is where a name becomes an object.
+`SOLVERS` has them by name, and `as_solver` turns a name into an object.
 """
 
 from __future__ import annotations
@@ -32,15 +32,16 @@ _REASONS = {
 }
 
 _ROUNDED = "The next step would change the objective by less than its rounding."
-# Of the objective, in units of its last place, that a sum over all channels is off by.
+# Rounding error of the objective, a sum over all channels, in units of its last place.
 _ROUNDINGS = 100.0
 _TRACED = "It was solved inside a transformation of JAX; the status says how that ended."
 
 
 class Solved(NamedTuple):
-    """Where a solver ended: coefficients (n,), iterations, the objective at the accepted iterates, how and why.
+    """Result of a solver: coefficients (n,), iterations, the objective at the accepted iterates, the status and its
+    reason.
 
-    Of a problem that is traced, `costs` are those of start and end, and `status` is the number of one.
+    For a traced problem, `costs` are those of start and end, and `status` is a status's number.
     """
 
     coefficients: Float[Array, " n"]
@@ -76,15 +77,15 @@ class AbstractSolver(eqx.Module):
         """The coefficients of least cost, from `start`; between the ends of `box`, (n,) each, if it keeps bounds."""
 
     def for_frames(self, max_steps: int | None = None, rtol: float | None = None) -> "AbstractSolver":
-        """Itself with these settings where it has none of its own, for an `Imager`. Raises `ValueError` if it is not
-        one that images a frame in a bounded time."""
+        """The solver with these settings where it has none of its own, for an `Imager`. Raises `ValueError` if it is
+        not one that images a frame in a bounded time."""
         raise ValueError(
             f"solver: {self.name} does not image frames in a bounded time; take one of {', '.join(frame_solvers())}."
         )
 
     def descent(self, max_steps: int, rtol: float) -> Descent:
-        """Its steps, for optimistix; the arguments hold where it has none of its own. Keeps the cost of the start and
-        of `max_steps` steps. Raises `ValueError` if it takes other steps."""
+        """The solver's steps, for optimistix; the arguments are used where it has no settings of its own. Keeps the
+        cost of the start and of `max_steps` steps. Raises `ValueError` if it takes other steps."""
         raise ValueError(f"solver: {self.name} does not descend along quadratic models.")
 
 
@@ -105,15 +106,15 @@ class GaussNewton(AbstractSolver):
         _check(self.max_steps, self.rtol)
 
     def minimise(self, inversion, start, box):
-        """By `jeit_solvers.Descent`."""
+        """Minimise by `jeit_solvers.Descent`."""
         return _descend(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
-        """Itself."""
+        """The solver itself."""
         return GaussNewton(_first(self.max_steps, max_steps), _first(self.rtol, rtol))
 
     def descent(self, max_steps, rtol):
-        """Without damping."""
+        """Steps without damping."""
         return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol))
 
 
@@ -135,15 +136,15 @@ class LevenbergMarquardt(AbstractSolver):
             raise ValueError(f"damping must be positive; it is {self.damping}. Without it, take GaussNewton().")
 
     def minimise(self, inversion, start, box):
-        """By `jeit_solvers.Descent`."""
+        """Minimise by `jeit_solvers.Descent`."""
         return _descend(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
-        """Itself."""
+        """The solver itself."""
         return LevenbergMarquardt(_first(self.max_steps, max_steps), _first(self.rtol, rtol), self.damping)
 
     def descent(self, max_steps, rtol):
-        """With damping."""
+        """Steps with damping."""
         return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol), self.damping)
 
 
@@ -159,11 +160,11 @@ class LBFGSB(AbstractSolver):
 
     @property
     def keeps_bounds(self):
-        """It does."""
+        """True."""
         return True
 
     def minimise(self, inversion, start, box):
-        """By `jeit_solvers.lbfgsb`."""
+        """Minimise by `jeit_solvers.lbfgsb`."""
         return _between(lbfgsb, inversion, start, box, self.max_steps, self.tolerance)
 
 
@@ -179,11 +180,11 @@ class ProjectedGradient(AbstractSolver):
 
     @property
     def keeps_bounds(self):
-        """It does."""
+        """True."""
         return True
 
     def minimise(self, inversion, start, box):
-        """By `jeit_solvers.projected_gradient`."""
+        """Minimise by `jeit_solvers.projected_gradient`."""
         return _between(projected_gradient, inversion, start, box, self.max_steps, self.tolerance)
 
 
@@ -199,11 +200,11 @@ class LeastSquares(AbstractSolver):
 
     @property
     def needs_squares(self):
-        """It does."""
+        """True."""
         return True
 
     def minimise(self, inversion, start, box):
-        """Of the residuals of data and prior together."""
+        """Minimise the residuals of data and prior together."""
         if not has_values(inversion, start):
             problem, first = undifferentiated((inversion, start))
             solution = _least_squares(problem, first, self.solver, self.max_steps, {})
@@ -224,15 +225,15 @@ class OneStep(AbstractSolver):
 
     @property
     def is_linear(self):
-        """It is."""
+        """True."""
         return True
 
     def minimise(self, inversion, start, box):
-        """Not to be had. Raises `ValueError`."""
+        """Not available. Raises `ValueError`."""
         raise ValueError("solver: linear images are those of one_step, or of an Imager; take another solver.")
 
     def for_frames(self, max_steps=None, rtol=None):
-        """Itself."""
+        """The solver itself."""
         return self
 
 
@@ -265,7 +266,7 @@ def as_solver(
 
 
 def counted_iterations(iterations: int, shortened: int = 0) -> str:
-    """In words, how many iterations there were, and how many steps that had to be shortened."""
+    """The numbers of iterations and of shortened steps, in words."""
     said = counted(iterations, "iteration")
     if not shortened:
         return said
@@ -303,8 +304,8 @@ def _least_squares(inversion: Inversion, start, solver, max_steps: int, options:
 
 
 def _steps(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
-    """As many steps, with room for the start. `atol` ends it where the objective itself goes to nothing, as that of an
-    undisturbed frame does, and no change is small beside it."""
+    """Settings for this many steps, with room for the start. `atol` ends the iteration where the objective itself goes
+    to zero, as for an undisturbed frame, so that no change is small relative to it."""
     return Descent(rtol=rtol, atol=0.5 * rtol, damping=damping, history=max_steps + 1)
 
 
@@ -329,7 +330,7 @@ def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
 
 
 def _traced(inversion: Inversion, start, found, iterations, status, box=None) -> Solved:
-    """Where a solver ended that saw no values: `found` gets the derivatives of the minimum."""
+    """Result of a solver for a traced problem: `found` gets the derivatives of the minimum."""
     found = as_solution(found, inversion, box)
     costs = jnp.stack([_cost(inversion, start), _cost(inversion, found)])
     return Solved(found, iterations, costs, status, _TRACED)
@@ -367,7 +368,7 @@ def minimise_between(
     Converged: a step along the projected gradient, scaled by each coefficient's own curvature, changes none by more
     than `tolerance`.
     """
-    # One size for all coefficients: conditioning decides how many steps a gradient method takes.
+    # All coefficients are scaled to one size: conditioning decides how many steps a gradient method takes.
     _, jacobian = inversion.linearise(start)
     scale = jax.lax.rsqrt(jnp.sum(jacobian**2, axis=0) + inversion.penalty.diagonal(start))
     unit = inversion.cost(start)
@@ -384,8 +385,8 @@ def minimise_between(
 
 @eqx.filter_jit
 def _is_within_rounding(inversion: Inversion, coefficients):
-    """Whether a Gauss-Newton step would lower the objective by no more than its rounding: solvers that accept steps by
-    what they gain stand still there, short of tolerances near the root of a number's precision."""
+    """Whether a Gauss-Newton step would lower the objective by no more than its rounding error: solvers that accept
+    steps by the gain stall there, before they reach tolerances near the square root of the precision."""
     cost, step = inversion.quadratic_model(coefficients)
     _, slope, curvature = step(0.0)
     return abs(slope + 0.5 * curvature) <= _ROUNDINGS * jnp.finfo(cost.dtype).eps * cost

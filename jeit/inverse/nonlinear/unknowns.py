@@ -1,7 +1,7 @@
-"""Unknowns: what else is not known exactly, and may be estimated along with the conductivity.
+"""Unknowns: further parameters that are not known exactly and can be estimated along with the conductivity.
 
-Each has a prior of zero mean and the given standard deviation, and changes the forward model or the image; what it does
-to the voltages is found by automatic differentiation. What stays positive is estimated by its logarithm, and told as
+Each has a prior of zero mean and the given standard deviation, and changes the forward model or the image; its effect
+on the voltages is found by automatic differentiation. A positive quantity is estimated by its logarithm and reported as
 itself.
 """
 
@@ -38,7 +38,7 @@ class AbstractUnknown(eqx.Module):
         """The model and the image (on the link's scale) with these values in place of zeros."""
 
     def quantity(self, model: ForwardModel, values: Float[Array, " k"]) -> Float[Array, " k"]:
-        """What the values mean, each for itself, in the unit of what is estimated; themselves unless said."""
+        """The estimated quantity of each value, in its unit; the values themselves by default."""
         return values
 
 
@@ -54,7 +54,7 @@ class ContactImpedance(AbstractUnknown):
         self.deviation = _deviation("ContactImpedance", deviation, model.electrodes.num_electrodes)
 
     def fits(self, model):
-        """As many electrodes, with contact."""
+        """Whether the model has as many electrodes, with contact."""
         return not model.electrodes.is_point and self.size == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
@@ -68,7 +68,7 @@ class ContactImpedance(AbstractUnknown):
 
 
 class ElectrodePosition(AbstractUnknown):
-    """How far electrodes are from where the model has them, metres: along the boundary, or anywhere in a sheet.
+    """Displacement of electrodes from their places in the model, metres: along the boundary, or anywhere in a sheet.
 
     One value for each electrode on the boundary, counter-clockwise; for discs in a sheet two, x of all and then y.
     """
@@ -88,12 +88,12 @@ class ElectrodePosition(AbstractUnknown):
         self.deviation = _deviation("ElectrodePosition", deviation, direction.shape[0] * direction.shape[1])
 
     def fits(self, model):
-        """As many electrodes, of a kind that can move."""
+        """Whether the model has as many electrodes, of a kind that can move."""
         movable = isinstance(model.electrodes, AbstractMovableElectrodes)
         return movable and self.direction.shape[0] == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
-        """Positions moved."""
+        """Move the positions."""
         shift = jnp.einsum("al,lad->ld", values.reshape(self.direction.shape[1], -1), self.direction)
         electrodes: Any = model.electrodes
         moved = eqx.tree_at(lambda e: e.position, electrodes, electrodes.position + shift)
@@ -112,7 +112,7 @@ class Background(AbstractUnknown):
         self.deviation = _deviation("Background", deviation, 1)
 
     def apply(self, model, estimate, values):
-        """The image plus a constant."""
+        """Add a constant to the image."""
         return model, estimate + values[0]
 
 
@@ -128,7 +128,7 @@ class Scale(AbstractUnknown):
         self.deviation = _deviation("Scale", deviation, 1)
 
     def apply(self, model, estimate, values):
-        """Currents times exp(value)."""
+        """Multiply the currents by exp(value)."""
         drive = model.protocol.drive * self.quantity(model, values)[0]
         return eqx.tree_at(lambda m: m.protocol.drive, model, drive), estimate
 

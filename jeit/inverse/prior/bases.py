@@ -1,7 +1,7 @@
 """Bases: images as combinations of shapes, x = x₀ + S c, that a prior makes independent and of unit variance.
 
 With covariance Γ = S Sᵀ the prior energy (x - x₀)ᵀ Γ⁻¹ (x - x₀) is ‖c‖². A diagonal S keeps every cell on its own; a
-narrow one (a covariance of low rank) keeps what the prior holds possible and leaves out the rest.
+narrow one (a covariance of low rank) keeps the images that the prior allows and leaves out the rest.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class AbstractBasis(eqx.Module):
 
     @abc.abstractmethod
     def variance(self) -> Float[Array, " m"]:
-        """Of every cell before the data are seen, the diagonal of S Sᵀ, and of what the shapes leave out."""
+        """Prior variance of every cell: the diagonal of S Sᵀ, and the variance that the shapes leave out."""
 
     @abc.abstractmethod
     def scaled(self, factor) -> "AbstractBasis":
@@ -65,7 +65,7 @@ class DiagonalBasis(AbstractBasis):
 
     @property
     def num_coefficients(self) -> int:
-        """One for each cell."""
+        """Number of coefficients: one for each cell."""
         return self.deviation.shape[0]
 
     def expand(self, coefficients):
@@ -110,7 +110,7 @@ class DenseBasis(AbstractBasis):
 
     @property
     def num_coefficients(self) -> int:
-        """One for each shape."""
+        """Number of coefficients: one for each shape."""
         return self.shapes.shape[1]
 
     def expand(self, coefficients):
@@ -154,7 +154,7 @@ class NodalBasis(AbstractBasis):
 
     @property
     def num_coefficients(self) -> int:
-        """One for each node."""
+        """Number of coefficients: one for each node."""
         return self.number
 
     def expand(self, coefficients):
@@ -169,7 +169,7 @@ class NodalBasis(AbstractBasis):
         return functools.reduce(operator.add, corners).T
 
     def restrict_blocks(self, blocks):
-        """The same, some cells after others."""
+        """As `restrict`, for rows given block by block."""
         total: Any = np.zeros(0)
         count = self.cells.shape[1]
         for cells, block in blocks:
@@ -182,15 +182,15 @@ class NodalBasis(AbstractBasis):
         return np.ascontiguousarray(total.T)
 
     def variance(self):
-        """Of means of independent nodes."""
+        """Variance of cells as means of independent nodes."""
         return namespace(self).full(len(self.cells), 1 / self.cells.shape[1])
 
     def scaled(self, factor):
-        """Not to be had: nodes have no scale of their own. Raises `ValueError`."""
+        """Not available: nodes have no scale of their own. Raises `ValueError`."""
         raise ValueError("A basis of nodes has no scale; weigh the penalty.")
 
     def pooled(self, regions):
-        """Not to be had. Raises `ValueError`."""
+        """Not available. Raises `ValueError`."""
         raise ValueError("regions: images of nodes have none; leave them out.")
 
 
@@ -264,7 +264,7 @@ class RegionBasis(AbstractBasis):
 
     @property
     def num_coefficients(self) -> int:
-        """One for each region."""
+        """Number of coefficients: one for each region."""
         return self.regions.number
 
     def expand(self, coefficients):
@@ -284,5 +284,5 @@ class RegionBasis(AbstractBasis):
         return RegionBasis(self.regions, self.deviation * factor)
 
     def pooled(self, regions):
-        """Not done twice. Raises `ValueError`."""
+        """Not available twice. Raises `ValueError`."""
         raise ValueError("This basis has regions already.")

@@ -1,4 +1,4 @@
-"""Which prior is taken where none is given, and the quadratic priors by the names of the command line."""
+"""Default priors, and the quadratic priors by the names of the command line."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MEASURED = "gaussian"
 
 
 def smooth_prior(size: float) -> Gaussian:
-    """The prior that served on measured tanks and skins, for a body of this size: its longer side, metres."""
+    """The smooth prior that worked on measured tanks and skins, for a body of this size: its longer side, metres."""
     return Gaussian(0.085 * size)
 
 

@@ -1,4 +1,4 @@
-"""Priors of many cells by few shapes: low-rank factors of their covariance, on grids where bodies are large.
+"""Low-rank factors of the covariance of many cells, computed on grids where bodies are large.
 
 Covariances of low rank: Γ ≈ S Sᵀ with far fewer columns than cells, by a pivoted Cholesky factorisation.
 
@@ -22,7 +22,8 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
-# Of places that are as large but for this, as those of symmetric meshes are, the first: rounding is not to decide.
+# Relative difference within which diagonal entries count as equal, as in symmetric meshes; the first is taken, so that
+# rounding does not decide.
 _AS_LARGE = 1 - 1e-4
 
 
@@ -68,7 +69,7 @@ def _squared_distances(one, other):
 
 
 def _pivots(scaled, tolerance: float, size: int):
-    """Which points are pivots (size,), and how many of them are needed."""
+    """Indices of the points that are pivots (size,), and the number of them that are needed."""
     enough = tolerance * len(scaled)
 
     def go_on(state):
@@ -90,7 +91,8 @@ def _pivots(scaled, tolerance: float, size: int):
 
 # Grid points per correlation length, and points of a cubic along an axis.
 _PER_LENGTH, _CUBIC = 3, 4
-# Grid points, for every place and in all, beyond which a grid is no gain; all pairs of places cost far more than that.
+# Numbers of grid points, for every place and in all, beyond which a grid does not pay; all pairs of places cost far
+# more than that.
 _EACH, _MOST = 8, 500_000
 # Columns at a time, for all on the grid at once would take more memory than the places do.
 _COLUMNS = 64
@@ -131,7 +133,7 @@ class GriddedGaussian:
 
 
 def _weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
-    """Of Lagrange's cubics through the two grid points on either side, along every axis."""
+    """Weights of Lagrange's cubics through the two grid points on either side, along every axis."""
     t = place - np.floor(place) + 1
     nodes = np.arange(_CUBIC)
     return np.stack([np.prod([(t - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)

@@ -26,9 +26,9 @@ from jeit.mesh import Mesh, gradients, measures
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, host, on_host
 
-# How far beyond the wall the field is taken to go on falling, in units of 1/κ.
+# Distance beyond the wall over which the field continues to fall, in units of 1/κ.
 _ROBIN = 1.42
-# Nodes up to which variances are worked out; of more they are estimated, from this many fields.
+# Number of nodes up to which variances are computed exactly; beyond, they are estimated from this many fields.
 _FEW, _FIELDS = 3000, 400
 # Fields at a time.
 _AT_ONCE = 50
@@ -37,10 +37,10 @@ _AT_ONCE = 50
 class Matern(AbstractPrior):
     """Matérn smoothness: a random field of unit variance that a differential equation correlates over `length` metres.
 
-    The correlation falls to 0.14 at twice the `length`, as that of `Gaussian(length)` does, but from the first: its
-    images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. Cells much larger than the
-    length do not resolve it. Takes memory and time in proportion to the nodes, about. Raises `ValueError` for a length
-    that is not positive.
+    The correlation falls to 0.14 at twice the `length`, as that of `Gaussian(length)` does, but it falls from distance
+    zero on: its images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. Cells much larger
+    than the length do not resolve it. Takes memory and time in proportion to the nodes, about. Raises `ValueError` for
+    a length that is not positive.
     """
 
     length: float
@@ -58,18 +58,18 @@ class Matern(AbstractPrior):
         return host.asarray(field.product(columns))
 
     def precision(self, mesh, jacobian):
-        """Not to be had of cells. Raises `ValueError`."""
+        """Not available for cells. Raises `ValueError`."""
         raise ValueError(
             "prior: Matern is a field of the nodes and has no precision matrix of cells, which bounds need; take "
             "Noser, Tikhonov, Laplace or TotalVariation, or link=Bounded(lower, upper) in place of bounds."
         )
 
     def basis(self, mesh, jacobian):
-        """A shape for each node: what white noise there makes of the cells."""
+        """A shape for each node: the response of the cells to white noise at that node."""
         return DenseBasis(host.asarray(self._field(mesh, jacobian).shapes()))
 
     def informed_basis(self, mesh, jacobian):
-        """As of any prior, of one field."""
+        """Informed shapes as of any prior, from one field."""
         field = self._field(mesh, jacobian)
         return informed_shapes(np.asarray(jacobian), field.product, field.variance())
 
@@ -108,7 +108,7 @@ class _Field(NamedTuple):
         return cls(system.means, solve, mass, scale, scale[:, None] * fields)
 
     def variance(self) -> Float[np.ndarray, " m"]:
-        """Of the cells."""
+        """Variance of the cells."""
         some = np.array_split(self.fields, max(1, self.fields.shape[1] // _AT_ONCE), axis=1)
         return np.sum([((self.means @ part) ** 2).sum(axis=1) for part in some], axis=0)
 

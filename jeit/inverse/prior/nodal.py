@@ -14,7 +14,7 @@ from jeit.mesh import Mesh
 from jeit_solvers import Factor, FactorisationPlan, SparsityPattern, analyse, factorise, on_cores, solve
 from jeit_solvers.engines import on_host
 
-# Columns solved for at a time: of more, fronts leave the caches, and of all they take the memory of several images.
+# Columns solved for at a time: with more, fronts exceed the caches, and all at once take the memory of several images.
 _AT_ONCE = 32
 
 Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
@@ -22,7 +22,7 @@ Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
 
 
 class NodalSystem(NamedTuple):
-    """Where the entries of a matrix between neighbouring nodes go, and how to factorise it.
+    """Places of the entries of a matrix between neighbouring nodes, and the plan of its factorisation.
 
     **Fields**: `mesh`, in NumPy; `pattern`; `plan`; `means` (m, n), of cells over their nodes.
     """
@@ -34,7 +34,7 @@ class NodalSystem(NamedTuple):
 
     @classmethod
     def create(cls, mesh: Mesh) -> "NodalSystem":
-        """Of a mesh that has values."""
+        """Create for a mesh that has values."""
         mesh = on_host(mesh)
         cells, count = np.asarray(mesh.cells), mesh.cells.shape[1]
         pattern = SparsityPattern.from_elements([cells], size=mesh.num_points)
@@ -55,7 +55,7 @@ class NodalSystem(NamedTuple):
         return values
 
     def inverse(self, values: Any) -> Solve:
-        """What solves A X = B for columns (n, k), A being of these entries, in the pattern's order."""
+        """Function that solves A X = B for columns (n, k), A having these entries, in the pattern's order."""
         factor = factorise(self.plan, values)
         return lambda columns: in_columns(solve, self.plan, factor, columns)
 
@@ -70,8 +70,8 @@ def in_columns(
 
 
 def by_columns(function: Callable[[Any], Any], columns: Any, rows: int) -> Any:
-    """What `function` makes of columns (n, k) of NumPy's, (rows, k), some at a time on every core. It may ask for the
-    same of as many columns as it is given."""
+    """Apply `function` to columns (n, k) of a NumPy array, some at a time on every core; returns (rows, k). `function`
+    may itself call `by_columns` with as many columns as it is given."""
     number = columns.shape[1]
     found = np.empty((rows, number), columns.dtype)
 

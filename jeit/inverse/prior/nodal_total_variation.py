@@ -74,7 +74,8 @@ class NodalTotalVariation(AbstractPenalty):
 
     @property
     def tolerance(self) -> float:
-        """Lagged diffusivity comes nearer by a constant share a step, and its last steps change nothing to be seen."""
+        """Relative change of the objective that ends a descent: lagged diffusivity converges linearly, and its last
+        steps change nothing visible."""
         return 1e-4
 
     def cost(self, coefficients):
@@ -84,13 +85,13 @@ class NodalTotalVariation(AbstractPenalty):
         return edges + 0.5 * (self.pull * image**2).sum() + 0.5 * rest @ rest
 
     def diagonal(self, coefficients):
-        """Of the form that touches the energy at c."""
+        """Diagonal of the form that touches the energy at c."""
         image, rest = self._parts(coefficients)
         own = (self.slope**2).sum(axis=-1) * (self.weight / self._height(image))[:, None]
         return jnp.concatenate([self.pull + sum_into(self.pull.shape, self.cells, own), jnp.ones_like(rest)])
 
     def inverse_hessian(self, coefficients, free, columns):
-        """Of the energy's own Hessian where it does not bend less: zero across steep slopes."""
+        """Approximate inverse of the energy's own Hessian, which is zero across steep slopes."""
         image, _ = self._parts(coefficients)
         size = self.pull.shape[0]
         mine = free[:size]
@@ -101,7 +102,7 @@ class NodalTotalVariation(AbstractPenalty):
         return jnp.concatenate([solved, columns[size:]])
 
     def normal(self, coefficients):
-        """Of the form that touches the energy at c, as of `jeit.inverse.prior.total_variation`."""
+        """Normal distribution of the form that touches the energy at c, as in `jeit.inverse.prior.total_variation`."""
         image, _ = self._parts(coefficients)
         factor = self._factor(self._elements(self.weight / self._height(image)), self.pull)
         return SparseNormal(self.pattern, self.plan, factor)
@@ -140,17 +141,17 @@ class NodalTotalVariation(AbstractPenalty):
         return cost, step
 
     def _elements(self, stiffness):
-        """Of the form Σ stiffness |∇x|², (m, k, k)."""
+        """Element matrices of the form Σ stiffness |∇x|², (m, k, k)."""
         return namespace(self, stiffness).einsum("mid,mjd,m->mij", self.slope, self.slope, stiffness)
 
     def _factor(self, elements, diagonal) -> Factor:
-        """Of form + diagonal."""
+        """Factorise form + diagonal."""
         values = self.pattern.assemble(elements)
         xp = namespace(self, values)
         return factorise(self.plan, values + xp.concatenate([diagonal, xp.zeros(len(values) - len(diagonal))]))
 
     def _gradient(self, image):
-        """Of an image of the nodes, in every cell, (m, d) 1/m."""
+        """Gradient of an image of the nodes, in every cell, (m, d) 1/m."""
         return (self.slope * gather(image, self.cells)[:, :, None]).sum(axis=1)
 
     def _divergence(self, flux):

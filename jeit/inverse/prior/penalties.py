@@ -1,4 +1,4 @@
-"""Penalties of coefficients, which nonlinear images minimise beside the misfit, and their normal distributions.
+"""Penalties of coefficients, which nonlinear images minimise together with the misfit, and their normal distributions.
 
 A penalty that is, or from above touches, ½ cᵀQc up to what is linear in c stands for a normal distribution of precision
 Q. Its covariance Q⁻¹ is never there as a matrix.
@@ -38,8 +38,8 @@ class AbstractPenalty(eqx.Module):
 
     @property
     def is_standard_normal(self) -> bool:
-        """Whether it takes the coefficients for independent and of unit variance, ½‖c‖²: then the misfit with it is a
-        sum of squares, and what the data leave open is near a Gaussian."""
+        """Whether the coefficients are independent and of unit variance, ½‖c‖²: then the objective is a sum of squares,
+        and the posterior is nearly Gaussian."""
         return False
 
     @property
@@ -53,15 +53,16 @@ class AbstractPenalty(eqx.Module):
 
     @abc.abstractmethod
     def diagonal(self, coefficients: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Diagonal of the penalty's quadratic form at c: what scales a gradient method."""
+        """Diagonal of the penalty's quadratic form at c, which scales a gradient method."""
 
     @abc.abstractmethod
     def inverse_hessian(self, coefficients: Float[Array, " n"], free, columns: Float[Array, "n k"]) -> Array:
-        """About the inverse of the penalty's Hessian at c, of the coefficients that are `free` (n,), times columns that
-        are zero for the others: what makes derivatives of a minimum cheap, and need not be exact."""
+        """Approximate inverse of the penalty's Hessian at c, of the coefficients that are `free` (n,), times columns
+        that are zero for the others. It preconditions the derivatives of a minimum, and need not be exact."""
 
     def normal(self, coefficients: Float[Array, " n"]) -> AbstractNormal | None:
-        """The normal distribution that the penalty stands for near c; None where what data leave open is near none."""
+        """The normal distribution that the penalty stands for near c; None where the posterior is not nearly
+        Gaussian."""
         return None
 
     @abc.abstractmethod
@@ -74,7 +75,7 @@ class Ridge(AbstractPenalty):
 
     @property
     def is_standard_normal(self) -> bool:
-        """It does."""
+        """True."""
         return True
 
     def cost(self, coefficients):
@@ -119,7 +120,7 @@ class QuadraticForm(AbstractPenalty):
         return 0.5 * (jnp.sum(self.value * image[self.row] * image[self.column]) + rest @ rest)
 
     def diagonal(self, coefficients):
-        """Of Q."""
+        """Diagonal of Q."""
         own = jnp.zeros(self.size).at[self.row].add(jnp.where(self.row == self.column, self.value, 0))
         return jnp.concatenate([own, jnp.ones(coefficients.size - self.size)])
 
@@ -137,7 +138,7 @@ class QuadraticForm(AbstractPenalty):
         return jnp.concatenate([jnp.where(mine[:, None], solved, 0), rest])
 
     def model(self, residual, jacobian, coefficients, data):
-        """Not for descent along quadratic models: the bounded solvers take gradients. Raises `ValueError`."""
+        """Not available: the bounded solvers use gradients, not quadratic models. Raises `ValueError`."""
         raise ValueError("A QuadraticForm is minimised by bounded solvers only.")
 
 
@@ -150,11 +151,11 @@ class AbstractNormal(eqx.Module):
 
     @abc.abstractmethod
     def variance(self, basis: AbstractBasis) -> Float[Array, " m"]:
-        """Of the image's cells: the diagonal of S Q⁻¹ Sᵀ, and of what the shapes leave out."""
+        """Variance of the image's cells: the diagonal of S Q⁻¹ Sᵀ, and the variance that the shapes leave out."""
 
     @abc.abstractmethod
     def num_draws(self, num_coefficients: int) -> int:
-        """How many independent standard normal numbers a sample of n coefficients is made of."""
+        """Number of independent standard normal numbers that make a sample of n coefficients."""
 
     @abc.abstractmethod
     def drawn(self, numbers: Float[Array, "d k"]) -> Float[Array, "n k"]:
@@ -173,7 +174,7 @@ class StandardNormal(AbstractNormal):
         return basis.variance()
 
     def num_draws(self, num_coefficients):
-        """One for each coefficient."""
+        """Number of draws: one for each coefficient."""
         return num_coefficients
 
     def drawn(self, numbers):
@@ -189,13 +190,14 @@ class SparseNormal(AbstractNormal):
     factor: Factor
 
     def covariance_product(self, columns):
-        """By sparse solves."""
+        """Q⁻¹ times columns, by sparse solves."""
         size = self.plan.size
         solved = in_columns(solve, self.plan, self.factor, columns[:size])
         return namespace(columns, solved).concatenate([solved, columns[size:]])
 
     def variance(self, basis):
-        """From the entries of Q⁻¹ between neighbours, which are all that cells, and means over their nodes, take."""
+        """Variance from the entries of Q⁻¹ between neighbours, which suffice for cells, and for means over their
+        nodes."""
         entries = inverse_entries(self.plan, self.factor)
         if isinstance(basis, DiagonalBasis):
             return basis.deviation**2 * entries[: self.plan.size]
@@ -204,11 +206,11 @@ class SparseNormal(AbstractNormal):
         return host.where(row == column, 1.0, 2.0) @ between / basis.cells.shape[1] ** 2
 
     def num_draws(self, num_coefficients):
-        """One for each pivot of the factor, padding included, and for each of the rest."""
+        """Number of draws: one for each pivot of the factor, padding included, and for each of the rest."""
         return num_coefficients - self.plan.size + self.plan.num_pivots
 
     def drawn(self, numbers):
-        """By half a solve."""
+        """Samples by half a solve."""
         number = self.plan.num_pivots
         image = inverse_root(self.plan, self.factor, numbers[:number])
         return namespace(numbers, image).concatenate([image, numbers[number:]])

@@ -1,4 +1,4 @@
-"""Priors of conductivity: what is known of an image before it is measured, as a precision Q with energy xᵀQx.
+"""Priors of conductivity: quadratic energies xᵀQx of an image, with precision Q.
 
 A linear image minimises ‖W^½ (J x - v)‖² + λ² xᵀQx. With M measurements and m ≫ M cells it is found in data space,
 from products of the prior covariance Γ = Q⁻¹ with Jᵀ alone; where Q has a null space (Laplace: the constant), Γ is
@@ -52,10 +52,10 @@ def check_prior(prior: Any) -> None:
 
 # Rows of a dense covariance at a time.
 _BLOCK = 512
-# Of a Gaussian prior's variance, the share that its shapes may leave out, and their greatest number.
+# Share of a Gaussian prior's variance that its shapes may leave out, and their greatest number.
 _LEFT_OUT, _MOST_SHAPES = 1e-3, 2000
-# Cells beyond which images are made of no more shapes than data tell of, and neighbours are those of nodes; what of a
-# shape's variance, relative to the largest, data tell nothing of.
+# Number of cells beyond which images are made only of the shapes that the data resolve, and neighbours are those of
+# nodes; variance of a shape, relative to the largest, below which the data do not resolve it.
 _MANY, _NOTHING = 30_000, 1e-12
 # Precision given to the constant image where it would have none, relative to a step between neighbouring cells.
 _FREEDOM = 1e-6
@@ -64,14 +64,14 @@ _FREEDOM = 1e-6
 class AbstractPrior(eqx.Module):
     """Base of all priors on an image of one value per cell.
 
-    A new quadratic one is a class with `covariance_product`, `precision` and `basis`; one whose energy is not xᵀQx
-    answers `penalty` itself, and raises `ValueError` where it is asked for what it has not. Both parts of a complex
-    image have the same prior; a complex Jacobian is given conjugated.
+    A new quadratic prior is a class with `covariance_product`, `precision` and `basis`; one whose energy is not xᵀQx
+    overrides `penalty`, and raises `ValueError` in the methods that do not apply. Both parts of a complex image have
+    the same prior; a complex Jacobian is given conjugated.
     """
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether the energy is xᵀQx, of a Gaussian: what linear images, rules for λ and memories need."""
+        """Whether the energy is xᵀQx, of a Gaussian, as linear images, rules for λ and memories require."""
         return True
 
     @property
@@ -122,11 +122,11 @@ class AbstractPrior(eqx.Module):
         """S with Γ = S Sᵀ, for nonlinear reconstructions; where Q has a null space, a wide prior stands for none."""
 
     def informed_basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
-        """What stands for S where there are many cells, if that is too large: see `informed_shapes`."""
+        """A smaller basis in place of S where there are many cells: see `informed_shapes`."""
         return self.basis(mesh, jacobian)
 
     def null_space(self, mesh: Mesh) -> Float[Array, "m p"]:
-        """Basis of the images that cost nothing; none unless a prior says otherwise."""
+        """Basis of the images of zero energy; none unless a prior defines one."""
         return host.zeros((mesh.num_cells, 0))
 
 
@@ -176,7 +176,7 @@ class Noser(AbstractPrior):
 class Laplace(AbstractPrior):
     """Laplace smoothness: Q = 2 × graph Laplacian of face-neighbouring cells, xᵀQx = 2 Σ (x_i - x_j)².
 
-    Unweighted by geometry, as the field has it; a constant image costs nothing. Of a solid body of more than 30,000
+    Unweighted by geometry, as is usual in EIT; a constant image costs nothing. Of a solid body of more than 30,000
     cells, whose graph has no factor of a size to keep, neighbours are nodes that share an edge, and a cell has their
     mean.
     """
@@ -205,14 +205,14 @@ class Laplace(AbstractPrior):
         return 2 * (scipy.sparse.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
 
     def basis(self, mesh, jacobian):
-        """All of Q's inverse, dense, the constant image nearly free."""
+        """A root of Q's inverse, dense, with the constant image nearly free."""
         precision = self.precision(mesh, jacobian).toarray()
         precision[np.diag_indices_from(precision)] += _FREEDOM
         lower = scipy.linalg.cholesky(precision, lower=True)
         return DenseBasis(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
 
     def informed_basis(self, mesh, jacobian):
-        """As of any prior, the constant image nearly free."""
+        """Informed shapes as of any prior, with the constant image nearly free."""
         if mesh.dimension != 3:
             return self.basis(mesh, jacobian)
         free = partial(_between_nodes, mesh, freedom=_FREEDOM)
@@ -265,7 +265,7 @@ class Gaussian(AbstractPrior):
         return DenseBasis(host.asarray(pivoted_cholesky(ones, column, tolerance=_LEFT_OUT, max_rank=_MOST_SHAPES)))
 
     def informed_basis(self, mesh, jacobian):
-        """As of any prior, by way of a grid, or where that would be too large, of all shapes."""
+        """Informed shapes as of any prior, computed on a grid, or where that would be too large, from all shapes."""
         places = np.asarray(centroids(mesh))
         if not GriddedGaussian.suits(places, float(self.length)):
             return self.basis(mesh, jacobian)
@@ -273,7 +273,7 @@ class Gaussian(AbstractPrior):
         return informed_shapes(np.asarray(jacobian), grid.product, grid.variance)
 
     def precision(self, mesh, jacobian):
-        """Not to be had: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""
+        """Not available: the inverse of a Gaussian covariance is dense and ill-conditioned. Raises `ValueError`."""
         raise ValueError(
             "prior: Gaussian has no usable precision matrix, which bounds need; take Noser, Tikhonov, Laplace or "
             "TotalVariation, or link=Bounded(lower, upper) in place of bounds."
@@ -332,8 +332,8 @@ def check_cells(mesh: Mesh) -> None:
 
 
 def cell_factorisation(mesh: Mesh, groups) -> tuple[SparsityPattern, FactorisationPlan]:
-    """Of matrices between cells that are made of entries between `groups` of them: where these go, and how to
-    factorise. Works where the mesh's points are traced, too."""
+    """Pattern and factorisation plan of matrices between cells that are made of entries between `groups` of them. Works
+    where the mesh's points are traced, too."""
     centres = centroids(mesh)
     with jax.ensure_compile_time_eval():
         pattern = SparsityPattern.from_elements(groups, size=mesh.num_cells)

@@ -25,7 +25,7 @@ from jeit.mesh.geometry import interior_facets
 from jeit_solvers import Factor, FactorisationPlan, SparsityPattern, factorise, solve, solve_definite
 from jeit_solvers.engines import has_values, host, namespace, on_host, sum_into
 
-# Pull to the background, relative to the price of an edge: what fixes an image that the data do not.
+# Pull to the background, relative to the price of an edge: it determines the image where the data do not.
 _LEVEL = 1e-3
 
 
@@ -34,7 +34,7 @@ class TotalVariation(AbstractPrior):
 
     In a solid body the image is linear between its nodes, and a cell has their mean; in a sheet every cell has its own.
     `smoothing` β: jumps below it, on the link's scale (`Log()`: relative), cost by their square. Its energy is not
-    quadratic, so linear images and the rules that choose λ have no use for it: λ is a number, 300 unless given. Raises
+    quadratic, so linear images and the rules that choose λ cannot use it: λ is a number, 300 unless given. Raises
     `ValueError` for a smoothing that is not positive.
     """
 
@@ -46,7 +46,7 @@ class TotalVariation(AbstractPrior):
 
     @property
     def is_quadratic(self) -> bool:
-        """It is not."""
+        """False."""
         return False
 
     @property
@@ -55,15 +55,15 @@ class TotalVariation(AbstractPrior):
         return EDGE_PRICE
 
     def covariance_product(self, mesh, jacobian) -> NoReturn:
-        """Not to be had. Raises `ValueError`."""
+        """Not available. Raises `ValueError`."""
         _refuse("covariance")
 
     def precision(self, mesh, jacobian) -> NoReturn:
-        """Not to be had. Raises `ValueError`."""
+        """Not available. Raises `ValueError`."""
         _refuse("precision matrix")
 
     def basis(self, mesh, jacobian) -> NoReturn:
-        """Not to be had. Raises `ValueError`."""
+        """Not available. Raises `ValueError`."""
         _refuse("basis of independent shapes")
 
     def penalty(self, mesh, reference, hyperparameter, *, jacobian=None, regions=None, per_cell=False):
@@ -125,7 +125,8 @@ class TotalVariationPenalty(AbstractPenalty):
 
     @property
     def tolerance(self) -> float:
-        """Lagged diffusivity comes nearer by a constant share a step, and its last steps change nothing to be seen."""
+        """Relative change of the objective that ends a descent: lagged diffusivity converges linearly, and its last
+        steps change nothing visible."""
         return 1e-4
 
     def cost(self, coefficients):
@@ -135,14 +136,15 @@ class TotalVariationPenalty(AbstractPenalty):
         return edges + 0.5 * (self.level * image**2).sum() + 0.5 * rest @ rest
 
     def diagonal(self, coefficients):
-        """Of the form that touches the energy at c."""
+        """Diagonal of the form that touches the energy at c."""
         image, rest = self._parts(coefficients)
         stiffness = self.weight / self._height(image)
         own = self.level.at[self.pairs[:, 0]].add(stiffness).at[self.pairs[:, 1]].add(stiffness)
         return jnp.concatenate([own, jnp.ones_like(rest)])
 
     def inverse_hessian(self, coefficients, free, columns):
-        """Of the energy's own Hessian, with β² / (d² + β²) of the touching form's weights: zero across high edges."""
+        """Approximate inverse of the energy's own Hessian, with β² / (d² + β²) of the touching form's weights: zero
+        across high edges."""
         image, _ = self._parts(coefficients)
         mine = free[: self.level.shape[0]]
         bend = self.weight * self.smoothing**2 / self._height(image) ** 3
@@ -155,8 +157,8 @@ class TotalVariationPenalty(AbstractPenalty):
         return jnp.concatenate([solve(self.plan, factor, image_columns), other])
 
     def normal(self, coefficients):
-        """Of the form that touches the energy at c: each jump normal of variance √(d² + β²) / weight, as if where the
-        edges are, and how high, were known. None between bounds."""
+        """Normal distribution of the form that touches the energy at c: each jump is normal with variance √(d² + β²) /
+        weight, as if where the edges are, and how high, were known. None between bounds."""
         if self.between_bounds:
             return None
         image, _ = self._parts(coefficients)
@@ -197,7 +199,7 @@ class TotalVariationPenalty(AbstractPenalty):
         return solve(self.plan, self._factor(stiffness), columns)
 
     def _factor(self, stiffness) -> Factor:
-        """Of Q."""
+        """Factorise Q."""
         link = stiffness[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
         return factorise(self.plan, self.pattern.assemble(link, self.level[:, None, None]))
 

@@ -1,4 +1,4 @@
-"""Bodies as shapes with few parameters: what is told of a body where voltages tell too little for an image."""
+"""Shape reconstruction: bodies described by few parameters, for voltages that do not determine a full image."""
 
 from __future__ import annotations
 

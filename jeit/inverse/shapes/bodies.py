@@ -1,4 +1,4 @@
-"""Some bodies on a mesh: what they have in common whatever their form, from coefficients to conductivity.
+"""Base classes of bodies on a mesh, of any form: conductivity computed from the bodies' coefficients.
 
     log σ/σ₀ = drift + Σ_bodies mixture(share of a cell that a body covers, ± contrast),
 
@@ -19,17 +19,17 @@ from jaxtyping import Bool, Float, Int
 
 from jeit.arguments import describe, is_number
 
-# Fields of `Bodies` that say one thing of every body, besides where it starts.
+# Fields of `Bodies` with one value for every body, besides its start.
 _OF_EACH = ("sign", "other", "alike")
 
 
 @dataclass(frozen=True)
 class BodyPrior(abc.ABC):
-    """What bodies are expected to be; standard deviations, lengths in units of the longer side of the whole body.
+    """Prior of bodies, as standard deviations; lengths are in units of the longer side of the whole body.
 
-    - `modes`: of a form, how fine; 1 makes disks and balls.
+    - `modes`: number of modes of a body's form; 1 makes disks and balls.
     - `place`: of the centre about where the search starts. `radius` with the spread of its logarithm.
-    - `roughness`: how far from round.
+    - `roughness`: deviation of the form from round.
     - `drift`: of the logarithm of the bath's conductivity between the two frames.
     - `apart`: over the share of the whole body by which two bodies overlap, its standard deviation. Without it two of
       opposite sign may lie on each other and cancel.
@@ -54,12 +54,12 @@ class BodyPrior(abc.ABC):
 
     @property
     def _numbers(self) -> dict[str, Any]:
-        """What has to be positive."""
+        """Values that have to be positive."""
         return vars(self)
 
     @property
     def is_of_one_kind(self) -> bool:
-        """Whether it is known beforehand of which of two kinds bodies are."""
+        """Whether bodies can be of one of the two kinds only."""
         return False
 
     @property
@@ -103,7 +103,8 @@ class Bodies(abc.ABC):
     **Fields**: `prior` of every body; `weight` (m,), every cell's share of the whole measure; `span`, the longest side
     of the whole body; `start` (k, d), metres, and `sign` (k,) of every body; `other` (k,), whether it is of the form's
     other kind: weak among stars, a column among ellipsoids; `alike` (k,), whether it is of one material with all others
-    of its sign that are: the contrast of the first of them is theirs, and their own coefficients of it tell nothing.
+    of its sign that are: they share the contrast of the first of them, and their own coefficients of contrast have no
+    effect.
     """
 
     prior: Any
@@ -117,16 +118,16 @@ class Bodies(abc.ABC):
     @property
     @abc.abstractmethod
     def odds(self) -> float:
-        """Logarithm of the odds against bodies of their kinds, beforehand."""
+        """Logarithm of the prior odds against bodies of their kinds."""
 
     @property
     @abc.abstractmethod
     def num_splits(self) -> int:
-        """Along how many of its axes, from the longest, it is tried whether a body is two."""
+        """Number of axes, from the longest, along which a body is tentatively split in two."""
 
     @abc.abstractmethod
     def otherwise(self, some: Any, coefficients: Float[np.ndarray, " n"]) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The same with `some` bodies taken for the other kind, and about as much of an effect."""
+        """The same bodies with `some` of them of the other kind, with about the same effect."""
 
     @abc.abstractmethod
     def mixture(self, share: Float[np.ndarray, " c"], contrast: float) -> tuple[Any, Any, Any]:
@@ -134,7 +135,7 @@ class Bodies(abc.ABC):
 
     @abc.abstractmethod
     def covered(self, k: int, row: Float[np.ndarray, " q"]) -> Covered:
-        """What body k, of these coefficients, covers."""
+        """The cells that body k, of these coefficients, covers."""
 
     @abc.abstractmethod
     def axis(self, k: int, row: Float[np.ndarray, " q"], number: int) -> Float[np.ndarray, " d"]:
@@ -146,12 +147,12 @@ class Bodies(abc.ABC):
 
     @property
     def dimension(self) -> int:
-        """d."""
+        """Spatial dimension d."""
         return self.start.shape[1]
 
     @property
     def first(self) -> Int[np.ndarray, " k"]:
-        """The body whose contrast every one has: itself, or the first that is of one material with it."""
+        """Index of the body whose contrast each body has: itself, or the first of the same material."""
         order, first = np.arange(len(self.sign)), np.arange(len(self.sign))
         for one in (self.alike & (self.sign == sign) for sign in (-1, 1)):
             first[one] = order[one].min(initial=len(order))
@@ -180,15 +181,15 @@ class Bodies(abc.ABC):
         return np.append(0, rows)
 
     def centre(self, k: int, row: Float[np.ndarray, " q"]) -> Float[np.ndarray, " d"]:
-        """Of body k, metres."""
+        """Centre of body k, metres."""
         return self.start[k] + self.prior.place * self.span * row[: self.dimension]
 
     def log_radius(self, row: Float[np.ndarray, " q"]) -> float:
-        """Of the mean radius of a body, metres."""
+        """Logarithm of the mean radius of a body, metres."""
         return np.log(self.prior.radius * self.span) + self.prior.radius_spread * row[self.dimension]
 
     def contrast(self, k: int, row: Float[np.ndarray, " q"]) -> tuple[float, float]:
-        """Of log σ of body k, positive, and its derivative by the coefficient."""
+        """Contrast of log σ of body k, positive, and its derivative by the coefficient."""
         return self.prior.contrast_of(row[self.dimension + 1], bool(self.other[k]))
 
     def shown(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
@@ -196,7 +197,7 @@ class Bodies(abc.ABC):
         return self.image(coefficients).image
 
     def only(self, some) -> Self:
-        """Some of them."""
+        """A subset of the bodies."""
         some = np.asarray(some, int)
         return replace(self, **{name: getattr(self, name)[some] for name in ("start", *_OF_EACH)})
 

@@ -19,18 +19,18 @@ from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh, measures
 
-# How much likelier (of the logarithm) one kind of body has to make the data than the other, or one material than
-# several, not to be told as one of two. Steps to what else may be, and how precisely.
+# Least difference of log evidence between the two kinds of body, or between one material and several, for which only
+# the likelier is reported. Steps of the fit of an alternative, and its tolerance.
 _UNDECIDED, _STEPS, _ROUGHLY = 4.0, 8, 1e-2
-# What the mesh adds to the deviation of a solid body's contrast, of log σ: balls of three times the bath are told as
-# 3.87, 3.59 and 3.31 times where edges on their surfaces are 0.7, 0.5 and 0.35 of the radius, and as 3.1 to 3.2 times
-# where they are 0.25.
+# Contribution of the mesh to the deviation of a solid body's contrast, of log σ: balls of three times the bath's
+# conductivity are estimated at 3.87, 3.59 and 3.31 times where edges on their surfaces are 0.7, 0.5 and 0.35 of the
+# radius, and as 3.1 to 3.2 times where they are 0.25.
 _BY_THE_MESH = 0.1
 
 
 def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> list[float]:
-    """Standard deviations of the contrasts of bodies; of those of one material so large that they reach the deviation
-    of `each` for itself too, where the data do not tell that they are."""
+    """Standard deviations of the contrasts of bodies. Where the data do not determine that bodies are of one material,
+    theirs are large enough to include the contrasts of `each`, the fit with a material for every body."""
     contrast, deviation = _contrasts(problem, fitted)
     if each and problem.surprise(each) - each.bodies.odds < problem.surprise(fitted) - fitted.bodies.odds + _UNDECIDED:
         own, its = _contrasts(problem, each)
@@ -47,8 +47,8 @@ def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " 
 
 
 def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | None, float]]:
-    """Every ellipsoid as a column, and every column as an ellipsoid, that explains the data about as well, whichever is
-    more likely beforehand; and the deviation of its contrast."""
+    """Bodies of the other kind, columns for ellipsoids and ellipsoids for columns, where they explain the data about as
+    well, whichever is more likely beforehand; and the deviations of their contrasts."""
     bodies, number = fitted.bodies, len(fitted.bodies.sign)
     if not number or bodies.prior.is_of_one_kind or not isinstance(bodies, Ellipsoids):
         return [(None, np.nan)] * number
@@ -65,19 +65,20 @@ def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | N
 KINDS = ("either", "ellipsoids", "columns")
 """Of bodies that there may be in a solid: balls and the like, those through its whole height, or either."""
 
-# Corners' weights of the twenty points at which a cell is asked whether it lies in a body: each stands for as much.
+# Barycentric weights of the twenty points at which a cell is sampled; each stands for an equal part of it.
 _SAMPLES = np.array([[2 * n + 1 for n in one] for one in np.ndindex(4, 4, 4, 4) if sum(one) == 3]) / 10
-# Over how much of a cell's size a surface is blurred: enough to be differentiable, and little, for blurred bodies are
-# wider than they are large, and are fitted as smaller and stronger ones.
+# Width of the blur of a surface, in units of a cell's size: enough to be differentiable, but small, since blurred
+# bodies are fitted as smaller and stronger ones.
 _BLUR = 0.1
-# Of means of cells on a surface, for bodies more and less conductive than the bath. By them the change of voltages of
-# balls, 0.1 to 12 times as conductive, is that of meshes cut along them to 1 to 5 % where edges are half the radius;
-# with one for both, 0.15, those of 12 times changed 13 to 19 % too much, with the first order of the edges.
+# Exponents of the power means in cells on a surface, for bodies more and less conductive than the bath. With them the
+# change of voltages of balls, 0.1 to 12 times as conductive, is that of meshes cut along them to 1 to 5 % where edges
+# are half the radius; with one for both, 0.15, those of 12 times changed 13 to 19 % too much, with the first order of
+# the edges.
 _POWERS = {1: -1.0, -1: 0.5}
-# How far from a surface edges are short, of the least half axis; and the least of that which is heeded, of the mean
-# radius.
+# Distance from a surface within which edges are short, in units of the least half axis; and the least value of that
+# axis that is used, in units of the mean radius.
 _BAND, _LEAST_AXIS = 0.1, 0.6
-# Beyond so many widths of the blur from a surface a cell's share is less than 1e-8.
+# Widths of the blur from a surface beyond which a cell's share is less than 1e-8.
 _REACH = 20
 # Orthonormal directions of S.
 _STRETCHES = np.array(
@@ -89,17 +90,17 @@ _STRETCHES = np.array(
         np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]]) / np.sqrt(2),
     ]
 )
-# Which of them are level, and of no trace along x and y.
+# The directions that are level, and have no trace along x and y.
 _LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
 class EllipsoidPrior(BodyPrior):
-    """Of ellipsoids: `modes` 2, or 1 for balls; `roughness`, of the logarithm of the axes' ratios; `contrast` of log σ
-    and the spread of its logarithm; `odds_for_columns`, how many times as likely as an ellipsoid a column is
+    """Prior of ellipsoids: `modes` 2, or 1 for balls; `roughness`, of the logarithm of the axes' ratios; `contrast` of
+    log σ and the spread of its logarithm; `odds_for_columns`, how many times as likely as an ellipsoid a column is
     beforehand: most tanks hold columns; `odds_for_one_material`, how many times as likely all bodies of a sign, more or
-    less conductive than the bath, are of the same as each of its own; `kinds` of bodies that there may be, one
-    of `KINDS`. Smooth images of solids tell places well, so `place` is small. The rest as of `BodyPrior`.
+    less conductive than the bath, are of the same as each of its own; `kinds` of bodies that there may be, one of
+    `KINDS`. Smooth images of solids locate bodies well, so `place` is small. The rest as of `BodyPrior`.
 
     Raises `ValueError` for what is not positive, and for other kinds.
     """
@@ -142,13 +143,13 @@ class EllipsoidPrior(BodyPrior):
 
 
 class Ellipsoid(eqx.Module):
-    """A body that was found in a solid.
+    """A body found in a solid, an ellipsoid or a column.
 
     **Fields**: `sign`, +1 conductive or -1 resistive; `centre` (3,) metres; `axes` (3, 3), half axes as rows, metres,
     the longest first; `volume` m³ and `centroid` (3,) metres, of the part that lies in the whole body; `contrast` of
     log σ, positive; `column`, whether it is no ellipsoid, but stands through the whole height, half of which is one of
-    the half axes then; `alike`, whether it is taken to be of one material with the others of its sign; `rise`, how many
-    times the objective is, at its least, without this body: what tells a body from a ghost.
+    the half axes then; `alike`, whether it is taken to be of one material with the others of its sign; `rise`, the
+    factor by which the least objective grows without this body, which distinguishes a body from a ghost.
     """
 
     sign: int
@@ -168,11 +169,11 @@ class Ellipsoid(eqx.Module):
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether by the data: of every ellipsoid."""
+        """Whether the contrast is determined by the data: true of every ellipsoid."""
         return True
 
     def holds(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
-        """Which of points, metres, lie inside."""
+        """Whether points, metres, lie inside."""
         length = (self.axes**2).sum(axis=1)
         along = (points - self.centre) @ self.axes.T / length
         if self.column:
@@ -205,7 +206,8 @@ class Ellipsoids(Bodies):
 
     @property
     def odds(self) -> float:
-        """What columns, and bodies of one material, are more likely by beforehand."""
+        """Logarithm of the prior odds against the bodies' kinds: columns, and bodies of one material, are more
+        likely."""
         materials = len(set(self.sign[self.first != np.arange(len(self.sign))]))
         columns = 0 if self.prior.is_of_one_kind else self.other.sum()
         prior = np.log([self.prior.odds_for_columns, self.prior.odds_for_one_material])
@@ -213,7 +215,8 @@ class Ellipsoids(Bodies):
 
     @property
     def num_splits(self) -> int:
-        """The longest: neighbours that merge make a long one, and every try is some tens of solves of a solid."""
+        """One, the longest axis: merged neighbours make a long body, and every trial costs some tens of solves of a
+        solid."""
         return 1
 
     def otherwise(self, some, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
@@ -266,7 +269,7 @@ class Ellipsoids(Bodies):
         return replace(there, other=self.other, alike=self.alike, span=self.span)
 
     def edges(self, coefficients, edge: float, corners: Float[np.ndarray, "m 4 3"]) -> Float[np.ndarray, " m"]:
-        """How long edges of cells of some `corners`, metres, may be, metres: on surfaces `edge` times the least half
+        """Greatest length of the edges of cells with these `corners`, metres: on surfaces `edge` times the least half
         axis, infinite elsewhere."""
         longest = np.full(len(corners), np.inf)
         for k, row in enumerate(self.rows(coefficients)):
@@ -343,7 +346,7 @@ class Ellipsoids(Bodies):
         reach = np.linalg.norm(round_offset, axis=-1)
         # Along the line from the centre, the surface lies at radius · distance / reach.
         surface = radius * distance / reach
-        # What is blurred off a convex body is less than what is blurred on: less by that, it keeps its volume.
+        # The blur takes less off a convex body than it adds: reduced by the excess, the body keeps its volume.
         excess = (np.pi * width) ** 2 * (axes.sum() - 1) / (6 * surface)
         inside = 0.5 * (1 + np.tanh(0.5 * (surface - excess - distance) / width))
         edge = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(surface - excess - distance)

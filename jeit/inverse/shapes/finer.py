@@ -1,9 +1,9 @@
-"""A problem of bodies on a mesh that is finer on their surfaces.
+"""Refinement of a shape problem: the mesh is made finer on the surfaces of the bodies.
 
-A mesh that is even enough for a smooth image holds a body of a few cells badly: its voltages are off by the first order
-of the edges on its surface, not all by the same factor, and what is off looks like another body. So bodies that were
-found are fitted again where the mesh has been bisected for them; everything else stays as it was, the voltages of the
-background included.
+A mesh that suffices for a smooth image resolves a body of a few cells badly: the error of its voltages is of first
+order in the edges on its surface, is not the same factor for all of them, and looks like another body. So bodies that
+were found are fitted again on a mesh that is bisected at their surfaces; everything else stays as it was, the voltages
+of the background included.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from jeit.mesh.bisection import bisected
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
-# How many times the nodes a finer mesh may have.
+# Factor by which a finer mesh may have more nodes.
 _MOST = 2.5
 
 
@@ -40,21 +40,21 @@ class Finer(NamedTuple):
     cell: Int[np.ndarray, " f"]
 
     def change(self, protocol: Protocol, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " M"]:
-        """How voltages of a protocol change, volts, by the `image` of bodies and a `field` (m,) or 0, of log σ."""
+        """Change of a protocol's voltages, volts, due to the `image` of bodies and a `field` (m,) or 0, of log σ."""
         model, background = self.problem.model.with_protocol(protocol), self.problem.background
         after = self.conductivity(image, field)
         return solved_fields(model, after).voltages - solved_fields(model, background).voltages
 
     def conductivity(self, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " f"]:
-        """Of the finer cells, S/m, for the `image` of bodies and a `field` (m,) or 0, of log σ."""
+        """Conductivity of the finer cells, S/m, for the `image` of bodies and a `field` (m,) or 0, of log σ."""
         return self.problem.background * np.exp(image + np.broadcast_to(field, self.cell.max() + 1)[self.cell])
 
 
 def finer(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> Finer:
-    """The problem on a mesh that is finer on the surfaces of the bodies of a fit, ellipsoids: of `edges`, times the
-    least half axis, the first with which it grows little, or the last.
+    """The problem on a mesh refined on the surfaces of a fit's ellipsoids. The length of edges there, in units of the
+    least half axis, is the first of `edges` with which the mesh grows little, or the last.
 
-    What that does to the voltages of the background, it does to the data as well: they are told from it.
+    The change that the finer mesh makes to the voltages of the background is added to the data as well.
     """
     bodies, model = fit.bodies, problem.model
     assert isinstance(bodies, Ellipsoids)

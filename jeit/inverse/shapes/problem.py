@@ -1,7 +1,7 @@
 """The nonlinear problem of bodies and the smooth conductivity field beside them.
 
-What else than bodies there is in a solid, as a smooth field: salt that has sunk from a ball of agar to the floor, a
-bath of uneven temperature, contacts that have changed. Bodies alone would bend to explain it.
+The smooth field represents what is in a solid besides the bodies: salt that has sunk from a ball of agar to the floor,
+a bath of uneven temperature, contacts that have changed. Bodies alone would bend to explain it.
 
     log σ/σ₀ = bodies + level · field,    field ~ N(0, Γ) as of a smooth image's prior,
 
@@ -11,9 +11,9 @@ noise; MacKay, Neural Computation 4 (1992) 415, levels by evidence.
 
 Least squares for the coefficients of bodies: ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², r = w (v(σ(c)) - ŷ).
 
-How well some bodies explain the data, number and kind open, is told by the evidence, the probability of the data
-whatever the coefficients. By Laplace's approximation at the least cost, -log evidence = cost + ½ log det H + const,
-with H = 1 + JᵀC⁻¹J the Hessian in units of the prior: every coefficient costs as much as it has to be told precisely.
+The evidence, the probability of the data integrated over the coefficients, measures how well bodies of any number and
+kind explain the data. By Laplace's approximation at the least cost, -log evidence = cost + ½ log det H + const, with H
+= 1 + JᵀC⁻¹J the Hessian in units of the prior: every coefficient costs more the more precisely it is determined.
 MacKay, Neural Computation 4 (1992) 415, section 2.
 """
 
@@ -79,7 +79,7 @@ class SmoothField:
         return replace(self.alone, data=data)
 
     def likeliest(self, fit: Fit) -> float:
-        """The level of which tells what bodies leave of the voltages."""
+        """The level with the greatest evidence, given the voltages that the bodies do not explain."""
         residual = self._left(fit)
 
         def surprise(level: float) -> float:
@@ -89,19 +89,19 @@ class SmoothField:
         return min(_LEVELS, key=surprise)
 
     def estimate(self, level: float, fit: Fit) -> Float[np.ndarray, " m"]:
-        """level · field (m,), of log σ/σ₀, that explains best what the bodies leave of the voltages."""
+        """level · field (m,), of log σ/σ₀, that best explains the voltages that the bodies do not explain."""
         precision = self.beside(level).data.precision
         coefficients: Any = -(level**2) * self.jacobian.T @ (precision @ self._left(fit))
         return self.scale * np.asarray(self.image.inversion.basis.expand(coefficients))
 
     def _left(self, fit: Fit) -> Float[np.ndarray, " r"]:
-        """What bodies predict too much of the weighted voltages."""
+        """Residual of the weighted voltages: those predicted for the bodies less the data."""
         return fit.rows[0][: len(self.jacobian)]
 
 
 class Fit(NamedTuple):
-    """Bodies and their `coefficients` (n,) of least `cost`; there, the residual and its Jacobian as `rows`, of the
-    problem that they were fitted to, whatever its covariance."""
+    """Bodies and their `coefficients` (n,) of least `cost`, with the residual there and its Jacobian as `rows`, both of
+    the problem that was fitted, whatever its covariance."""
 
     bodies: Bodies
     coefficients: Float[np.ndarray, " n"]
@@ -125,7 +125,7 @@ class ShapeProblem:
         conductivity = self.background * np.exp(image)
         fields = solved_fields(self.model, conductivity)
         weight = np.asarray(self.data.weight)
-        # That bodies keep apart is one more datum of unit variance for every two of them.
+        # The condition that bodies keep apart is one more datum of unit variance for every two of them.
         apart, more = bodies.prior.apart, np.eye(len(overlap))
 
         def jacobian():
@@ -163,7 +163,7 @@ class ShapeProblem:
 
     @property
     def uncertainty(self) -> float:
-        """What the covariance of the data adds to the -log evidence: half the logarithm of its determinant."""
+        """Contribution of the data's covariance to the -log evidence: half the logarithm of its determinant."""
         return 0.5 * float(np.linalg.slogdet(np.asarray(self.data.covariance))[1])
 
     def surprise(self, fit: Fit) -> float:

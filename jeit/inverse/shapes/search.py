@@ -1,4 +1,4 @@
-"""`reconstruct_shapes`: the bodies that explain a frame of voltages, as many as it tells of."""
+"""`reconstruct_shapes`: the bodies that explain a frame of voltages; their number is estimated from the data."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from jeit_solvers.engines import as_array
 if TYPE_CHECKING:
     from jeit.inverse.shapes.finer import Finer
 
-# How many times the objective must rise, at least, when a body is left out and the others fitted again.
+# Least factor by which the objective must rise when a body is left out and the others are fitted again.
 LEAST_RISE = 1.4
 _FIRST_STEPS, _STEPS, _STEPS_WITHOUT, _STEPS_TRIED = 15, 40, 8, 6
 _ROUGHLY = 1e-2
 # After so many in a row that data do not ask for, weaker ones are not tried.
 _MOST_REFUSED = 2
-# How many times the objective rises at least without a body that is one beyond doubt.
+# Least factor by which the objective rises without a body, for the body to be beyond doubt.
 _SURELY = 10.0
-# How many changes of their number or kind are made at most.
+# Greatest number of changes of the number or kind of bodies.
 _MOST_CHANGES = 10
-# How often the mesh is made finer where bodies are, at most: they move by it. And the lengths of edges there, of the
-# least half axis, that are tried in turn: first while ghosts are among the bodies, and then.
+# Greatest number of times that the mesh is refined at the bodies, which move as a result. And the lengths of edges
+# there, in units of the least half axis, that are tried in turn: while ghosts are among the bodies, and afterwards.
 _MOST_MESHES, _EDGES = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
-# How much likelier (of the logarithm) more has to make the data than less, to be told.
+# Least gain of the log evidence for which the richer of two descriptions of the bodies is accepted.
 _MARGIN = 2.0
 
 
@@ -47,25 +47,25 @@ Body = Star | Ellipsoid
 
 
 class FinerImage(eqx.Module):
-    """The `conductivity` (c,), S/m, of the cells of a finer mesh, that of `model`, on which electrodes lie as before;
-    its protocol is another, of independent channels."""
+    """Conductivity on a finer mesh: `conductivity` (c,), S/m, of the cells of the mesh of `model`. The electrodes lie
+    as before; the protocol of `model` is another one, of independent channels."""
 
     model: ForwardModel
     conductivity: Float[Array, " c"]
 
 
 class ShapeReconstruction(eqx.Module):
-    """What `reconstruct_shapes` found.
+    """Result of `reconstruct_shapes`.
 
     **Fields**: `bodies`, `Star`s of a sheet and `Ellipsoid`s of a solid, those that explain most first; `conductivity`
     (m,), S/m (2-D: S), of a solid's cells that are covered in part the geometric mean; `voltages` (M,), what the model
     predicts for the bodies; `misfit`, root mean square of predicted - measured over the channels used, in standard
-    deviations; `drift`, how many times as conductive as its `background` the bath is, less one; `doubtful`, bodies that
-    were started from and left out again, their `rise` too small; `contrast_deviations`, standard deviation of each
-    body's contrast, after the data and as far as noise is all that is wrong, in solids with 0.1 for the mesh besides;
-    `alternatives`, each body of a solid as the other kind, ellipsoid or column, where the data do not tell which it is,
-    else None; `alternative_deviations`, of their contrasts, or NaN; `finer`, of a solid in which there are any, on the
-    last of the meshes that are finer at their surfaces: for pictures.
+    deviations; `drift`, the bath's conductivity over its `background`, less one; `doubtful`, bodies among the starts
+    that were left out again because their `rise` is too small; `contrast_deviations`, posterior standard deviation of
+    each body's contrast due to noise, in solids with 0.1 added for the mesh; `alternatives`, each body of a solid as
+    the other kind, ellipsoid or column, where the data do not determine which it is, else None;
+    `alternative_deviations`, of their contrasts, or NaN; `finer`, of a solid in which there are any, on the last of the
+    meshes that are finer at their surfaces: for pictures.
     """
 
     bodies: tuple[Body, ...]
@@ -86,12 +86,12 @@ class ShapeReconstruction(eqx.Module):
 
     @property
     def rule(self) -> str:
-        """No rule chose it: "none"."""
+        """ "none", as no rule chooses a hyperparameter."""
         return "none"
 
     @property
     def choice(self) -> None:
-        """None."""
+        """None, as there is no hyperparameter."""
         return None
 
 
@@ -108,25 +108,28 @@ def reconstruct_shapes(
     smooth: Reconstruction | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ShapeReconstruction:
-    """The bodies, star shapes in a sheet and ellipsoids in a solid, that explain measured `voltages` (M,), in volts.
+    """Estimate the bodies, star shapes in a sheet and ellipsoids in a solid, that explain measured `voltages` (M,), in
+    volts.
 
-    - `background`: conductivity without them, one number or (m,), S/m (2-D: S); what it has drifted is estimated.
+    - `background`: conductivity without them, one number or (m,), S/m (2-D: S); its drift is estimated.
     - `start`: sign, centre (x, y) or (x, y, z) and radius, metres, of every body that may be there, such as of all the
-      inclusions of an image; too many do no harm, and two that are one there are told apart; where none is, none is
-      added.
+      inclusions of an image; surplus starts do no harm, and two bodies that share one start are separated; no body is
+      added where no start is given.
     - `noise`, `mask`: as in `jeit.inverse.reconstruct`.
     - `prior`: `StarPrior()` of sheets, `EllipsoidPrior()` of solids, unless given.
-    - `least_rise`: bodies whose loss raises the objective less than so many times are taken for ghosts; and those whose
-      evidence is not for them.
-    - `smooth`: an image of the same channels by a smooth prior and no bounds; what it shows beside bodies is let stay
-      as a `SmoothField`, of as much as the evidence is for, and only bodies that are told beside it are fitted.
+    - `least_rise`: bodies without which the objective rises by less than this factor, or that the evidence does not
+      favour, are treated as ghosts.
+    - `smooth`: an image of the same channels by a smooth prior and no bounds; what it shows besides bodies is modelled
+      as a `SmoothField`, whose level is chosen by the evidence, and only bodies that are detected beside that field are
+      fitted.
     - `progress` is called with the name of each stage as it begins: those of a solid take up to a minute.
 
-    All are fitted together, as strong disks or balls first. Then one after the other is left out and the rest fitted
-    again, and that which is missed least goes, for as long as it is missed so little. What errors of the model and
-    electrodes gone missing make of themselves is missed little, for other bodies can take its place. Of what is left,
-    each is split in two, or taken for the other kind, a weak star or a column from floor to lid, where the evidence is
-    for it (`ShapeProblem.surprise`): once splits first, once kinds first, and the better of the two is kept.
+    All bodies are first fitted together, as strong disks or balls. Then each in turn is left out and the rest are
+    fitted again, and the body whose loss raises the objective least is removed, as long as the rise is small. Ghosts
+    due to errors of the model and missing electrodes are removed in this way, since other bodies can take their place.
+    Each remaining body is split in two, or changed to the other kind, a weak star or a column from floor to lid, where
+    the evidence favours it (`ShapeProblem.surprise`): once with splits first, once with kinds first; the better result
+    is kept.
 
     Raises `ValueError` for arguments that do not fit, and for a `smooth` that is no image of these channels by a smooth
     prior.
@@ -215,13 +218,13 @@ def _grown(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
 
 
 class _Setting(NamedTuple):
-    """What bodies are fitted in: the problem of them `alone`, or with a smooth field `beside` it."""
+    """Setting in which bodies are fitted: the problem of them `alone`, or with a smooth field `beside` it."""
 
     alone: ShapeProblem
     beside: SmoothField | None
 
     def problem(self, level: float) -> ShapeProblem:
-        """With the field at a level."""
+        """The problem with the field at a level."""
         return self.alone if self.beside is None else self.beside.beside(level)
 
     def on(self, alone: ShapeProblem) -> _Setting:
@@ -259,7 +262,7 @@ def _added_one_by_one(setting: _Setting, bodies: Bodies, coefficients, sure: int
 
 
 class _Found(NamedTuple):
-    """Bodies that data tell of, and their rises; and those left out."""
+    """Bodies that the data support, with their rises, and the bodies left out."""
 
     fit: Fit
     rises: list[float]
@@ -267,7 +270,7 @@ class _Found(NamedTuple):
 
 
 class _State(NamedTuple):
-    """What was `found` in a `setting`, with the field at its `level`."""
+    """State of the search: the bodies `found` in a `setting`, with the field at its `level`."""
 
     setting: _Setting
     level: float
@@ -324,7 +327,7 @@ def _without_ghosts(
     doubtful, missed = list(doubtful), np.zeros(len(fitted.bodies.sign)) if known is None else known.copy()
     while True:
         bodies, coefficients, cost, _ = fitted
-        # With one ghost fewer in whose place others can step, what was missed is missed as much.
+        # With one ghost fewer that others can replace, the remaining bodies are missed at least as much.
         beyond_doubt = max(_SURELY * cost, problem.surprise(fitted) + _MARGIN)
         unsure, others = np.flatnonzero(missed <= beyond_doubt).tolist(), {}
         for k in unsure:
@@ -339,7 +342,7 @@ def _without_ghosts(
 
 
 def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
-    """The bodies with one of them split in two; None if the data do not tell of it."""
+    """The bodies with one of them split in two; None if the data do not support the split."""
     bodies, coefficients, cost, _ = fitted
     tried = [
         _grown(problem, *bodies.split(k, coefficients, number), _STEPS_TRIED)
@@ -351,8 +354,8 @@ def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None
 
 
 def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
-    """The bodies with one or all of them taken for the other kind, weak stars or columns; None if the data do not tell
-    of it."""
+    """The bodies with one or all of them changed to the other kind, weak stars or columns; None if the data do not
+    support the change."""
     plain = np.flatnonzero(~fitted.bodies.other & (not fitted.bodies.prior.is_of_one_kind))
     some = [[k] for k in plain] + [plain] * (len(plain) > 1)
     found = _best(problem, fitted, [fitted.bodies.otherwise(one, fitted.coefficients) for one in some])

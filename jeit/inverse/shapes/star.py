@@ -17,23 +17,23 @@ from jaxtyping import Bool, Complex, Float
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered
 from jeit.mesh import Mesh, measures
 
-# Corners' weights of the six points at which a cell is asked whether it lies in a body.
+# Barycentric weights of the six points at which a cell is sampled.
 _SAMPLES = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2.5, 2.5, 1], [2.5, 1, 2.5], [1, 2.5, 2.5]]) / 6
-# Over how much of a cell's size an outline is blurred: enough to be differentiable.
+# Width of the blur of an outline, in units of a cell's size: enough to be differentiable.
 _BLUR = 0.2
-# Beyond so many widths of the blur from an outline a cell's share is less than 1e-12.
+# Widths of the blur from an outline beyond which a cell's share is less than 1e-12.
 _REACH = 30
 _OUTLINE = 128
 
 
 @dataclass(frozen=True)
 class StarPrior(BodyPrior):
-    """Of stars: `modes`, N, the finest waves of an outline, 1 makes disks; `roughness`, of the logarithm of r in the
-    second mode; the others have 2/n of it. The rest as of `BodyPrior`, and:
+    """Prior of stars: `modes`, N, the finest waves of an outline, 1 makes disks; `roughness`, of the logarithm of r in
+    the second mode; the others have 2/n of it. The rest as of `BodyPrior`, and:
 
-    - `contrast` of log σ and its spread. What is ten times as conductive or resistive as the bath is hardly told from
-      what is more so: strong bodies are best held strong.
-    - `weak_contrast` and the spread of its logarithm: of bodies that data tell to be weak. `odds_against_weak`: how
+    - `contrast` of log σ and its spread. A body ten times as conductive or resistive as the bath can hardly be
+      distinguished from a stronger one: the contrast of strong bodies is best held fixed at a strong value.
+    - `weak_contrast` and the spread of its logarithm: of bodies that the data show to be weak. `odds_against_weak`: how
       many times as likely strong ones are beforehand.
     """
 
@@ -64,12 +64,12 @@ class StarPrior(BodyPrior):
 
 
 class Star(eqx.Module):
-    """A body that was found.
+    """A body found in a sheet, with a star-shaped outline.
 
     **Fields**: `sign`, +1 conductive or -1 resistive; `centre` (2,), of the star, metres; `outline` (k, 2), metres,
-    counter-clockwise; `contrast` of log σ, positive, told by the data where the body is `weak`, else the prior's, "at
-    least about so much"; `rise`, how many times the objective is, at its least, without this body: what tells a body
-    from a ghost.
+    counter-clockwise; `contrast` of log σ, positive, estimated from the data where the body is `weak`, else the
+    prior's, "at least about so much"; `rise`, the factor by which the least objective grows without this body, which
+    distinguishes a body from a ghost.
     """
 
     sign: int
@@ -81,7 +81,7 @@ class Star(eqx.Module):
 
     @property
     def area(self) -> float:
-        """m²."""
+        """Area, m²."""
         return float(abs(self._moments()[0]))
 
     @property
@@ -91,17 +91,17 @@ class Star(eqx.Module):
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether by the data: of weak bodies."""
+        """Whether the contrast is determined by the data: true of weak bodies."""
         return self.weak
 
     @property
     def centroid(self) -> Float[np.ndarray, "2"]:
-        """Of the area, (2,) metres."""
+        """Centroid of the area, (2,) metres."""
         area, first = self._moments()
         return first / area
 
     def holds(self, points: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
-        """Which of points, metres, lie inside."""
+        """Whether points, metres, lie inside."""
         corner, offset = self._from_centre(self.outline), self._from_centre(points)
         angle = np.unwrap(np.angle(corner))
         turn = angle[0] + (np.angle(offset) - angle[0]) % (2 * np.pi)
@@ -151,16 +151,16 @@ class Stars(Bodies):
 
     @property
     def odds(self) -> float:
-        """What weak ones are less likely by beforehand."""
+        """Logarithm of the prior odds against weak bodies."""
         return float(self.other.sum() * np.log(self.prior.odds_against_weak))
 
     @property
     def num_splits(self) -> int:
-        """Both."""
+        """Two, both axes."""
         return 2
 
     def otherwise(self, some, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
-        """The same with `some` stars taken for weak, and so much larger that they do as much to the field."""
+        """The same stars with `some` of them weak, and larger by as much as keeps their effect on the field."""
         rows, weak = self.rows(coefficients), self.other.copy()
         for k in some:
             strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)
@@ -169,8 +169,8 @@ class Stars(Bodies):
         return replace(self, other=weak), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):
-        """2 artanh(share · tanh(contrast / 2)): Maxwell Garnett's. What a cell of which a share is covered does to the
-        field is so much of what all of it would do."""
+        """2 artanh(share · tanh(contrast / 2)), Maxwell Garnett's formula: the effect on the field of a cell that is
+        covered in part is that share of the effect of a covered cell."""
         strength = np.tanh(contrast / 2)
         steep = 1 / (1 - (share * strength) ** 2)
         return 2 * np.arctanh(share * strength), 2 * strength * steep, steep * share * (1 - strength**2)
@@ -236,8 +236,8 @@ class Stars(Bodies):
 
 
 def _first_crossing(centre: complex, direction, edges) -> tuple[Float[np.ndarray, " k"], bool]:
-    """How far from `centre` lines in some `direction` (k,) first cross `edges` (b, 2), infinity where they do not; and
-    whether the closed line that these are goes round it."""
+    """Distance from `centre` at which lines in some `direction` (k,) first cross `edges` (b, 2), infinity where they do
+    not; and whether the closed line that these are goes round it."""
     start, along = edges[:, 0] - centre, edges[:, 1] - edges[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         across = _cross(direction[:, None], along)

@@ -1,1 +1,1 @@
-"""Frame after frame to images in bounded time: `Imager`, and `stream`, which looks after bad frames."""
+"""Imaging frame after frame in bounded time: `Imager`, and `stream`, which handles bad frames."""

@@ -1,4 +1,4 @@
-"""Which frames are imaged, which in part, and which are refused."""
+"""Checks of frames: whether a frame is imaged, imaged in part, or refused."""
 
 from __future__ import annotations
 
@@ -10,26 +10,28 @@ from jaxtyping import Bool, Float, Int
 from jeit.arguments import counted
 from jeit_solvers import Status
 
-# A frame that differs by more than this, relative to an undisturbed one, is another sensor's, or a fault.
+# A frame that differs from an undisturbed one by more than this share is another sensor's, or faulty.
 _LARGEST_DIFFERENCE = 0.5
-# Beyond this, an electrode is taken for dead whose channels have changed by half or more, and hold most of the change.
+# Beyond this change, an electrode counts as dead if its channels have changed by half or more and hold most of the
+# change.
 _SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
 _LEAST_CHANNELS = 0.5
-# Beyond the same, so many channels that read exactly the same, and more or less than all others, are at a rail.
+# Beyond the same change, this many channels with equal readings, above or below all others, are at a rail.
 _AT_RAIL, _ALIKE = 3, 1e-6
-# Reciprocal channels of nothing but noise are alike by chance: so many standard deviations of that, of so many pairs
-# at least, tell of a change; and a change of less than this, relative to an undisturbed frame, is none.
+# Reciprocal channels that hold only noise agree by chance: a change is detected from this many standard deviations of
+# that agreement, over at least this many pairs; a relative change smaller than the last number, against an undisturbed
+# frame, counts as none.
 _CHANCE, _FEWEST_PAIRS, _EQUAL = 3.0, 10, 1e-12
 
 
 class FrameStatus(StrEnum):
-    """What became of a frame. Each is equal to its word."""
+    """Status of a frame. Each is equal to its word."""
 
     IMAGED = "imaged"
     PARTIAL = "partial"
     """Imaged, with some channels left out."""
     UNCHANGED = "unchanged"
-    """Imaged, though nothing but noise tells it from an undisturbed frame."""
+    """Imaged, though it differs from an undisturbed frame by noise alone."""
     STEP_LIMIT = Status.STEP_LIMIT.value
     """Imaged, though the steps that a frame is given were too few for it to converge."""
     REFUSED = "refused"
@@ -37,7 +39,7 @@ class FrameStatus(StrEnum):
 
 
 class FrameCheck:
-    """Looks at frames (M,) of a sensor that reads `expected` (M,) volts when undisturbed, in the channels of `mask`.
+    """Checks frames (M,) of a sensor that reads `expected` (M,) volts when undisturbed, in the channels of `mask`.
 
     `touching` (L, M): which channels each electrode takes part in. `tied`: pairs (P, 2) of channels that reciprocity
     ties, and the ratio (P,) of the second's voltage to the first's. `noise` (M,): volts, relative to each other.
@@ -67,7 +69,7 @@ class FrameCheck:
         return values, usable, status, reason
 
     def _unchanged(self, values, usable) -> str:
-        """A sentence, if all that a frame differs by is noise."""
+        """A sentence, if a frame differs from an undisturbed one by noise alone."""
         change = np.where(usable, values - self.expected, 0)
         if np.linalg.norm(change) <= _EQUAL * self.size:
             return "It equals an undisturbed frame."
@@ -129,7 +131,7 @@ class FrameCheck:
         """The usable channels less those of an electrode that explains most of a large difference, and a sentence."""
         total = np.linalg.norm(difference)
         left = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
-        # What all channels read, such as a common reference, cannot be left out.
+        # An electrode that all channels read, such as a common reference, cannot be left out.
         left[(usable & ~self.touching).sum(axis=1) < _LEAST_CHANNELS * self.mask.sum()] = np.inf
         electrode = int(np.argmin(left))
         if not np.isfinite(left[electrode]):

@@ -1,8 +1,8 @@
-"""`Imager`: frame after frame to images, linear or by Gauss-Newton from the last image, in a bounded time.
+"""`Imager`: images frame after frame, linear or by Gauss-Newton from the last image, in a bounded time.
 
-All that does not depend on the frame is worked out once: which channels are independent, the prior's basis, the
-hyperparameter, the electrodes' integrals, the linear image's matrix; and which combinations of the prior's shapes the
-data can tell of at all, some dozens. Array shapes never change, so nothing is compiled again: a channel that is masked
+Everything that does not depend on the frame is computed once: which channels are independent, the prior's basis, the
+hyperparameter, the electrodes' integrals, the linear image's matrix, and the combinations of the prior's shapes, some
+dozens, that the data can resolve. Array shapes never change, so nothing is compiled again: a channel that is masked
 keeps its place, and gets a variance so large that it does not count.
 """
 
@@ -34,10 +34,10 @@ from jeit_solvers.engines import as_array
 
 FRAME_STEPS = 4
 """Most iterations that a frame is given, unless the solver says otherwise."""
-# The tolerance, alike; and what a shape must tell to be kept.
+# The tolerance unless the solver says otherwise, and the least information of a shape that is kept.
 _RTOL, _INFORMATIVE = 1e-3, 0.03
-# Standard deviation of a masked channel over the largest noise: more, and what only they tell has no inverse in double
-# precision.
+# Standard deviation of a masked channel over the largest noise. With a larger one, combinations that only masked
+# channels measure would have no inverse in double precision.
 _BLIND = 1e3
 
 
@@ -48,7 +48,7 @@ def check_memory(memory) -> None:
 
 
 class FrameEstimate(eqx.Module):
-    """What an `Imager` makes of one frame by iteration.
+    """Result of an `Imager` for one frame by iteration.
 
     **Fields**: `conductivity` (m,), S/m (2-D: S); `coefficients`, where the next frame may start; `misfit`, root mean
     square in standard deviations of the channels used; `iterations`; `converged`, whether one more step would have
@@ -76,11 +76,11 @@ class LinearMap(eqx.Module):
 
 
 class Imager(eqx.Module):
-    """Images frames of one sensor. Made by `Imager.create`; `stream` feeds it, and looks after bad frames.
+    """Images frames of one sensor. Made by `Imager.create`; `stream` passes frames to it, and handles bad ones.
 
     **Fields**: `channels`, which of them are independent; `inversion`, the problem, whose data are exchanged for every
     frame's; `noise` (M,), volts; `mask` (M,), the channels used at all; `expected` (M,) volts, an undisturbed frame;
-    `offset` (M,) volts, added to frames: what the model's voltages have and the sensor's have not; `touching` (L, M),
+    `offset` (M,) volts, added to frames: the part of the model's voltages that the sensor's lack; `touching` (L, M),
     channels that drive or read each electrode; `tied`, pairs (P, 2) of channels that reciprocity ties, and the ratio
     (P,) of the second's voltage to the first's; `solver`, with the most iterations that a frame is given;
     `persistence`, the share of the last image that the next one is expected to keep, 0 without a memory.
@@ -113,11 +113,11 @@ class Imager(eqx.Module):
         memory: float = 0.0,
     ) -> "Imager":
         """`background`: conductivity of the undisturbed body, S/m (2-D: S). `reference` (M,): a measured frame of it,
-        volts; frames are then imaged by their difference to it, which frees images from what the model gets wrong.
-        `solver`: `GaussNewton()` unless given, `LevenbergMarquardt()` or, for linear images, `OneStep()`; by at most 4
-        steps a frame, and until the objective changes by less than 1e-3, unless it says otherwise. `prior`: `Gaussian`
-        of a twelfth of the body's width unless given. `parametrisation`: its link, regions and `informative` shapes.
-        `memory`: frames over which an image changes; the last image then tells of the next (a Kalman filter in its
+        volts; frames are then imaged by their difference to it, so that errors of the model cancel. `solver`:
+        `GaussNewton()` unless given, `LevenbergMarquardt()` or, for linear images, `OneStep()`; by at most 4 steps a
+        frame, and until the objective changes by less than 1e-3, unless it says otherwise. `prior`: `Gaussian` of a
+        twelfth of the body's width unless given. `parametrisation`: its link, regions and `informative` shapes.
+        `memory`: frames over which an image changes; the last image then predicts the next (a Kalman filter in its
         steady state, of coefficients with covariance exp(-|t - t'| / memory) in time), which takes noise out and lags
         by a part of it; 0 takes every frame alone. The rest as in `reconstruct`. Raises `ValueError` for arguments that
         do not fit.
@@ -173,7 +173,7 @@ class Imager(eqx.Module):
         return 1 if self.solver.is_linear else self.solver.descent(FRAME_STEPS, _RTOL).history - 1
 
     def weighing(self, usable: Bool[Array, " M"]) -> Weighing:
-        """How to combine frames of which only the `usable` channels count."""
+        """Weights that combine frames of which only the `usable` channels count."""
         return self.channels.weigh(_blinded(self.noise, self.mask & usable))
 
     def linear_map(self, weighing: Weighing) -> LinearMap:
@@ -190,7 +190,7 @@ class Imager(eqx.Module):
 
 
 def _check_together(solver: AbstractSolver, prior: AbstractPrior, parametrisation: Parametrisation, memory) -> None:
-    """What needs a covariance, and what takes more than a bounded time."""
+    """Raise `ValueError` for settings that need a covariance, or more than a bounded time."""
     if memory > 0 and not prior.is_quadratic:
         raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
     if solver.is_linear and not prior.is_quadratic:
@@ -201,7 +201,7 @@ def _check_together(solver: AbstractSolver, prior: AbstractPrior, parametrisatio
 
 
 def _check_reference(measured, predicted) -> None:
-    """Units and polarity: what is wrong by ten times, or in sign, is not the model's error."""
+    """Check units and polarity: a factor of ten, or a wrong sign, is not an error of the model."""
     ratio = measured @ predicted / (predicted @ predicted)
     if not 0.1 < ratio < 10:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""`stream`: frames one by one, from anywhere, to images; a bad frame is said to be bad, and the stream goes on."""
+"""`stream`: images of frames one by one, from any source; a bad frame is reported as such, and the stream goes on."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jeit.inverse.streaming.imager import Imager
 
 
 class FrameImage(eqx.Module):
-    """One frame of a stream.
+    """Result for one frame of a stream.
 
     **Fields**: `number`, from 0; `conductivity` (m,), S/m (2-D: S), NumPy, None for a frame that is refused; `status`,
     and its `reason`, in a sentence, empty where all is well; `usable` (M,), the channels used; `misfit`, root mean
@@ -48,9 +48,9 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     compiled before the first frame is asked for. A frame is refused, and the stream goes on, when it has another number
     of channels or is not real, when fewer than half of the channels can be used, when all read zero (the current source
     has failed), or when it differs from an undisturbed frame by more than half of it. A dead electrode's channels are
-    left out, and named, and so are those that an amplifier cuts at the ends of its range. A frame that nothing but
-    noise tells from an undisturbed one is imaged, and said to be "unchanged". Raises `ValueError` for what is no
-    imager, for what are no frames, and for an array of frames that is not (frames, channels).
+    left out, and named, and so are those that an amplifier cuts at the ends of its range. A frame that differs from an
+    undisturbed one by noise alone is imaged, with status "unchanged". Raises `ValueError` for what is no imager, for
+    what are no frames, and for an array of frames that is not (frames, channels).
     """
     check_kind("imager", imager, Imager, "an Imager, as of Imager.create or prepare_imager(reference)[0]")
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
@@ -66,7 +66,7 @@ def _images(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
 
 
 class _Session:
-    """What a stream keeps from one frame to the next, in NumPy where JAX's dispatch would cost more than the work."""
+    """State of a stream from one frame to the next, in NumPy where JAX's dispatch would cost more than the work."""
 
     def __init__(self, imager: Imager):
         self.imager = imager
@@ -82,7 +82,7 @@ class _Session:
         self.coefficients = np.asarray(imager.start)
 
     def image(self, number: int, frame) -> FrameImage:
-        """The image of one frame, or why there is none."""
+        """The image of one frame, or the reason why there is none."""
         begin = time.perf_counter()
         values, usable, status, reason = self.check(frame)
         if status == FrameStatus.REFUSED:

@@ -17,9 +17,9 @@ Size = Callable[[np.ndarray], np.ndarray]
 class Curve:
     """A closed curve of `length` metres.
 
-    `at` gives points (p, 2) at arc lengths (p,); `corners` are the arc lengths of its corners, all of them
-    nodes; `inside` tells which points it encloses and `distance` how far from it they are; `angles` are the
-    angles of the domain at the corners in radians.
+    `at` gives points (p, 2) at arc lengths (p,); `corners` are the arc lengths of its corners, all of them nodes;
+    `inside` returns which points it encloses and `distance` how far from it they are; `angles` are the angles of the
+    domain at the corners in radians.
     """
 
     length: float

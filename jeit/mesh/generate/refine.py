@@ -45,7 +45,7 @@ def nodes_of_solid(asked: int | None, in_plane: Callable[[int], int]) -> Iterato
         raise ValueError(f"num_points: {error.solid.format(asked=asked, least=f'{least:.0f}')}") from None
 
 
-# How fast cells may grow away from nodes that lie close together and from a user's own size function.
+# Growth of cells away from nodes that lie close together, and from a user's own size function.
 _OWN_GROWTH = 0.45
 
 
@@ -61,9 +61,9 @@ class Refine(eqx.Module):
     from 2.2 % (uniform rings) to 0.5 %; 10,000 nodes with `factor=8, growth=0.4` bring it below 0.1 %
     (contact impedance times conductivity between 0.01 and 0.1 radii).
 
-    **Fields**: `points` (k, 2) in metres, or None for the whole outline; `cell_size` in metres; `factor` > 1;
-    `growth` of the edge length per length, 0.35 unless told, at most 1 (above 0.7 the cells are visibly
-    stretched); `distance` in metres over which cells stay at their smallest.
+    **Fields**: `points` (k, 2) in metres, or None for the whole outline; `cell_size` in metres; `factor` > 1; `growth`
+    of the edge length per length, 0.35 unless given, at most 1 (above 0.7 the cells are visibly stretched); `distance`
+    in metres over which cells stay at their smallest.
     """
 
     points: np.ndarray | None

@@ -1,4 +1,4 @@
-"""From what the user asks (a number of nodes or a cell size, refinement, nodes that must be there) to a mesh."""
+"""Unstructured plane meshes for a number of nodes or a cell size, with refinement and nodes at given places."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ DEFAULT_NUM_POINTS = 1200
 MOST_POINTS = 1_000_000
 # Nodes that must be there, closer than this relative to the outline's length, are refused.
 _CLOSEST = 1e-6
-# How well the number of nodes is met before smoothing and repair, which may add or drop a few.
+# Relative error of the number of nodes before smoothing and repair, which may add or drop a few.
 _MISS = 0.02
 
 
 @dataclass(frozen=True)
 class Target:
-    """How fine the mesh shall be: a number of nodes, or a cell size in metres (the other is None or a default)."""
+    """Target size of a mesh: a number of nodes, or a cell size in metres (the other is None or a default)."""
 
     num_points: int
     cell_size: float | None
@@ -134,7 +134,7 @@ def _merge(curve: Curve, own: np.ndarray) -> np.ndarray:
             "closer than a millionth of the outline (a corner counts). Make them equal or move one."
         )
     keep = gaps > 1e-9
-    # Of coinciding stops keep the corner, so that corners stay exactly where they are.
+    # Among coinciding stops the corner is kept, so that corners stay exactly where they are.
     kept = stops[keep]
     if len(curve.corners):
         apart = np.abs(kept[:, None] - curve.corners)

@@ -1,4 +1,5 @@
-"""Ways along triangulated surfaces in space: their lengths, the places that they join, and surfaces unrolled."""
+"""Geodesics on triangulated surfaces in space: their lengths, places on surfaces, and surfaces unrolled into the
+plane."""
 
 from __future__ import annotations
 

@@ -25,11 +25,12 @@ from jeit.mesh.mesh import Mesh
 
 # Lengths that fall by less, relative, are not passed on; and sources worked on at once, as lengths (s, n) are kept.
 _ENOUGH, _TOGETHER = 1e-10, 128
-# Of a way on a sphere, radians: farther on, near the antipode, a wave closes in on a point.
+# Greatest length of a way on a sphere, radians: farther on, near the antipode, a wave closes in on a point.
 _FARTHEST = 2.6
-# Of a side, that lengths of one wave may miss each other by.
+# Share of a side by which lengths of one wave may disagree.
 _APART = 0.02
-# Of the surface's extent: how far off it places may be, such as those on the other side of a thick skin.
+# Greatest distance of places from the surface, in units of its extent, such as of those on the other side of a thick
+# skin.
 _OFF = 0.25
 
 
@@ -59,7 +60,7 @@ class Geodesics(eqx.Module):
 
     @classmethod
     def create(cls, surface: Triangles | Mesh, face: str | None = None) -> "Geodesics":
-        """Of a surface, or of a `face` of a shell as in `Triangles.of`. Raises `ValueError` as that does."""
+        """Create for a surface, or for a `face` of a shell as in `Triangles.of`. Raises `ValueError` as that does."""
         triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
         cells, points = triangles.cells, triangles.points
         node, start, end = (np.roll(cells, -turn, axis=1).ravel() for turn in range(3))
@@ -119,7 +120,7 @@ class Geodesics(eqx.Module):
         return lengths
 
     def owners(self, sources: ArrayLike | SurfacePlaces) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Of each node the nearest of the `sources` (s, 3), as its number, and the length of the way to it, metres."""
+        """Number of the nearest of the `sources` (s, 3) for each node, and the length of the way to it, metres."""
         at = sources if isinstance(sources, SurfacePlaces) else self.surface.nearest(sources)
         nodes = self.surface.cells[at.triangle]
         length = np.linalg.norm(self.surface.points[nodes] - at.points[:, None], axis=-1)
@@ -159,7 +160,7 @@ class Geodesics(eqx.Module):
                 share = np.where(through > 0, np.clip(before / through, 0, 1), 0.0)
             least = through == lengths[place]
             bent[place[least]] = (share * mean[lower] + (1 - share) * self.curvature[node])[least]
-            # What lies beyond the limit is known to be, and passes nothing on.
+            # Nodes beyond the limit pass nothing on.
             changed = np.unique(place[lengths[place] <= limit])
         return lengths.reshape(-1, count), bent.reshape(-1, count)
 
@@ -171,8 +172,8 @@ class Geodesics(eqx.Module):
         return np.repeat(carried, number), self.touching[np.repeat(self.first[nodes], number) + inside]
 
     def near(self, sources: ArrayLike, targets: SurfacePlaces, limit: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Of each of some `sources` (s, 3) the targets no farther than `limit` metres by the way along the surface, as
-        their numbers, and how far they are: what is far away is not looked at."""
+        """Targets no farther than `limit` metres from each of some `sources` (s, 3) by the way along the surface, as
+        their numbers, and their distances; targets far away are not searched."""
         begun = self.surface.nearest(sources)
         tree, found = KDTree(targets.points), []
         for low in range(0, len(begun.triangle), _TOGETHER):

@@ -40,7 +40,7 @@ class Triangles(eqx.Module):
 
     @classmethod
     def of(cls, mesh: Mesh, face: str | None = None) -> "Triangles":
-        """Those of a surface, or those facets of a solid mesh that have the tag `face`, "inner" or "outer" of a shell.
+        """Triangles of a surface, or facets of a solid mesh that have the tag `face`, "inner" or "outer" of a shell.
 
         Nodes that are none of theirs are left out. Raises `ValueError` for a plane mesh, and a tag that there is not.
         """
@@ -57,12 +57,12 @@ class Triangles(eqx.Module):
 
     @property
     def corners(self) -> Float[np.ndarray, "m 3 3"]:
-        """Of every triangle, metres."""
+        """Corners of every triangle, metres."""
         return self.points[self.cells]
 
     @property
     def areas(self) -> Float[np.ndarray, " m"]:
-        """Of the triangles, m²."""
+        """Areas of the triangles, m²."""
         return np.linalg.norm(self._crossed, axis=1) / 2
 
     @property
@@ -113,7 +113,7 @@ class Triangles(eqx.Module):
         return between / np.linalg.norm(between, axis=1, keepdims=True)
 
     def distance_to_border(self, places: ArrayLike) -> Float[np.ndarray, " p"]:
-        """How far places (p, 3) are from the edge, straight through space, metres; infinite where there is none."""
+        """Distances of places (p, 3) from the edge, straight through space, metres; infinite where there is none."""
         border, asked = self.border, np.asarray(places, float)
         if not len(border):
             return np.full(len(asked), np.inf)

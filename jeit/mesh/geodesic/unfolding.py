@@ -1,9 +1,9 @@
-"""`unfold`: what of a triangulated surface lies round a place, laid into the plane of the triangle that it lies in.
+"""`unfold`: the triangles of a surface round a place, laid into the plane of the triangle that holds the place.
 
 Triangle after triangle is turned about the side that it shares with the one before, on the way that crosses the fewest.
 Where a surface can be laid flat without stretching, as a sheet that was bent can, all ways lead to the same, and
-straight lines there are the shortest ways on the surface: exactly, on its triangles. Elsewhere it depends on the way,
-so that it is told where that is. Arrays of either engine, differentiated and batched.
+straight lines there are the shortest ways on the surface: exactly, on its triangles. Elsewhere the result depends on
+the way, and the places where it does are reported. Arrays of either engine, differentiated and batched.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _JOININGS = 7
 
 
 class Unfolding(NamedTuple):
-    """Of L places on a surface of m triangles, metres.
+    """Unfolded triangles round L places on a surface of m triangles, metres.
 
     **Fields**: `corners` (m, 3, 2), of each triangle in its own plane; `turn` (L, m, 2), cosine and sine, and `shift`
     (L, m, 2), from there into the plane of each place's triangle; `place` (L, 2), in that one; `reached` (L, m), where
@@ -99,7 +99,7 @@ def _triangles_of(places, frames, local) -> Int[Array, " L"]:
 
 
 def _twins(cells) -> Int[Array, " h"]:
-    """Of each side of each triangle, 3 cell + number, the same side as the neighbour's; itself on the edge."""
+    """For each side of each triangle, 3 cell + number, the same side in the neighbour; itself on the edge."""
     xp = namespace(cells)
     start, end = cells.reshape(-1), xp.roll(cells, -1, axis=1).reshape(-1)
     low, high = xp.minimum(start, end), xp.maximum(start, end)
@@ -112,8 +112,8 @@ def _twins(cells) -> Int[Array, " h"]:
 
 
 def _hang_together(neighbour, near: Bool[Array, "L m"], root):
-    """Which of the triangles `near` places are reached from the `root` (L,) over sides, and the side (L, m) of each
-    that leads back, −1 of the root and what is not reached."""
+    """Whether the triangles `near` places are reached from the `root` (L,) over sides, and the side (L, m) of each that
+    leads back, −1 of the root and what is not reached."""
     xp = namespace(neighbour, near)
     cell = xp.arange(near.shape[1])
     neighbour = neighbour.reshape(-1, 3)
@@ -154,7 +154,7 @@ def _joined(before, turn, shift):
 
 
 def _curved(local, cells, twin, number: int) -> Bool[Array, " m"]:
-    """Of each triangle, whether angles round one of its corners inside the surface are no full turn."""
+    """Whether, for each triangle, the angles round one of its corners inside the surface are no full turn."""
     xp = namespace(local, cells)
     ahead, back = xp.roll(local, -1, axis=1) - local, xp.roll(local, 1, axis=1) - local
     angle = xp.arctan2(ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0], (ahead * back).sum(axis=-1))

@@ -1,10 +1,10 @@
 """`Unrolled`: a curved surface laid flat, in metres, with how much that stretches it (NumPy).
 
-What can be laid flat without stretching, cylinders, cones and bent sheets, is, but for what their triangles are not;
-all else as rigidly as possible: each triangle turned only, and these brought together in the least-squares sense, again
-and again (Liu, Zhang, Xu, Gotsman and Gortler, SGP 2008, from a conformal start: Lévy, Petitjean, Ray and Maillot,
-SIGGRAPH 2002). A closed sleeve is cut along a shortest way from edge to edge, a closed surface from one end to the
-other.
+Surfaces that can be laid flat without stretching, cylinders, cones and bent sheets, are laid so, except as far as their
+triangles deviate from them; all others are laid as rigidly as possible: each triangle turned only, and these brought
+together in the least-squares sense, again and again (Liu, Zhang, Xu, Gotsman and Gortler, SGP 2008, from a conformal
+start: Lévy, Petitjean, Ray and Maillot, SIGGRAPH 2002). A closed sleeve is cut along a shortest way from edge to edge,
+a closed surface from one end to the other.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
 from jeit.mesh.mesh import Mesh
 
 _ROUNDS = 60
-# Height in space for a metre on the flat surface, from which on it tells which way is up.
+# Height in space per metre on the flat surface from which on it determines which way is up.
 _UP = 0.3
 
 
@@ -69,7 +69,7 @@ class Unrolled(eqx.Module):
         return ends, ~_among(np.sort(self.nodes[ends], axis=1), np.sort(self.surface.border, axis=1))
 
     def flat(self, places: ArrayLike | SurfacePlaces) -> Float[np.ndarray, "p 2"]:
-        """Where places on the surface, (p, 3) metres, come to lie: (p, 2) metres."""
+        """Positions on the flat surface, (p, 2) metres, of places on the surface, (p, 3) metres."""
         at = places if isinstance(places, SurfacePlaces) else self.surface.nearest(places)
         return np.einsum("pk,pkd->pd", at.weights, self.points[self.cells[at.triangle]])
 
@@ -218,7 +218,7 @@ def _cut_open(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _loops(border, count: int):
-    """How many loops the border is, and of which each of its edges is."""
+    """Number of loops of the border, and the loop of each of its edges."""
     if not len(border):
         return 0, np.zeros(0, int)
     graph = scipy.sparse.csr_array((np.ones(len(border)), border.T), shape=(count, count))

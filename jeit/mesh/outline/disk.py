@@ -84,7 +84,7 @@ class Disk(Domain):
         return {"shape": "disk", "radius": float(self.radius), "centre": [float(x) for x in self.centre]}
 
     def draw(self, pen: Pen) -> None:
-        """One circle."""
+        """Draw one circle."""
         pen.circle(self.centre, self.radius)
 
     @size_checked()

@@ -17,12 +17,13 @@ from jeit.mesh.mesh import Mesh
 from jeit.mesh.sizes import warn_large
 from jeit_solvers.engines import has_values
 
-# How many times an outline's size it may lie away from the origin: ten digits of its shape are left there.
+# Greatest distance of an outline from the origin, over its size: ten digits of its shape are left there.
 _FARTHEST = 1e6
 
 
 class Pen(Protocol):
-    """What outlines are drawn with: a drawing's file, or a geometry kernel. The first stroke encloses the others."""
+    """Interface to draw outlines: into a drawing's file, or by a geometry kernel. The first stroke encloses the
+    others."""
 
     def circle(self, centre: tuple[float, float], radius: float) -> None:
         """A circle, in metres."""

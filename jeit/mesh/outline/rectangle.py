@@ -86,7 +86,7 @@ class Rectangle(Domain):
         return {"shape": "rectangle", **sides, "centre": [float(x) for x in self.centre]}
 
     def draw(self, pen: Pen) -> None:
-        """One loop of four sides."""
+        """Draw one loop of four sides."""
         pen.loop(np.asarray(self.vertices))
 
     @size_checked()

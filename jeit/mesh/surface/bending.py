@@ -28,9 +28,9 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
         return Mesh.create(np.asarray(mesh.points)[used], cells.reshape(facets.shape))
 
 
-# Where triangles at a node are turned against each other by more, there is an edge, and nothing to be smoothed.
+# Cosine of the angle between triangles at a node beyond which there is an edge, which is not smoothed.
 _CREASE = np.cos(np.radians(50.0))
-# Of the coefficients of a quadratic form that are fitted to neighbours, and how well it must be told by them.
+# Number of coefficients of the quadratic form fitted to neighbours, and how well they must determine it.
 _TERMS, _LEAST = 5, 1e-6
 
 
@@ -128,7 +128,7 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
 
 
 def _folds(places: np.ndarray, corners: np.ndarray, across: int, num_folds: int | None) -> np.ndarray:
-    """Where the sheet is folded, from one side to the other, those included."""
+    """Places where the sheet is folded, from one side to the other, both included."""
     width = np.ptp(places)
     ordered = np.sort(places)
     rows = ordered[np.concatenate([[True], np.diff(ordered) > _ON * width])]

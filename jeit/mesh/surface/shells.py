@@ -14,7 +14,7 @@ from jeit.mesh.solids import stacked_cells, stacked_wall
 from jeit.mesh.surface.bending import node_normals
 
 _TAGS = ("inner", "outer", "side")
-# Times that the largest thickness is halved in on.
+# Number of bisections that find the largest thickness.
 _HALVINGS = 40
 
 
@@ -34,8 +34,8 @@ def shell(
     them.
 
     Raises `ValueError` for a mesh that is no surface in space, a thickness that is not positive, no layers, a shell so
-    thick that prisms turn inside out, as they do beyond the radius of curvature (it is told where, and how thick it can
-    be), and one that grows into itself.
+    thick that prisms turn inside out, as they do beyond the radius of curvature (the message says where, and how thick
+    it can be), and one that grows into itself.
     """
     if not surface.is_surface:
         raise ValueError("surface: a shell is made on a surface in space; on a flat mesh it is jeit.mesh.layer.")

@@ -83,7 +83,7 @@ def _outward(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def _icosahedron() -> np.ndarray:
-    """Its corners (12, 3)."""
+    """Corners of an icosahedron (12, 3)."""
     golden = (1 + np.sqrt(5)) / 2
     plane = np.array([[0, a, b * golden] for a in (1, -1) for b in (1, -1)])
     return np.concatenate([np.roll(plane, k, axis=1) for k in range(3)]) / np.hypot(1, golden)

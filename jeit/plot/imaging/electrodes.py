@@ -142,9 +142,10 @@ class _Pen:
         self._number(middle, beside=True)
 
 
-# Over the size of the body: how far a number stands from its electrode, and how near the edge one lies that is on it.
+# Distance of a number from its electrode, and distance from the edge within which an electrode lies on it, over the
+# size of the body.
 _AWAY, _ON_EDGE = 0.058, 0.02
-# Over that distance: how far numbers stand that begin there, in place of having their middle there.
+# Distance of numbers that are aligned by their beginning, not their middle, over that distance.
 _CLOSER = 0.7
 # Free outside the outline, over that distance, or else the number stands inside.
 _ROOM = 1.6
@@ -180,7 +181,7 @@ def draw_numbers(
 
 
 def _beside(shift: Float[np.ndarray, " 2"]) -> str:
-    """How several numbers, which are wide, are aligned that far from their electrode: off it, not across it."""
+    """Alignment of several numbers, which are wide, beside their electrode: off it, not across it."""
     if abs(shift[0]) < 0.8 * abs(shift[1]):
         return "center"
     return "left" if shift[0] > 0 else "right"
@@ -231,14 +232,14 @@ def _normals(start, end) -> Float[np.ndarray, "b 2"]:
 
 
 def _distances(place, start, end) -> Float[np.ndarray, " b"]:
-    """Of a place from every edge."""
+    """Distances of a place from every edge."""
     along = end - start
     fraction = np.clip(np.sum((place - start) * along, axis=1) / np.sum(along**2, axis=1), 0, 1)
     return np.linalg.norm(start + fraction[:, None] * along - place, axis=1)
 
 
 def _free(place, direction, start, end, least: float) -> float:
-    """How far it is from a place, in a unit direction, to the next edge farther off than `least`."""
+    """Distance from a place, in a unit direction, to the next edge farther off than `least`."""
     along, offset = end - start, start - place
     across = direction[0] * along[:, 1] - direction[1] * along[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):  # edges along the direction are not met

@@ -26,13 +26,13 @@ from jeit_solvers.engines import as_array
 # Pixels along a side of a picture, and the grey of a body without an image.
 _PIXELS, _GREY = 160, "#dfe2e6"
 SHEET_FRAMES = 12
-"""Frames of a contact sheet at most, unless it is told."""
+"""Default greatest number of frames of a contact sheet."""
 # Refused frames that are named beneath it.
 _NAMED = 6
 
 
 class FrameCount(NamedTuple):
-    """How many frames a stream had, of which some are drawn: the `number`, how many were `refused`, and the `names` of
+    """Number of frames of a stream, of which some are drawn: the `number`, how many were `refused`, and the `names` of
     the first of those."""
 
     number: int
@@ -147,7 +147,7 @@ def plot_frames(
 
 
 def _count_text(count: FrameCount, chosen: int, mesh: Mesh) -> str:
-    """What the sheet does not show: frames left out, and which were refused."""
+    """Text about frames that the sheet does not show, and about refused ones."""
     parts = [] if chosen == count.number else [f"{chosen} of {count.number} frames"]
     if count.refused:
         some = ", ".join(count.names[:_NAMED]) + (" …" if count.refused > _NAMED else "")

@@ -1,4 +1,4 @@
-"""Parameter choice: the curves that rules for the hyperparameter look at, and the points they choose."""
+"""Parameter choice: the curves that rules for the hyperparameter use, and the points that they choose."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLOURS = {
     "noise-figure": "#157f3b",
     "best-resolution": "#7b4fa3",
 }
-# How far apart points with a name stand on the L-curve, over its width and height.
+# Least distance of named points on the L-curve, over its width and height.
 _APART = 0.06
 # The criterion of each rule, the scale of its axis, and what is looked for.
 _CRITERIA = {
@@ -33,7 +33,7 @@ _CRITERIA = {
 
 
 def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw what was looked at in choosing a hyperparameter, and the point chosen.
+    """Draw the curves used in choosing a hyperparameter, and the point chosen.
 
     One `Choice`: for "l-curve" the L-curve, ‖residual‖ against ‖image‖ with the corner marked; for other rules their
     criterion against λ. Several, by name, as from `jeit.inverse.compare_rules`: the L-curve with all of them marked,

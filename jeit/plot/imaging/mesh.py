@@ -63,7 +63,8 @@ def draw_slice_outline(
 
 
 def slice_text(mesh: Mesh, height: float | None = None, what: str = "slice") -> str:
-    """Where a solid is cut, at z = `height` metres or half way up: "slice at z = 20.0 mm"; of a plane mesh nothing."""
+    """Text of the height of a slice, z = `height` metres or half way up: "slice at z = 20.0 mm"; empty for a plane
+    mesh."""
     if mesh.dimension == 2:
         return ""
     z = np.asarray(mesh.points)[:, 2]

@@ -1,4 +1,4 @@
-"""Sensitivity: where on a body a change of conductivity shows in the voltages."""
+"""Sensitivity maps: size of the voltage change for a change of conductivity, for each cell of a body."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happens over time: the functional image, maps of amplitude and phase, and curves and spectra of regions."""
+"""Pictures of image series: the functional image, maps of amplitude and phase, and curves and spectra of regions."""
 
 from __future__ import annotations
 

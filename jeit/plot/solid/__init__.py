@@ -1,1 +1,1 @@
-"""Pictures of what is not plane: surfaces in space, solids, slices through them."""
+"""Pictures of bodies in space: surfaces, solids, and slices through them."""

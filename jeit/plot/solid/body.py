@@ -1,4 +1,4 @@
-"""What stands round an image in space: the body's hull, translucent, and electrodes on it, numbered."""
+"""The surroundings of an image in space: the body's translucent hull, and numbered electrodes on it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,12 @@ from jeit.plot.solid.scene import BODY, Scene, draw_number
 _HULL = 0.1
 # Cosine of the angle between facets beyond which their edge is one of the body.
 _SHARP = 0.85
-# Over the size of the body: how much nearer electrodes count than the surface under them, and how far off numbers are.
+# Distance by which electrodes count as nearer than the surface under them, and distance of numbers, over the size of
+# the body.
 _BEFORE, _AWAY = 0.06, 0.045
-# And how far numbers are apart that can be read.
+# Least distance of readable numbers, over the size of the body.
 _CLEAR = 0.03
-# Share of what is seen of a body beyond which electrodes hide too much, and how much of their colour is left then.
+# Share of the visible body beyond which electrodes hide too much, and their opacity in that case.
 _HIDES, _GLASS = 0.4, 0.16
 
 
@@ -82,14 +83,14 @@ def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, 
 
 
 def _seen_area(scene: Scene, corners: Float[np.ndarray, "*m k 3"]) -> float:
-    """On the page, m², of polygons."""
+    """Area of polygons on the page, m²."""
     x, y = np.moveaxis(scene.camera.on_page(corners.reshape(-1, 3)).reshape(*corners.shape[:-1], 2), -1, 0)
     twice = (x * np.roll(y, -1, axis=-1) - np.roll(x, -1, axis=-1) * y).sum(axis=-1)
     return float(np.abs(twice).sum() / 2)
 
 
 def _rims(polygons, electrode, near: float) -> list[np.ndarray]:
-    """Which edges of each polygon are on the rim of its electrode: those that no other of its polygons has."""
+    """Edges of each polygon on the rim of its electrode: those that no other polygon of the electrode has."""
     keys = []
     for corners, number in zip(polygons, electrode.tolist(), strict=True):
         places = [tuple(place) for place in np.round(corners / near).astype(np.int64).tolist()]
@@ -118,15 +119,15 @@ def number_electrodes(
         some = np.flatnonzero(faint == side)
         for one in at_one_place(places[some], clear):
             place = places[some[one]].mean(axis=0)
-            # What is behind has no number where one in front has its own.
+            # Electrodes behind have no number where one in front has its own.
             if side and len(near) and np.linalg.norm(near - place, axis=1).min() <= clear:
                 continue
             outward = "right" if place[0] < left else "left" if place[0] > right else "center"
             align = outward if len(one) > 1 else "center"
-            draw_number(ax, place, _told((some[one] + 1).tolist()), fontsize=fontsize, faint=side, align=align)
+            draw_number(ax, place, _number_text((some[one] + 1).tolist()), fontsize=fontsize, faint=side, align=align)
 
 
-def _told(numbers: list[int]) -> str:
+def _number_text(numbers: list[int]) -> str:
     """Rising numbers, three or more that follow each other as "4–6"."""
     runs: list[list[int]] = []
     for number in numbers:

@@ -1,4 +1,4 @@
-"""Where a picture in space is seen from, and the light on what is seen."""
+"""The camera and the light of a picture in space."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jeit.arguments import describe, is_number
 
-# Over the left shoulder of who looks: to the right and up on the page, and towards the viewer.
+# Direction of the light, from over the viewer's left shoulder: to the right and up on the page, and towards the viewer.
 _LIGHT = np.array([-0.35, 0.5, 0.79])
 _DARKEST = 0.66
 
@@ -55,7 +55,7 @@ class Camera:
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
     def nearness(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-        """How far places (…, 3) are towards the viewer, metres."""
+        """Coordinate of places (…, 3) towards the viewer, metres."""
         return points @ self.toward
 
     def light(self, normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:

@@ -22,7 +22,7 @@ from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
 from jeit.plot.solid.scene import Scene, bare_in_space
 from jeit.plot.solid.shaded_surface import BODY, checked_values, colours_of, mappable
 
-# Of the skin's size: how far marks count as nearer than the surface that they are on.
+# Distance by which marks count as nearer than the surface that they are on, over the skin's size.
 _BEFORE = 0.02
 
 

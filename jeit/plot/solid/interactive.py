@@ -71,7 +71,7 @@ def view_solid(
         plotter.add_mesh(shell, scalars="value", opacity=opacity, **options, **look)
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.asarray(mesh.cells)}, points)
     grid.cell_data["value"] = fitted.factor * cell_values(mesh, values)
-    # In two lines: VTK cuts off what is wider than the bar has room for, and with it the unit.
+    # The label takes two lines: VTK cuts off text that is wider than the bar, and with it the unit.
     what, bracket, unit = fitted.label.rpartition(" (")
     bar = {"title": f"{what}\n{bracket.strip()}{unit}", "color": INK, "vertical": True, "n_labels": 5, "fmt": "%.3g"}
     bar |= {"title_font_size": 16, "label_font_size": 14, "position_x": 0.86, "position_y": 0.25, "height": 0.5}

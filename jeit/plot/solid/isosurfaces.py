@@ -25,7 +25,7 @@ from jeit.plot.solid.shaded_surface import colours_of, mappable
 
 HALF = (0.5,)
 OUTER = 0.3
-# Over the strongest change of either sign: as inclusions are looked for.
+# Least peak that is drawn, over the strongest change of either sign, as for inclusions.
 _LEAST_PEAK = 0.3
 
 

@@ -1,4 +1,4 @@
-"""What one wants to see of a solid image first: where things are in space, and cut through the strongest change."""
+"""Overview of a solid image: isosurfaces in space, and slices through the strongest change."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ def plot_solid(
 
 
 def strongest_place(mesh: Mesh, image: np.ndarray, inclusions: Sequence[Inclusion] = ()) -> np.ndarray:
-    """Where to cut (3,): the centre of the first inclusion, or of the cell of the strongest value."""
+    """Place of the cuts (3,): the centre of the first inclusion, or of the cell of the strongest value."""
     if inclusions:
         return np.array(inclusions[0].centroid)
     return np.asarray(centroids(mesh))[np.abs(image - (np.median(image))).argmax()]
 
 
 def _caption(ax: Axes, place, levels, inclusions: Sequence[Inclusion], *, difference: bool) -> None:
-    """What is drawn, and what was found, in words."""
+    """Caption: what is drawn, and the inclusions found, in words."""
     ax.set_axis_off()
     shares = ", ".join(f"{100 * share:g}" for share in sorted(levels))
     of = "of the strongest change" if difference else "of the way from least to greatest"

@@ -19,7 +19,7 @@ from jeit.plot.solid.camera import Camera
 _RIM = [withStroke(linewidth=2.2, foreground="white")]
 _HALO = [withStroke(linewidth=3, foreground="white")]
 _LETTERS = ("x", "y", "z")
-# Of what has no values.
+# Colour of surfaces without values.
 BODY = "#b9bec6"
 
 

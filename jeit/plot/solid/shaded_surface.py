@@ -97,7 +97,7 @@ def colours_of(fitted: FittedScale, values: Float[np.ndarray, " m"]) -> Float[np
 
 
 def mappable(fitted: FittedScale) -> ScalarMappable:
-    """What a colour bar is drawn of."""
+    """The mappable from which a colour bar is drawn."""
     return ScalarMappable(_normalised(fitted), fitted.keywords["cmap"])
 
 

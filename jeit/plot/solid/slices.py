@@ -159,7 +159,7 @@ def dress_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, float
 
 
 def window_of(ax: Axes) -> tuple[float, float, float, float]:
-    """What is drawn on axes, (left, right, low, high)."""
+    """Limits of the drawing on axes, (left, right, low, high)."""
     box = ax.dataLim
     return box.x0, box.x1, box.y0, box.y1
 
@@ -184,7 +184,7 @@ def _shapes(mesh: Mesh, electrodes) -> ElectrodeShapes | None:
 
 
 def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, away: float, middle) -> None:
-    """Where a plane passes electrodes, a thick line; their numbers outward of it."""
+    """Draw a thick line where a plane passes electrodes, and their numbers outward of it."""
     found: dict[int, list[np.ndarray]] = {}
     for corners, number in zip(shapes.polygons(), shapes.electrode, strict=True):
         height = plane.distance(corners)
@@ -210,6 +210,6 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, away: 
 def _columns(number: int, tall: float) -> int:
     """Columns of a grid of panels that are `tall` times as high as wide, for a page wider than it is high."""
     best = max(1, round(float(np.sqrt(1.6 * number * tall))))
-    # Of about as many, those that leave the fewest places empty.
+    # Among similar numbers of columns, the one that leaves the fewest places empty.
     near = range(max(1, best - 1), best + 2)
     return min(number, min(near, key=lambda columns: (-number % columns, abs(columns - best))))

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from jeit.cli.applications import NETWORK
+from jeit.cli.options import NETWORK
 
 if TYPE_CHECKING:
     import numpy as np

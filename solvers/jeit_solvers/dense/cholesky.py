@@ -82,7 +82,7 @@ def _symmetric_inverse_jvp(primals, tangents):
 
 def _by_lapack(matrices: Any) -> Any:
     """`inverse_cholesky` by LAPACK, of NumPy's arrays."""
-    # To a diagonal of order one, by powers of two: LAPACK's inverse loses what rows of other orders have.
+    # Scaled to a diagonal of order one, by powers of two: LAPACK's inverse loses accuracy for rows of other orders.
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
     scale = np.ldexp(1.0, -(np.frexp(diagonal)[1] // 2)).astype(matrices.dtype)
     try:

@@ -22,7 +22,7 @@ Objective = Callable[[Float[Array, " n"]], Float[Array, ""]]
 
 
 class BoundedMinimum(eqx.Module):
-    """Where a minimisation between bounds ended: `x` (n,), the `steps` it took, and whether it `converged`: a step
+    """Result of a minimisation between bounds: `x` (n,), the number of `steps`, and whether it `converged`: a step
     along the projected gradient would have changed no coordinate by more than the tolerance."""
 
     x: Float[Array, " n"]
@@ -62,7 +62,7 @@ def projected_gradient(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """The same by accelerated projected gradients: more steps, each of them cheaper."""
+    """The least value between two bounds (n,) by accelerated projected gradients: more steps, each of them cheaper."""
     jaxopt = _jaxopt()
     solver = jaxopt.ProjectedGradient(
         objective, jaxopt.projection.projection_box, maxiter=max_steps, tol=tolerance, acceleration=True

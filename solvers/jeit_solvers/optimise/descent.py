@@ -23,7 +23,7 @@ _SUFFICIENT = 1e-4
 
 
 class DescentState(eqx.Module):
-    """Where a `Descent` stands: the point it is about to try, on a line from the last one accepted."""
+    """State of a `Descent`: the next trial point, on a line from the last one accepted."""
 
     trial: Float[Array, " n"]
     direction: Float[Array, " n"]

@@ -1,4 +1,4 @@
-"""Where a minimisation ended, as a function of the problem: derivatives of a minimum, whichever solver found it.
+"""Derivatives of a minimum with respect to the problem, by the implicit function theorem, whichever solver found it.
 
 At a minimum x̂(p) of a cost with gradient g(x, p) the gradient stays zero whatever the problem p does, so that
 
@@ -21,7 +21,8 @@ from jaxtyping import Array, Float
 
 from jeit_solvers.engines import undifferentiated
 
-# Of the linear system, relative; and its most steps: with a good model of the Hessian a dozen are taken.
+# Relative tolerance of the linear system, and its greatest number of steps: with a good model of the Hessian a dozen
+# are taken.
 _TOLERANCE, _MOST_STEPS = 1e-11, 500
 # The length of a step of Newton's method to the minimum, in the root of what it lowers the cost by, that needs no other
 # after it, for what is left is its square; and the most of them.
@@ -58,7 +59,7 @@ def _minimum_jvp(primals, tangents):
     along = tangents[1]
     if not jax.tree.leaves(along):
         return point, jnp.zeros_like(point)
-    # Of constants: no derivative goes through the way to the minimum, only through the minimum.
+    # Constants: no derivative goes through the way to the minimum, only through the minimum.
     start, constant = undifferentiated((found, problem))
     model = precondition(start, constant)
     at = point + jax.lax.stop_gradient(_polished(start, constant, gradient, model) - start)
@@ -77,7 +78,7 @@ def _solve(hessian: Linear, right: Float[Array, " n"], model: Linear) -> Float[A
 
 
 def _conjugate_gradients(multiply: Linear, right: Float[Array, " n"], model: Linear) -> Float[Array, " n"]:
-    """From zero, preconditioned; Golub and Van Loan, Matrix Computations (2013), 11.5."""
+    """Preconditioned conjugate gradients from zero; Golub and Van Loan, Matrix Computations (2013), 11.5."""
 
     def go_on(state):
         _, _, _, left, number = state

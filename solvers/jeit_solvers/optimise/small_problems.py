@@ -19,12 +19,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jeit_solvers.engines import complex_slope, host, namespace, set_at, slopes, while_loop
 
-# What a function must give at x (n, F), with data whose last axis is F: its value (F,), gradient (n, F), and a positive
-# definite model of its Hessian (n, n, F), the Gauss-Newton or Fisher matrix for instance.
+# Signature of a function that returns at x (n, F), with data whose last axis is F, its value (F,), gradient (n, F), and
+# a positive definite model of its Hessian (n, n, F), the Gauss-Newton or Fisher matrix for instance.
 Expansion = Callable[[Array, Any], tuple[Array, Array, Array]]
 
 _MOST_DAMPING = 1e12
-# Gathering fewer than so many is not worth it.
+# Smallest number of functions that is worth gathering.
 _LEAST_PART = 32
 # Steps that the whole batch takes before what is left of it is gathered.
 _WHOLE_STEPS = 8
@@ -33,7 +33,7 @@ _APART = 1e-6
 
 
 class Minimum(eqx.Module):
-    """Where the batch ended: `x` (n, F), `value` (F,), `converged` (F,), and the `steps` that the slowest took."""
+    """Result of the batch: `x` (n, F), `value` (F,), `converged` (F,), and the `steps` that the slowest took."""
 
     x: Float[Array, "n F"]
     value: Float[Array, " F"]
@@ -79,7 +79,7 @@ def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Fl
 
 
 def definite_small(matrix: Float[Array, "n n F"]) -> Bool[Array, " F"]:
-    """Which of F symmetric matrices are positive definite."""
+    """Whether each of F symmetric matrices is positive definite."""
     lower, xp = _cholesky(matrix), namespace(matrix)
     diagonal = xp.stack([lower[i, i] for i in range(len(matrix))])
     return xp.all(xp.isfinite(diagonal) & (diagonal > 0), axis=0)
@@ -108,7 +108,7 @@ def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
 
 
 class _State(eqx.Module):
-    """Where each function of a batch stands."""
+    """State of each function of a batch."""
 
     x: Array
     value: Array
@@ -121,7 +121,7 @@ class _State(eqx.Module):
 
 
 class _Limits(NamedTuple):
-    """What steps are held to."""
+    """Limits of the steps."""
 
     lower: Array
     upper: Array
@@ -195,7 +195,7 @@ def _first_true(which: Bool[Array, " F"], most: int) -> Int[Array, " i"]:
 
 
 def _step_from(state: _State, limits: _Limits) -> tuple[Array, Array]:
-    """Where the next step leads, and by how much it promises to lower the value, to first order."""
+    """End point of the next step, and the predicted decrease of the value, to first order."""
     x, gradient, matrix, xp = state.x, state.gradient, state.matrix, namespace(state)
     held = ((x <= limits.lower) & (gradient > 0)) | ((x >= limits.upper) & (gradient < 0))
     diagonal = xp.eye(x.shape[0], dtype=bool)[:, :, None]
@@ -209,7 +209,7 @@ def _step_from(state: _State, limits: _Limits) -> tuple[Array, Array]:
 
 
 def _advance(state: _State, data, steps: int, expand: Expansion, limits: _Limits) -> _State:
-    """So many steps of all functions, or fewer if all are done."""
+    """Take this many steps of all functions, or fewer if all are done."""
     xp = namespace(state, data)
 
     def body(loop):
@@ -223,7 +223,7 @@ def _advance(state: _State, data, steps: int, expand: Expansion, limits: _Limits
         settled = (promised >= 0) & (promised <= limits.tolerance * (1 + xp.abs(state.value))) & ~fresh
         damping = xp.where(better, xp.maximum(state.damping / 10, 1e-12), 8 * xp.maximum(state.damping, 1e-4))
         taken = state.taken + ~(state.done | fresh)
-        # A step too small to tell better from worse ends the search as well.
+        # A step too small to distinguish better from worse ends the search as well.
         converged = state.converged | (~state.done & (settled | (damping > _MOST_DAMPING)))
         broken = fresh & ~xp.isfinite(value)
         return count + 1, _State(

@@ -1,4 +1,4 @@
-"""How a minimisation ended, in one word: the same words for every solver."""
+"""Status of a minimisation, in one word: the same words for every solver."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Status(StrEnum):
 
     @property
     def number(self) -> int:
-        """Its place among them: what stands for it in compiled code, which knows no words."""
+        """Index of the status, which stands for it in compiled code, where there are no words."""
         return list(Status).index(self)
 
     @classmethod

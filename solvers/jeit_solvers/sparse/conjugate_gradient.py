@@ -72,7 +72,7 @@ class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
 
 
 class Iterate(NamedTuple):
-    """Where conjugate gradients stand: r = b - A x, search direction p, and r^T M^-1 r."""
+    """State of conjugate gradients: r = b - A x, search direction p, and r^T M^-1 r."""
 
     solution: Inexact[Array, " n"]
     residual: Inexact[Array, " n"]

@@ -118,7 +118,7 @@ def _straight_cuts(coordinates: np.ndarray, part: np.ndarray, number: int) -> li
 
 
 def _distance_cut(graph: csr_array) -> np.ndarray:
-    """Of one part without coordinates, in graph distance."""
+    """Cut of one part without coordinates, in graph distance."""
     size = _num_nodes(graph)
     if size == 1:
         return np.zeros(1)

@@ -107,7 +107,7 @@ class EliminationTree:
 
 
 def _merged_levels(largest: np.ndarray) -> list[int]:
-    """How many levels of the tree each stage takes, from the leaves up, for levels with separators up to `largest`.
+    """Number of levels of the tree in each stage, from the leaves up, for levels with separators up to `largest`.
 
     Eliminating a separator together with the two below it makes a stage less, and wastes operations on the zeros
     between these two. It is done where the waste is smaller than what a stage costs in itself.

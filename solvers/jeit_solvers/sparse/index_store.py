@@ -18,7 +18,7 @@ from jeit_solvers.engines import add_into, as_array, gather, gather_or_zero, has
 
 
 class Slot(NamedTuple):
-    """Where an index array lies in the store, and its shape."""
+    """Place of an index array in the store, and its shape."""
 
     start: int
     shape: tuple[int, ...]
@@ -46,7 +46,7 @@ class IndexStore:
         return slot
 
     def pack(self) -> Int[Array, " total"]:
-        """All arrays in one. Raises `ValueError` if there are more indices than 32 bits can count."""
+        """Join all arrays into one. Raises `ValueError` if there are more indices than 32 bits can count."""
         if self._total > np.iinfo(np.int32).max:
             raise ValueError(
                 f"The plan needs {self._total} indices, more than 32-bit integers can count: the matrix fills in too "
@@ -77,7 +77,7 @@ class PaddedSum(NamedTuple):
         target, source = target[order], source[order]
         counts = np.bincount(target, minlength=num_sums)
         rank = np.arange(target.size) - np.repeat(np.cumsum(counts) - counts, counts)
-        # How many contributions each width would leave over; the width with the least predicted time is taken.
+        # Number of contributions that each width would leave over; the width with the least predicted time is taken.
         left_over = target.size - np.concatenate([[0], np.cumsum(np.bincount(rank, minlength=1))])
         width = int(np.argmin(np.arange(left_over.size) * num_sums + _SCATTER_COST * left_over))
         gather = np.full((width, num_sums), num_sources, dtype=np.int32)

@@ -244,7 +244,7 @@ def _inverse_entries(
 
 
 def _within(above: Inexact[Array, "parents height height"], rows: Int[Array, "batch border"]):
-    """Of the inverse in parents' fronts what is between the rows of children's borders, zero for padding."""
+    """Entries of the inverse in parents' fronts between the rows of children's borders, zero for padding."""
     height = above.shape[-1]
     slot, place = rows // height, rows % height
     # Padding is one beyond the last front.

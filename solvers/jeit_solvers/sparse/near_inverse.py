@@ -63,7 +63,7 @@ class Strips(eqx.Module):
         return self.position // self.size * self.wanted + self.position % self.size
 
     def reach(self, groups: Int[np.ndarray, "g k"]) -> int:
-        """How many strips further the last of a group's places is than the first, at most; 1 at least."""
+        """Greatest number of strips from the first to the last of a group's places; at least 1."""
         strips = np.asarray(groups) // self.wanted
         return max(1, int((strips.max(axis=1) - strips.min(axis=1)).max()))
 

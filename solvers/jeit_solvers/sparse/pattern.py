@@ -16,7 +16,8 @@ from jeit_solvers.sparse.index_store import IndexLayout, IndexStore, Slot
 
 
 class SparsityPattern(eqx.Module):
-    """Which entries of a symmetric (n, n) matrix may be non-zero: its lower triangle, diagonal included.
+    """Positions of the entries of a symmetric (n, n) matrix that may be non-zero: its lower triangle, diagonal
+    included.
 
     A matrix with this pattern is its `values` (nnz,): `values[k]` stands at `(rows[k], columns[k])` and also at
     `(columns[k], rows[k])`. The diagonal comes first, `values[:n]`, then the entries below it, row by row.

@@ -16,8 +16,8 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 
 
 class Link(NamedTuple):
-    """How a stage takes over what the fronts of an earlier one, `source`, left for it: sums over that stage's flattened
-    Schur complements, into `panel` and `corner`, and over its flattened right-hand-side updates, into `rows`."""
+    """Transfer to a stage from the fronts of an earlier one, `source`: sums over that stage's flattened Schur
+    complements, into `panel` and `corner`, and over its flattened right-hand-side updates, into `rows`."""
 
     source: int
     panel: PaddedSum
@@ -44,7 +44,7 @@ class Stage(NamedTuple):
 
 
 class FactorisationPlan(eqx.Module):
-    """All that `factorise` and `solve` need to know about a sparsity pattern; made by `analyse`.
+    """Everything that `factorise` and `solve` need to know about a sparsity pattern; made by `analyse`.
 
     The index maps are one leaf of the pytree: pass a plan to a jitted function as an argument.
     """
@@ -61,7 +61,7 @@ class FactorisationPlan(eqx.Module):
 
     @property
     def solution(self) -> Slot:
-        """For each matrix row, where it is among the pivots of all stages, one stage after the other."""
+        """Index of each matrix row among the pivots of all stages, one stage after the other."""
         return self.layout.content[1]
 
     @property
@@ -94,7 +94,7 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
 
 
 def elimination_tree(pattern: SparsityPattern, coordinates: Any = None) -> EliminationTree:
-    """The tree that `analyse` makes a plan of; cheap, and enough to tell what the plan would cost.
+    """Elimination tree from which `analyse` makes a plan; cheap to compute, and enough to estimate the plan's cost.
 
     Raises `ValueError` for coordinates of another shape than (n, d), or not finite.
     """
@@ -128,14 +128,14 @@ def plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> Factorisati
 
 
 def _known(pattern: SparsityPattern, tree: EliminationTree) -> bytes:
-    """By which a plan is known again."""
+    """Key by which a plan is recognised."""
     found = hashlib.blake2b(digest_size=16)
     for one in (pattern.rows, pattern.columns, tree.front, tree.place, tree.parent, tree.stage, tree.slot):
         found.update(np.asarray(one).tobytes())
     return found.digest()
 
 
-# Of plans in use: making one of a solid takes seconds, and keeping it hundreds of megabytes.
+# Indices of plans in use: making a plan of a solid takes seconds, and keeping it hundreds of megabytes.
 _INDICES: WeakValueDictionary[bytes, Array] = WeakValueDictionary()
 _LAYOUTS: WeakValueDictionary[bytes, IndexLayout] = WeakValueDictionary()
 
