@@ -160,6 +160,18 @@ def test_no_name_for_everybody_hides_a_module(top):
     assert sorted(given & set(house)) == []
 
 
+@pytest.mark.parametrize("top", ["jeit", "solvers/jeit_solvers"])
+def test_no_module_assigns_a_constant_twice(top):
+    """The second would be read by functions written for the first."""
+    twice = []
+    for name, path in modules(ROOT / top).items():
+        statements = [one for one in ast.parse(path.read_text("utf-8")).body if isinstance(one, ast.Assign)]
+        targets = [target for one in statements for target in one.targets]
+        given = [one.id for target in targets for one in ast.walk(target) if isinstance(one, ast.Name)]
+        twice += [f"{name}.{one}" for one in sorted(set(given)) if given.count(one) > 1]
+    assert twice == []
+
+
 def test_no_two_test_files_have_one_name():
     """pytest imports them by name, and can collect only one of the two."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]

@@ -12,7 +12,7 @@ from typing import Any
 
 from jeit.files.limits import check_memory
 
-_LONGEST = 120
+_LONGEST_REASON = 120
 
 
 @contextmanager
@@ -36,7 +36,7 @@ def read_as(said: str) -> Iterator[None]:
 def reason(error: Exception) -> str:
     """Message of an error, in one short line: its type where it has no message."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+    return text if len(text) <= _LONGEST_REASON else f"{text[: _LONGEST_REASON - 1]}…"
 
 
 # Bytes of a file that a person writes, at most; bytes of memory for each of a text's.

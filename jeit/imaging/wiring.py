@@ -31,7 +31,7 @@ from jeit_solvers.engines import on_host
 
 # Share of the difference that may be left after each exchange, and after all reported exchanges; and the greatest
 # number of exchanges searched for.
-_STEP, _BETTER, _MOST = 0.9, 0.5, 4
+_EXCHANGE_STEP, _EXCHANGE_BETTER, _MOST = 0.9, 0.5, 4
 
 
 def exchanges_message(frame: Measurement, reference: Measurement) -> str:
@@ -49,7 +49,7 @@ def exchanges_message(frame: Measurement, reference: Measurement) -> str:
         (*_exchanges(measured.T, rest.T), "measurements of every drive"),
     ]
     left, pairs, what = min(found, key=lambda one: one[0])
-    if not pairs or left > _BETTER * described:
+    if not pairs or left > _EXCHANGE_BETTER * described:
         return ""
     size = float(np.linalg.norm(rest))
     named = ", ".join(f"{one + 1} and {other + 1}" for one, other in pairs)
@@ -80,7 +80,7 @@ def _exchanges(
         own = np.diag(apart)
         gain = own[:, None] + own - apart - apart.T
         one, other = np.unravel_index(np.argmax(gain), gain.shape)
-        if left - gain[one, other] > _STEP**2 * left:
+        if left - gain[one, other] > _EXCHANGE_STEP**2 * left:
             break
         left = max(left - float(gain[one, other]), 0.0)
         pairs.append((int(min(one, other)), int(max(one, other))))

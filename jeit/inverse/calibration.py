@@ -25,7 +25,7 @@ from jeit_solvers.engines import as_array, has_values, on_device, on_host, undif
 # Logarithm of a contact impedance over the model's, beyond which it no longer changes the voltages.
 FARTHEST = 50.0
 # Tolerance of the parameters and the misfit: as small as double precision allows.
-_TOLERANCE = 1e-12
+_TRACED_TOLERANCE = 1e-12
 
 
 class TracedFit(NamedTuple):
@@ -49,7 +49,7 @@ def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact:
     unit = jnp.where(used, model.voltages(1.0), 0)
     size = {"fixed": 1, "common": 2, "each": 1 + model.electrodes.num_electrodes}[contact]
     start = jnp.full(size, jnp.log(unit @ unit / (unit @ jnp.where(used, measured, 0))))
-    solver = optx.LevenbergMarquardt(rtol=_TOLERANCE, atol=_TOLERANCE)
+    solver = optx.LevenbergMarquardt(rtol=_TRACED_TOLERANCE, atol=_TRACED_TOLERANCE)
     residual = partial(_residual, contact)
     frozen_start, frozen = undifferentiated((start, problem))
     found = optx.least_squares(residual, solver, frozen_start, frozen, max_steps=max_steps, throw=False)
