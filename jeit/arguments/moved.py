@@ -60,6 +60,8 @@ MOVED = _RENAMED | {
 # Contents pages that have moved as a whole.
 _MOVED_PAGES = {
     "jeit.report.study": "jeit.design.reports",
+    "jeit.simulate.acoustic": "jeit.acoustic.simulate",
+    "jeit.simulate.acoustic.people": "jeit.acoustic.simulate.people",
     "jeit.simulate.contact": "jeit.touch.simulate.contact",
     "jeit.simulate.damage": "jeit.touch.simulate.damage",
     "jeit.simulate.people": "jeit.touch.simulate.people",

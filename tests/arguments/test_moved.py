@@ -23,6 +23,7 @@ def test_an_old_name_is_found_and_warned_of(old):
     ("old", "new"),
     [
         ("jeit.simulate.contact import PressedSkin", "jeit.touch.simulate.contact.PressedSkin"),
+        ("jeit.simulate.acoustic.people import SoundingPerson", "jeit.acoustic.simulate.people.SoundingPerson"),
         ("jeit.simulate.people import Person", "jeit.touch.simulate.people.Person"),
         ("jeit.simulate.damage import Cut", "jeit.touch.simulate.damage.Cut"),
         ("jeit.report.study import write_study_report", "jeit.design.reports.write_study_report"),

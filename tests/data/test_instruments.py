@@ -13,6 +13,7 @@ from instrument_files import (
 )
 
 from jeit import data, protocol
+from jeit.data import table
 from jeit.data.quality import impossible_signs
 from jeit.data.registry import FORMATS
 
@@ -261,3 +262,8 @@ def test_what_is_wrong_is_told(name, tmp_path):
     with pytest.raises(ValueError, match=message) as caught:
         data.read(tmp_path / "a.eit")
     assert len(str(caught.value)) < 400
+
+
+def test_a_table_has_one_list_of_endings():
+    """The registry's, by which the reader is imported, and the reader's own."""
+    assert FORMATS["table"].endings == table.SUFFIXES
