@@ -23,7 +23,7 @@ def licence_of(name: str) -> str:
     own = [one for one in own if one != "OSI Approved"]
     files = [one for one in metadata.files(name) or [] if re.match(r"(?i)licen[cs]e|copying", one.name)]
     text = about.get("License") or (files[0].locate().read_text("utf-8") if files else "")
-    return about.get("License-Expression") or ", ".join(own) or " ".join(text.split())[:40] or "not told"
+    return about.get("License-Expression") or ", ".join(own) or " ".join(text.split())[:40] or "not given"
 
 
 def needed(name: str, extras: set[str], seen: set[tuple[str, str]]) -> None:

@@ -96,12 +96,13 @@ def measure(name: str, options: argparse.Namespace) -> tuple[Result, list[str]]:
 def measure_all(names: Iterable[str], options: argparse.Namespace) -> Iterator[tuple[str, Callable]]:
     """Each case, as it is done, and a function that gives what `measure` does.
 
-    First those that tell times, one after the other; then the others, as many beside each other as there are cores.
+    First those that measure times, one after the other; then the others, as many beside each other as there are cores.
+    A quick run judges no times, so all of its cases run beside each other.
     """
     studies = []
     for name in names:
         try:
-            timed = find(name).timed
+            timed = find(name).timed and not options.quick
         except CaseFailedError:
             timed = True
         if timed:

@@ -14,7 +14,7 @@ The names used most, and where the rest is:
 - `plot_image`: pictures (`jeit.plot`).
 
 Importing jeit turns on JAX's 64-bit mode, unless JAX_ENABLE_X64 is set, and keeps compiled code in the user's cache
-folder, unless JAX has been told of another or JEIT_COMPILATION_CACHE is "off". Rooms are imported when first used.
+folder, unless JAX has been given another or JEIT_COMPILATION_CACHE is "off". Rooms are imported when first used.
 """
 
 from __future__ import annotations

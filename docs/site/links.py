@@ -11,9 +11,11 @@ ROOT = Path(__file__).resolve().parents[2]
 # Files outside `docs/` that are pages of the site as well.
 OUTSIDE = {
     "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
     "benchmarks/RESULTS.md": "results.md",
+    "tests/README.md": "tests.md",
 }
 _CODE = re.compile(r"<(a|h\d|pre|autoref)\b.*?</\1>|<code>([A-Za-z_][\w.]*)((?:\([^<]*\))?)</code>", re.DOTALL)
 _LINK = re.compile(r"(?<!!)\[([^\]\n]*)\]\((?!\w+:|#)([^)#\s]+)(#[^)\s]*)?\)")

@@ -21,7 +21,7 @@ _MOVED = {
         "jeit.design.plots": "plot_sensitivity_histograms plot_sensitivity_map plot_taxel_areas plot_taxels "
         "plot_travel plot_unrolled",
         "jeit.touch.plots": "plot_answers plot_changes plot_confusion plot_contact_stages plot_contacts "
-        "plot_depth_map plot_force_errors plot_health plot_health_course plot_heard "
+        "plot_depth_map plot_force_errors plot_health plot_health_course "
         "plot_key_errors plot_losses plot_map plot_place_errors plot_places plot_timeline "
         "plot_touch_paths plot_tried",
     },
@@ -30,9 +30,9 @@ _MOVED = {
         "jeit.design.reports": "draw_improved_layout draw_layout_comparison report_improved_layout "
         "report_layout_comparison write_improved_layout write_layout_comparison "
         "write_study_report",
-        "jeit.touch.reports": "draw_health draw_heard draw_watch report_gestures report_health report_heard "
+        "jeit.touch.reports": "draw_health draw_watch report_gestures report_health "
         "report_learnt_images report_learnt_skin report_listener report_watch write_depths "
-        "write_gestures write_health write_heard write_learnt_images write_learnt_skin "
+        "write_gestures write_health write_learnt_images write_learnt_skin "
         "write_listener write_touches write_watch",
     },
     "jeit.simulate": {
@@ -48,6 +48,9 @@ _MOVED = {
 _RENAMED = {
     "jeit.touch.attributes.least_told": "jeit.touch.attributes.least_detected",
     "jeit.touch.kohonen.touches_told": "jeit.touch.kohonen.touches_reported",
+    "jeit.touch.listening.Heard": "jeit.touch.listening.SoundLabels",
+    "jeit.plot.plot_heard": "jeit.touch.plots.plot_sound_labels",
+    **{f"jeit.report.{verb}_heard": f"jeit.touch.reports.{verb}_sound_labels" for verb in ("draw", "report", "write")},
 }
 MOVED = _RENAMED | {
     f"{page}.{name}": f"{home}.{name}"

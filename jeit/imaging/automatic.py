@@ -87,7 +87,7 @@ def _bodies_in_solid(prepared: PreparedDifference, asked: Asked, change: Float[A
         return None
     assert isinstance(smooth[0], Reconstruction)
     shapes = _shapes(prepared, smooth[0], asked)
-    why = f"the voltages tell of bodies, which a linear image of a solid blurs: their {_edges(prepared)} were fitted."
+    why = f"the voltages show bodies, which a linear image of a solid blurs: their {_edges(prepared)} were fitted."
     return shapes and _with_bodies(prepared, why, smooth, shapes)
 
 

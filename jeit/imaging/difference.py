@@ -152,7 +152,7 @@ class ImagedDifference:
                 said.append(
                     f"the body at x {x:.0f} mm, y {y:.0f} mm may as well be {kind}, of "
                     f"{np.exp(one.sign * one.contrast):.2g} times the background and {1e6 * one.volume:.3g} cm³: these "
-                    "electrodes do not tell which. If you know, bodies (--bodies) says so."
+                    "electrodes do not determine which. If you know, bodies (--bodies) says so."
                 )
         return tuple(said)
 
@@ -191,8 +191,8 @@ def _doubts_of_data(found: ImagedDifference) -> list[str]:
     used, said = np.asarray(found.measurement.mask)[0], []
     if (left := np.mean(used)) < _FEW_CHANNELS:
         said.append(
-            f"only {used.sum()} of {used.size} voltages are left ({percent(float(left))}): they tell little of what "
-            "is where."
+            f"only {used.sum()} of {used.size} voltages are left ({percent(float(left))}): they determine little of "
+            "what is where."
         )
     background, (low, high) = abs(complex(found.calibration.conductivity)), _CONDUCTIVITIES
     if found.mesh.dimension == 3 and not low < background < high:

@@ -83,7 +83,7 @@ def rule_for(name: str, prepared: PreparedDifference) -> Rule:
     if prepared.noise is None:
         raise ValueError(
             "hyperparameter: 'discrepancy' needs to know the noise, and no two channels of "
-            f"'{prepared.model.protocol.name}' are tied by reciprocity to tell it from; choose another rule, or a "
+            f"'{prepared.model.protocol.name}' are tied by reciprocity to estimate it from; choose another rule, or a "
             "number."
         )
     return partial(discrepancy, noise=prepared.noise)

@@ -180,7 +180,7 @@ def repeated_noise(frames, mask=None, *, prior_frames: float = 4.0) -> Float[np.
     if not known.any():
         raise ValueError("mask: it leaves no channel with two frames.")
     if not squares[known].any():
-        raise ValueError("frames: all are alike, so they tell nothing of the noise; is one frame repeated?")
+        raise ValueError("frames: all are alike, so the noise cannot be estimated; is one frame repeated?")
     typical = np.median((squares[known] / (count[known] - 1))[squares[known] > 0])
     freedom = np.where(known, count - 1, 1) + prior_frames
     return np.where(known, np.sqrt((squares + prior_frames * typical) / freedom), 1.0)

@@ -76,5 +76,5 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
 def _by_suffix(path: Path, table: dict):
     suffix = path.suffix.lower()
     if suffix not in table:
-        raise ValueError(f"path: {path} ends with none of {', '.join(table)}, which tell the format of a layout.")
+        raise ValueError(f"path: {path} ends with none of {', '.join(table)}, which give the format of a layout.")
     return table[suffix]

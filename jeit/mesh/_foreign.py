@@ -58,7 +58,7 @@ def check_foreign(path: Path) -> str:
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         raise ValueError(
-            f"path: {path.name[:80]} does not work as a mesh file: the ending of the name tells the format, "
+            f"path: {path.name[:80]} does not work as a mesh file: the ending of the name gives the format, "
             f"{', '.join(FORMATS)}. Others that meshio knows are read with trusted=True, where a file comes from you."
         )
     check_memory(path.name[:80], _GROWTH * path.stat().st_size)
@@ -71,7 +71,7 @@ def check_foreign(path: Path) -> str:
     if kind == "abaqus" and _INCLUDE.search(path.read_bytes()):
         raise ValueError(f"path: {path.name[:80]} includes another file; put all into one.")
     if kind == "abaqus" and _GENERATED.search(path.read_bytes()):
-        raise ValueError(f"path: {path.name[:80]} tells a set by its ends (GENERATE); write its members out.")
+        raise ValueError(f"path: {path.name[:80]} has a set by its ends (GENERATE); write its members out.")
     if kind == "vtk":
         _check_counts(path)
     return kind
@@ -112,7 +112,7 @@ def _check_counts(path: Path) -> None:
         if number > max(len(content), 1000):
             raise ValueError(
                 f"path: {path.name[:80]} does not work as a mesh file: it counts to {number} in {found[1].decode()}, "
-                f"and has {len(content)} bytes; grids that are told by their ends are not read."
+                f"and has {len(content)} bytes; grids with implicit ends are not read."
             )
 
 

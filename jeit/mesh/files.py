@@ -140,7 +140,7 @@ def _quietly(path: Path, action: Any, *, writing: bool = False) -> Any:
         fault = words if writing and words else "its content does not fit its format, or is cut off"
         says = f", which says: {words}" if words and not writing else ""
         raise ValueError(
-            f"path: {path.name[:80]} does not work as a mesh file: {fault}. The ending of the name tells the format: "
+            f"path: {path.name[:80]} does not work as a mesh file: {fault}. The ending of the name gives the format: "
             f".vtu, .vtk, .msh, .inp and others that meshio knows{says}."
         ) from None
 

@@ -118,7 +118,7 @@ def optimal(
             )
         change = dissipated - basis.T @ second @ basis
     if np.linalg.norm(change) <= _NOTHING * np.linalg.norm(dissipated):
-        raise ValueError("other: it equals transfer, and no current tells them apart.")
+        raise ValueError("other: it equals transfer, and no current distinguishes them.")
     if power is None:
         values, directions = _sorted(np.linalg.eigh(change @ change))
     else:

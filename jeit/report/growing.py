@@ -112,7 +112,7 @@ def saying_what_is_left(rows: GrowingRows) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        left = f"frames.csv tells of the {counted(rows.number, 'frame')} until then"
+        left = f"frames.csv has the {counted(rows.number, 'frame')} until then"
         said = f"{error.strerror or error}: what came of the stream could not all be written; {left}"
         raise OSError(error.errno, said, str(rows.folder)) from error
 

@@ -287,8 +287,8 @@ def _evidence_text(body: Star | Ellipsoid) -> str:
     if not body.contrast_is_determined:
         return "assumed, as of what is strong"
     if isinstance(body, Ellipsoid) and body.alike:
-        return "told by the data, as of one material with all others of its sign"
-    return "told by the data"
+        return "estimated from the data, as of one material with all others of its sign"
+    return "estimated from the data"
 
 
 def _prior(settings: ImagingSettings, dimension: int) -> str | None:

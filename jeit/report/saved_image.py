@@ -179,7 +179,7 @@ def _electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | 
         raise ValueError("'electrode_corners' are no places: some are not finite; write it again.")
     whole = all(one.dtype.kind in "iu" and one.ndim == 1 for one in (sizes, numbers))
     if not (whole and len(sizes) == len(numbers) > 0 and sizes.min() > 0 and sizes.sum() == len(corners)):
-        raise ValueError("'electrode_sizes' does not tell whose corners 'electrode_corners' are; write it again.")
+        raise ValueError("'electrode_sizes' does not say whose corners 'electrode_corners' are; write it again.")
     # Every electrode has a polygon, or there would be one without a place.
     if not np.array_equal(np.unique(numbers), np.arange(numbers.max() + 1)):
         raise ValueError("'electrode_numbers' leave electrodes out; write it again.")

@@ -261,7 +261,7 @@ def test_a_microphone_that_heard_little_is_said_so(exact):
     power[3:, 4] = np.nan
     fit = calibrated(power)
     assert not fit.calibration.usable[4]
-    assert fit.calibration.reasons[4] == "it heard 3 of the taps only, and 4 are needed"
+    assert fit.calibration.reasons[4] == "it received 3 of the taps only, and 4 are needed"
     assert fit.calibration.usable.sum() == COUNT - 1
 
 
@@ -311,7 +311,7 @@ def test_too_few_microphones(exact):
     power = exact[2].copy()
     power[:, 2:] = 0
     with pytest.raises(
-        ValueError, match=r"only 2 of 25 microphones heard taps from 4 distances.*microphones 2-24: dead"
+        ValueError, match=r"only 2 of 25 microphones received taps from 4 distances.*microphones 2-24: dead"
     ):
         calibrated(power)
 
@@ -370,7 +370,7 @@ def test_few_microphones_share_the_noise():
 @pytest.mark.parametrize(
     ("places", "said"),
     [
-        (np.repeat(PLACES[80:81], 20, axis=0), r"only 0 of \d+ microphones heard taps from 4 distances"),
+        (np.repeat(PLACES[80:81], 20, axis=0), r"only 0 of \d+ microphones received taps from 4 distances"),
         (np.repeat(PLACES[[10, 80, 150]], 7, axis=0), r"tap all over the skin"),
         pytest.param(np.random.default_rng(4).permutation(PLACES), r"in the order of the taps", marks=pytest.mark.slow),
     ],
@@ -405,7 +405,7 @@ def test_too_few_that_make_sense(exact):
     rng = np.random.default_rng(10)
     power = exact[2].copy()
     power[:, 2:] = np.exp(rng.normal(size=(NUMBER, COUNT - 2)))
-    with pytest.raises(ValueError, match=r"of the 25 microphones that heard the taps follow a decay model"):
+    with pytest.raises(ValueError, match=r"of the 25 microphones that received the taps follow a decay model"):
         calibrated(power)
 
 

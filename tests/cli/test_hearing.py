@@ -104,7 +104,7 @@ def test_a_large_error_of_the_models_is_noted(folder, off, tmp_path, capsys):
     assert re.search(
         r"decay model inverse-square: locates taps left out of the fit to 0\.0 mm, median \(", told["exact"]
     )
-    assert "the models miss what was heard by" in told["off"]
+    assert "the models miss the recorded levels by" in told["off"]
     assert "in another way here than in any decay model." in told["off"]
     exact, miss = (float(re.search(r"located to ± ([\d.]+) mm", one)[1]) for one in told.values())
     assert exact < 0.2
@@ -117,7 +117,7 @@ def test_another_decay_model_is_advised_where_one_was_asked_for(folder, off, tmp
     spoilt, exact = (
         " ".join(one.split()) for one in (capsys.readouterr().out, (folder / "cal.txt").read_text("utf-8"))
     )
-    assert "the models miss what was heard by" in spoilt
+    assert "the models miss the recorded levels by" in spoilt
     assert "try another --decay, or auto." in spoilt
     assert "the models miss" not in exact
     assert re.search(r"decay model inverse-square: locates taps left out of the fit to 0\.0 mm, median \(", exact)

@@ -231,8 +231,8 @@ def test_where_electrodes_do_not_tell_the_kind_of_a_body_it_is_doubted_and_the_r
     np.testing.assert_allclose(told[0]["or"]["conductivity_over_background"], 6)
     assert told[0]["or"]["deviation_of_logarithm"] == 0.5
     assert "or" not in told[1]
-    assert told[0]["conductivity_is"] == "told by the data, as of one material with all others of its sign"
-    assert told[1]["conductivity_is"] == "told by the data"
+    assert told[0]["conductivity_is"] == "estimated from the data, as of one material with all others of its sign"
+    assert told[1]["conductivity_is"] == "estimated from the data"
 
 
 def test_the_last_axis_of_a_column_that_is_drawn_stands():

@@ -212,7 +212,7 @@ def test_a_stream_noisier_than_what_was_learnt_says_so(made, learnt):
     rough = still + 50 * still.std(axis=0) * rng.normal(size=still.shape)
     watch = TouchWatch.create(TouchImages.prepare(DESCRIPTION, rough), learnt.model, rough, rate=RATE)
     assert watch.level.level > learnt.model.reading.level
-    assert "weak ones missed" in watch.notes[0]
+    assert "weak touches are missed" in watch.notes[0]
 
 
 def test_what_cannot_be_is_said(made, learnt, watch):

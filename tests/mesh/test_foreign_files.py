@@ -51,7 +51,7 @@ def refused(path):
 
 
 UNFIT = (
-    "its content does not fit its format, or is cut off. The ending of the name tells the format: .vtu, .vtk, .msh, "
+    "its content does not fit its format, or is cut off. The ending of the name gives the format: .vtu, .vtk, .msh, "
     ".inp and others that meshio knows"
 )
 LEADING = {

@@ -142,7 +142,7 @@ def test_a_full_disk_leaves_whole_lines(tmp_path):
 def test_a_full_disk_says_what_is_left(calibrated, tmp_path):
     with (
         limited(20_000),
-        pytest.raises(OSError, match=r"File too large: what came .* frames\.csv tells of the \d+ frames until then"),
+        pytest.raises(OSError, match=r"File too large: what came .* frames\.csv has the \d+ frames until then"),
     ):
         write_stream(images(calibrated, 100), calibrated, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["frames.csv"]

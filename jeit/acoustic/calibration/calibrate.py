@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.calibration.left_out import LeftOutTaps, locate_left_out
 from jeit.acoustic.calibration.robust_least_squares import TapFit, fit_taps, standard_errors
-from jeit.acoustic.calibration.usable_microphones import check_heard, leave_out
+from jeit.acoustic.calibration.usable_microphones import check_received, leave_out
 from jeit.acoustic.decay import DECAYS, AbstractDecay, find_decay
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.noise import IntensityNoise, below_nothing
@@ -83,8 +83,8 @@ class CalibrationFit(eqx.Module):
         if self.error <= _MUCH:
             return ""
         return (
-            f"the models miss what was heard by {100 * self.error:.0f} %, and what is located is the less certain. On "
-            "simulated skins taps at their places leave 20 %, taps 3 mm off them 25 %, and 5 mm off 30 %: are all "
+            f"the models miss the recorded levels by {100 * self.error:.0f} %, and places are less certain. "
+            "On simulated skins taps at their places leave 20 %, taps 3 mm off them 25 %, and 5 mm off 30 %: are all "
             "where they are said to be? Or sound falls off in another way here"
             + (": try another decay=, or auto." if len(self.left_out) == 1 else " than in any decay model.")
         )
@@ -215,7 +215,7 @@ def _read(taps: Taps, intensity: IntensitySettings | None) -> _Readings:
 
 def _fit(kind: type[AbstractDecay], readings: _Readings) -> _Fitted:
     """Fit one decay model. Raises `_NoFitError` where the fit does not determine positions."""
-    enough, why = check_heard(kind, readings.distance.T, readings.power, readings.faults)
+    enough, why = check_received(kind, readings.distance.T, readings.power, readings.faults)
     if why:
         raise _NoFitError(why)
     squared = readings.distance.T**2
@@ -225,9 +225,9 @@ def _fit(kind: type[AbstractDecay], readings: _Readings) -> _Fitted:
     left = locate_left_out(fit, readings.microphones, readings.surface, readings.places)
     if good.sum() < 3 or (good.sum() < _LEAST_SHARE * enough.sum() and not left.located):
         raise _NoFitError(
-            f"only {good.sum()} of the {enough.sum()} microphones that heard the taps follow a decay model, and three "
-            "are needed, or half: are the rows of positions in the order of the taps, and those of microphones in the "
-            f"order of the channels? {describe_faults(reasons)}."
+            f"only {good.sum()} of the {enough.sum()} microphones that received the taps follow a decay model, and "
+            "three are needed, or half: are the rows of positions in the order of the taps, those of microphones in "
+            f"the order of the channels? {describe_faults(reasons)}."
         )
     return _Fitted(fit, tried, good, reasons, explained, left)
 
@@ -236,7 +236,7 @@ def _calibration_fit(taps: Taps, readings: _Readings, fitted: _Fitted, notes) ->
     fit, good = fitted.fit, fitted.good
     # The factor between parameters and strengths, as `Calibration` has it.
     gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.values)).gain))[good].mean()
-    strength = np.where(fit.heard, np.exp(fit.strength + gain), np.nan)
+    strength = np.where(fit.received, np.exp(fit.strength + gain), np.nan)
     shared, errors = fit.shared & good, standard_errors(fit)
     errors[1:, shared] = np.nan
     decay = on_device(fit.kind.from_logarithms(host.concatenate([fit.values[:1] - gain, fit.values[1:]])))

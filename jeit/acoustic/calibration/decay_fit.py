@@ -133,21 +133,21 @@ def fit_within(
     problem: DecayProblem,
     start: Float[np.ndarray, "K M"],
     strength: Float[np.ndarray, " T"],
-    heard: Bool[np.ndarray, " M"],
+    received: Bool[np.ndarray, " M"],
     bounds: tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]],
 ) -> tuple[Float[np.ndarray, "K M"], Float[np.ndarray, " T"], Bool[np.ndarray, "K M"]]:
-    """As `fit_together`, with `bounds` on the logarithms, for the microphones in the mask `heard` (those with usable
+    """As `fit_together`, with `bounds` on the logarithms, for the microphones in the mask `received` (those with usable
     readings). Also returns which parameters are held at a bound; one is released where the cost decreases inwards."""
     lower, upper = (bound[:, None] for bound in bounds)
-    held = ((start <= lower) | (start >= upper)) & heard
+    held = ((start <= lower) | (start >= upper)) & received
     values = start
     for _ in range(_MOST_HELD):
-        slope = _normal_equations(problem, values, strength, heard & np.ones_like(held))[1].gradient
+        slope = _normal_equations(problem, values, strength, received & np.ones_like(held))[1].gradient
         inwards = np.where(values <= lower, slope < 0, slope > 0)
         held &= ~inwards
-        found, strength = fit_together(problem, values, strength, ~held & heard)
+        found, strength = fit_together(problem, values, strength, ~held & received)
         values = np.clip(np.where(np.isfinite(found), found, values), lower, upper)
-        beyond = (values != found) & ~held & heard
+        beyond = (values != found) & ~held & received
         held |= beyond
         if not beyond.any():
             break

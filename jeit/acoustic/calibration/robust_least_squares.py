@@ -68,7 +68,7 @@ class TapFit(eqx.Module):
         return self.usable & ~self.outlier
 
     @property
-    def heard(self) -> Bool[np.ndarray, " T"]:
+    def received(self) -> Bool[np.ndarray, " T"]:
         """Taps with a reading used in the fit, at any microphone."""
         return np.asarray(self.use.any(axis=0))
 
@@ -140,7 +140,7 @@ def fit_taps(
     strength = np.log(np.clip(seen[loudest], 1e-300, 1e300)) - response[loudest]
     fit = replace(
         fit,
-        strength=np.where(fit.heard & np.isfinite(strength), strength, 0.0),
+        strength=np.where(fit.received & np.isfinite(strength), strength, 0.0),
         # At first the model is good to 20 % at best.
         weight=1 / np.maximum(_level_variance(fit, np.nan_to_num(np.maximum(power, 0.0))), 0.04),
     )
@@ -208,7 +208,7 @@ def _reweighed(fit: TapFit) -> TapFit:
     received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
     # Degrees of freedom used by the unknown strengths and parameters.
     count = fit.use.sum()
-    spent = fit.heard.sum() + fit.free.sum()
+    spent = fit.received.sum() + fit.free.sum()
     inflation = count / max(count - spent, 0.1 * count)
     if not fit.known_noise:
         use = np.isfinite(fit.power) & ~fit.outlier

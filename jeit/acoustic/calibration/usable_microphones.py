@@ -17,7 +17,7 @@ _UNLIKE, _WELL = 2.5, 0.1
 _FLAT = 0.1
 
 
-def check_heard(
+def check_received(
     kind: type[AbstractDecay], distance: Float[np.ndarray, "M T"], power: Float[np.ndarray, "M T"], faults
 ) -> tuple[Bool[np.ndarray, " M"], str]:
     """Which microphones received taps from enough distances, and the reason if too few did to fit a model, else ""."""
@@ -29,8 +29,8 @@ def check_heard(
     if enough.sum() >= 3:
         return enough, ""
     return enough, (
-        f"only {enough.sum()} of {len(enough)} microphones heard taps from {needed} distances or more, and three are "
-        f"needed to calibrate a decay model of {len(kind.parameters)} parameters: tap all over the skin. "
+        f"only {enough.sum()} of {len(enough)} microphones received taps from {needed} distances or more, and three "
+        f"are needed to calibrate a decay model of {len(kind.parameters)} parameters: tap all over the skin. "
         f"{describe_faults(faults)}"
     ).strip()
 
@@ -70,9 +70,9 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
         if falls[k] < _FLAT:
             reasons.append("what it hears does not fall with distance")
         elif used.sum() >= needed and not share[k] >= _LEAST_EXPLAINED:
-            reasons.append(f"its model explains {100 * max(share[k], 0):.0f} % of what it heard")
+            reasons.append(f"its model explains {100 * max(share[k], 0):.0f} % of what it received")
         elif received < needed:
-            reasons.append(f"it heard {received} of the taps only, and {needed} are needed")
+            reasons.append(f"it received {received} of the taps only, and {needed} are needed")
         elif relative[k] > _UNLIKE * max(typical, _WELL):
             reasons.append(
                 f"its model is off by {100 * relative[k]:.0f} %, and those of others by {100 * typical:.0f} %: is it "

@@ -206,35 +206,35 @@ def _unit(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calib
         return []
     ratio = float(np.median(np.where(use, np.abs(intensities.power), 0.0).max(axis=0)[known] / deviation[known]))
     low = ratio < 1 / _SAME_UNIT
-    return [f"what is heard is {ratio:.3g} times as loud as the calibration's noise: {asked}"] if low else []
+    return [f"the sound is {ratio:.3g} times as loud as the calibration's noise: {asked}"] if low else []
 
 
 def microphones_in_use(
-    heard: Intensities, calibration: Calibration
+    intensities: Intensities, calibration: Calibration
 ) -> tuple[MicrophoneArray, np.ndarray, tuple[str, ...]]:
     """The array with the noise of these intensities, the mask of usable readings (F, M), and the faults of the
     microphones.
 
     Raises `ValueError` if fewer than three microphones are left.
     """
-    use = np.asarray(heard.usable) & calibration.usable
+    use = np.asarray(intensities.usable) & calibration.usable
     faults = tuple(
         "; ".join(part for part in (fault, reason and f"not calibrated: {reason}") if part)
-        for fault, reason in zip(heard.faults, calibration.reasons, strict=True)
+        for fault, reason in zip(intensities.faults, calibration.reasons, strict=True)
     )
     if use.any(axis=0).sum() < 3:
         raise ValueError(
-            f"'{heard.name}': {use.any(axis=0).sum()} of {len(faults)} microphones can be used, and three are needed "
-            f"to locate a touch. {describe_faults(faults)}."
+            f"'{intensities.name}': {use.any(axis=0).sum()} of {len(faults)} microphones can be used, and three are "
+            f"needed to locate a touch. {describe_faults(faults)}."
         )
     known = calibration.microphone_array.noise
-    if np.any(heard.floor > 0):
+    if np.any(intensities.floor > 0):
         noise = IntensityNoise.create(
-            len(faults), floor=heard.floor, freedom=heard.freedom, relative=np.asarray(known.relative)
+            len(faults), floor=intensities.floor, freedom=intensities.freedom, relative=np.asarray(known.relative)
         )
     else:
         # Negative intensities indicate noise that may have been absent in the calibration.
-        wider = np.maximum(below_nothing(heard.power, use), np.asarray(known.deviation))
+        wider = np.maximum(below_nothing(intensities.power, use), np.asarray(known.deviation))
         noise = eqx.tree_at(
             lambda n: (n.deviation, n.floor),
             known,

@@ -49,7 +49,7 @@ def make_grid(settings, rate: float, samples: int | None, name: str) -> Grid:
     bins = (settings.high - settings.low) * length / rate
     if bins < _FEWEST_BINS:
         raise ValueError(
-            f"{name}: a window of {settings.window:g} s tells frequencies {1 / settings.window:.3g} Hz apart: too "
+            f"{name}: a window of {settings.window:g} s resolves frequencies {1 / settings.window:.3g} Hz apart: too "
             f"few in the band {settings.low:g} to {settings.high:g} Hz. Set window to "
             f"{_FEWEST_BINS / (settings.high - settings.low):.2g} s or more, or widen the band."
         )

@@ -50,7 +50,7 @@ def reconstruct(
         str | None,
         typer.Option(
             help="auto (default): one-step, or gauss-newton and outlines of bodies where that is unsound, bodies in "
-            "solids wherever they are told of; one-step, back-projection, filtered-back-projection; gauss-newton, "
+            "solids wherever the data show them; one-step, back-projection, filtered-back-projection; gauss-newton, "
             "levenberg-marquardt, total-variation; shapes, outlines of strong bodies, in solids their surfaces; "
             "network, maps of depth by one that learnt the skin (--model)."
         ),
@@ -230,7 +230,7 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
     columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
     assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
     alike = any(isinstance(one, Ellipsoid) and one.alike for one in shapes.bodies)
-    material = ", as of one material: the data do not tell otherwise" if alike else ""
+    material = ", as of one material: the data do not contradict it" if alike else ""
     drift = f"the background has drifted by {percent(shapes.drift)}"
     return f"{counted(len(shapes.bodies), edge)} fitted{columns}{material}{left}{assumed}; {drift}"
 

@@ -75,7 +75,7 @@ def series(
     as_is: AsIs = False,
     quiet: Quiet = False,
 ) -> None:
-    """Image all frames of DATA against one reference, linearly and in one go, and tell what happens over time.
+    """Image all frames of DATA against one reference, linearly and in one go, and describe what happens over time.
 
     Writes series.png (the functional image, maps of amplitude and phase, curves and spectra of regions), series.npz,
     regions.csv and report.json. Frame after frame as they come: jeit stream.

@@ -85,7 +85,7 @@ def compare(
     height: skins.Height = 1e3 * defaults.SIDE,
     quiet: Quiet = False,
 ) -> None:
-    """Touch two layouts all over, and say what each feels: sensitivity, blind spots, virtual taxels."""
+    """Touch two layouts all over, and compare them: sensitivity, blind spots, virtual taxels."""
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.design import compare_layouts
     from jeit.design.comparison import check_same_outline

@@ -25,9 +25,12 @@ _SCORES = {
     "mean_variance": {"mean_variance": ("1", "mean posterior variance of a touch's amplitude (A)")},
     "largest_variance": {"largest_variance": ("1", "largest posterior variance of a pattern of touches (E)")},
     "localisation_error": {
-        "localisation_error_mean": ("mm", "mean Cramér-Rao bound of a touch's place, infinite if one cannot be told"),
+        "localisation_error_mean": (
+            "mm",
+            "mean Cramér-Rao bound of a touch's place, infinite where one has none",
+        ),
         "localisation_error_max": ("mm", "largest Cramér-Rao bound of a touch's place"),
-        "localisation_lost": ("1", "share of the area where a touch's place cannot be told"),
+        "localisation_lost": ("1", "share of the area where a touch's place cannot be estimated"),
     },
 }
 

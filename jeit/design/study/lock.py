@@ -126,6 +126,6 @@ def _refusal(owner: dict, place: Path, path: Path, kind: str) -> str:
         return f"{path} is being written by {who}{since}; wait until it ends, or stop it, then resume the {kind}."
     where = "this machine" if _is_here(owner) else describe(owner.get("host"))
     return (
-        f"{path} is being written by {who} on {where}{since}, or was when that was killed: from here that cannot be "
-        f"told. Where it still runs, wait; where it does not, delete {place} and resume the {kind}."
+        f"{path} is being written by {who} on {where}{since}, or was when that was killed: from here this cannot be "
+        f"seen. Where it still runs, wait; where it does not, delete {place} and resume the {kind}."
     )

@@ -143,7 +143,7 @@ def reconstruct(
     )
     if parametrisation.informative and inversion.penalty.is_standard_normal:
         instead = "leave it out, and take all shapes"
-        check_has_values("informative: the problem", inversion, "the shapes that data tell of are found from", instead)
+        check_has_values("informative: the problem", inversion, "shapes that the data support come from", instead)
         inversion = informed(inversion, parametrisation.informative)
     first = as_array(np.zeros(inversion.num_coefficients)) if start is None else _continued(start, inversion, choice)
     found = solver.minimise(inversion, first, box)

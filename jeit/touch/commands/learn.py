@@ -94,7 +94,7 @@ def image(
         ),
         ("touches never seen", f"{100 * learnt.standing.explained:.1f} % of squared depth explained"),
         ("a ball of 15 mm", f"{1e3 * place['mean']:.2f} ± {1e3 * place['sd']:.2f} mm off"),
-        ("told to be", f"{learnt.standing.deepest:.2f} of its depth, where it is deepest"),
+        ("its greatest depth", f"estimated as {learnt.standing.deepest:.2f} of the true one"),
         ("time", ", ".join(f"{name} {seconds:.0f} s" for name, seconds in learnt.seconds.items())),
     ]
     console.print()

@@ -11,7 +11,7 @@ from typer.core import TyperCommand, TyperGroup
 from jeit.cli.options import Quiet, check_at_least, make_folder, naming_options
 
 if TYPE_CHECKING:
-    from jeit.touch.listening import Heard
+    from jeit.touch.listening import SoundLabels
 
 
 _LOUDNESS = {"auto": None, "counts": True, "ignored": False}
@@ -39,7 +39,7 @@ class _RecordingFirst(TyperGroup):
 listen = typer.Typer(
     name="listen",
     cls=_RecordingFirst,
-    help="Name what is heard in a recording, every 0.1 s; 'listen fit' learns what from labelled clips.",
+    help="Name the sounds in a recording, every 0.1 s; 'listen fit' learns what from labelled clips.",
 )
 
 
@@ -70,21 +70,24 @@ def hear(
     calibration: Annotated[
         Path | None,
         typer.Option(
-            "--calibration", "-c", help="File of jeit calibrate-microphones: places are then told.", show_default=False
+            "--calibration",
+            "-c",
+            help="File of jeit calibrate-microphones: estimates places.",
+            show_default=False,
         ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Name what is heard in a recording, every 0.1 s; writes events.csv, report.json and timeline.png.
+    """Name the sounds in a recording, every 0.1 s; writes events.csv, report.json and timeline.png.
 
     What is named, a MODEL has learnt from labelled clips: see 'jeit listen fit --help'.
     """
     from jeit.acoustic import Calibration, Recording, read_recording
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.touch.listening import Listener
-    from jeit.touch.reports.listener import HEARD_FILES, write_heard
+    from jeit.touch.reports.listener import SOUND_LABEL_FILES, write_sound_labels
 
-    make_folder(output, HEARD_FILES)
+    make_folder(output, SOUND_LABEL_FILES)
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
@@ -92,13 +95,13 @@ def hear(
         known = None if calibration is None else Calibration.load(calibration)
         sound = read_recording(recording)
         if not isinstance(sound, Recording):
-            raise ValueError(f"{recording.name}: it holds intensities; what is heard is told from samples.")
+            raise ValueError(f"{recording.name}: it holds intensities; sounds are recognised in samples.")
         step("listen")
-        heard = listener.hear(sound, calibration=known)
+        labels = listener.hear(sound, calibration=known)
         step("write")
-        write_heard(heard, output, model=str(model))
+        write_sound_labels(labels, output, model=str(model))
     if not quiet:
-        _show(console, heard)
+        _show(console, labels)
         say_written(console, output / "events.csv", "report.json", "timeline.png")
 
 
@@ -196,7 +199,7 @@ def fit(
     say_written(console, output / "listener.jeit", "report.json", "learning.png")
 
 
-def _show(console, result: "Heard") -> None:
+def _show(console, result: "SoundLabels") -> None:
     """The whole, and a line for each event."""
     from rich.table import Table
 

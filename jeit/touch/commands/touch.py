@@ -61,7 +61,7 @@ def fit(
         ),
     ] = None,
     channels: Annotated[
-        int | None, typer.Option(help="Use only so many channels, those that tell most (default: all).")
+        int | None, typer.Option(help="Use only so many channels, the most informative (default: all).")
     ] = None,
     per_session: Annotated[
         bool, typer.Option("--per-session", help="Standardise the changes of each group by themselves, against drift.")

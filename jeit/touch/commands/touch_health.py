@@ -50,7 +50,7 @@ def health(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Tell cuts, failing electrodes and repair in a recording of a skin, beside one of it while it was healthy.
+    """Detect cuts, failing electrodes and repair of a skin: a recording, compared with one of the healthy skin.
 
     Writes events.csv, report.json and health.png. Nothing is asked of the skin: any number of channels, any unit.
     """

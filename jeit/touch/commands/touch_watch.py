@@ -42,7 +42,7 @@ def gestures(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Learn gestures from recordings of them; says how often they are told right, of people who were held out.
+    """Learn gestures from recordings of them; says how often those of people who were held out are named correctly.
 
     Writes gestures.skops, report.json and gestures.png, what was taken for what, to the folder MODEL.
     """
@@ -180,7 +180,7 @@ def watch(
 
 
 def _say(console, written, live, output: Path) -> None:
-    """What was told, in sum."""
+    """Print a summary of the touches."""
     import numpy as np
 
     from jeit.arguments import counted

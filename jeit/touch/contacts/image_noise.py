@@ -60,7 +60,7 @@ class ImageNoise(eqx.Module):
                 f"skin, {counted(_LEAST_FRAMES, 'frame')} or more."
             )
         if (frames == frames[0]).all():
-            raise ValueError("frames are all the same: they tell no noise. Give what was read, not copies of a frame.")
+            raise ValueError("frames are all the same and show no noise. Give what was read, not copies of a frame.")
         strayed = np.asarray(reconstruction.image(frames - frames.mean(axis=0)))
         return cls._of_factor(strayed / np.sqrt(len(frames) - 1))
 

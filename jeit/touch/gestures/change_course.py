@@ -88,7 +88,7 @@ class TouchLevel(eqx.Module):
                 f"images: give {_LEAST_FRAMES} frames of an untouched skin, or more; {len(peaks)} have none."
             )
         if np.ptp(peaks) == 0:
-            raise ValueError("images are all the same: they tell no noise. Give what was read, not copies of a frame.")
+            raise ValueError("images are all the same and show no noise. Give what was read, not copies of a frame.")
         return cls(mesh, float(peaks.mean() + _ABOVE * peaks.std(ddof=1)))
 
     def course(self, seconds: Float[np.ndarray, " F"], images: Float[np.ndarray, "F m"]) -> ChangeCourse:

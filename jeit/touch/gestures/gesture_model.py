@@ -117,7 +117,7 @@ class GestureModel:
             folds = person_folds(people_of, _FOLDS)
         else:
             folds = random_folds(right, _FOLDS)
-            remarks.append("one person, or nobody, was told of: chosen on touches held out at random, not on people.")
+            remarks.append("one person, or nobody, is named: chosen on touches held out at random, not on people.")
         found = []
         for shape in FORMS:
             values = FORMS[shape](touches).values

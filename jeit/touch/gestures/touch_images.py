@@ -69,7 +69,7 @@ class TouchImages:
         ).mean_frame()
         imager, calibration = prepare_imager(reference, settings, progress=progress)
         if calibration.model.mesh.dimension != 2:
-            raise ValueError(f"{description.origin}: touches are told on sheets, of two dimensions; this is a solid.")
+            raise ValueError(f"{description.origin}: touches are detected on sheets (2-D); this is a solid.")
         return cls(imager, calibration, reference)
 
     @property

@@ -119,7 +119,7 @@ class TouchWatch:
             own = TouchLevel.of_untouched(images.mesh, model.reading.sign * images.changes(untouched))
             notes.append(
                 f"the untouched skin's images reach {peaks.max() / level.level:.2g} times the level that a touch "
-                "exceeded when gestures were learnt: touches are told from a higher one, and weak ones missed. Was the "
+                "exceeded when gestures were learnt: a higher one is used, and weak touches are missed. Was the "
                 "skin touched meanwhile?"
             )
             level = own

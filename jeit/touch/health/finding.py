@@ -77,7 +77,7 @@ def findings(
     said = (
         f"{100 * outside:.0f} % of it is in no direction of touches; of those, {100 * healthy.unlike:.0f} % at most."
         if unlike
-        else "A press that is held looks like it: only time, or the user, tells."
+        else "A press that is held looks the same: wait, or check the skin."
     )
     if loss is not None:
         across = "through the whole skin" if loss.through else "perhaps through a part of its depth"

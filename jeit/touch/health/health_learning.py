@@ -70,13 +70,13 @@ def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndar
     window = known.window * known.stride
     if len(frames) < 2 * window:
         doubts.append(
-            f"{len(frames)} frames are fewer than two windows of {window}: a change that lasts cannot be told from a "
-            "touch in them."
+            f"{len(frames)} frames are fewer than two windows of {window}: a change that lasts cannot be distinguished "
+            "from a touch in them."
         )
     if known.brief or len(healthy.frames) < _FEW:
         doubts.append(
             f"the healthy recording has {len(healthy.frames)} frames, few beside the length of touches, or at all: "
-            "what is told may be false, and what is not may be there. Give forty of the longest touches, and a minute."
+            "findings may be false, and damage may be missed. Give forty of the longest touches, and a minute."
         )
     silent = np.flatnonzero(known.used & ~there.any(axis=0))
     if silent.size:

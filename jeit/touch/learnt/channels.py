@@ -42,7 +42,7 @@ class Channels:
     Of the channels used: `scale` (m,) of changes; `range` (2, m), in scales, beyond which no channel reads that is
     alive; `patterns` (m, k), `spread` (k,) of scores, `noise` (m,) in scales; `farthest` (m,): the greatest residuals
     of a channel that is alive; `directions` (m, r) of the covariance, the `weight` (r,) of each relative to a diagonal,
-    and the variance (m,) of channels that all others do not predict, `unforetold`; `usual`: the novelty that all but a
+    and the variance (m,) of channels that all others do not predict, `unpredicted`; `usual`: the novelty that all but a
     hundredth of the presses do not exceed; `neighbourhood`: how near presses are to each other.
     """
 
@@ -55,7 +55,7 @@ class Channels:
     farthest: Float[np.ndarray, " m"]
     directions: Float[np.ndarray, "m r"]
     weight: Float[np.ndarray, " r"]
-    unforetold: Float[np.ndarray, " m"]
+    unpredicted: Float[np.ndarray, " m"]
     usual: float
     neighbourhood: Neighbourhood
 
@@ -88,14 +88,14 @@ class Channels:
         farthest = np.maximum(farthest, max(6.0, float(np.nanquantile(left, 0.99))))
         variance, directions = _variances(scaled)
         best = int(misses[0].sum(axis=1).argmin())
-        weight, unforetold = variance / (variance + _DIAGONALS[best]), misses[1, best] / 2
+        weight, unpredicted = variance / (variance + _DIAGONALS[best]), misses[1, best] / 2
         patterns, spread, noise = _factors(scaled, variance, directions)
         every, _ = _explain(scaled, there, patterns, spread, noise)
         usual = float(np.quantile(apart, 0.99))
         least, most = np.nanmin(changes[:, used], axis=0) / scale, np.nanmax(changes[:, used], axis=0) / scale
         far = np.stack([least - _SPANS * (most - least), most + _SPANS * (most - least)])
         near = Neighbourhood.learn(every)
-        return cls(used, scale, far, patterns, spread, noise, farthest, directions, weight, unforetold, usual, near)
+        return cls(used, scale, far, patterns, spread, noise, farthest, directions, weight, unpredicted, usual, near)
 
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Replace changes of dead or missing channels by their prediction from the other channels.
@@ -174,7 +174,7 @@ class Channels:
         found = np.zeros((min(number, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
         patterns, kind = np.unique(alive, axis=0, return_inverse=True)
         for one, pattern in enumerate(patterns):
-            dead, doubt = self.directions[~pattern], np.sqrt(self.unforetold[~pattern])
+            dead, doubt = self.directions[~pattern], np.sqrt(self.unpredicted[~pattern])
             inverse = np.linalg.inv(np.eye(len(dead)) - (dead * self.weight) @ dead.T)
             variance, vectors = np.linalg.eigh(doubt[:, None] * inverse * doubt)
             columns = vectors[:, ::-1] * np.sqrt(np.maximum(variance[::-1], 0.0))

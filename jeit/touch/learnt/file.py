@@ -32,6 +32,8 @@ from jeit.touch.learnt.temporal_network import TemporalNetwork
 from jeit.touch.learnt.whitening import Whitened
 
 _KIND, _VERSION = "a jeit learnt skin", 2
+# Names that fields have in files of version 0.2.
+_OLD_FIELDS = {"unforetold": "unpredicted"}
 _OURS = {
     one.__name__: one
     for one in (
@@ -133,6 +135,6 @@ def _plain(value):
 def _whole(value):
     """Undo `_plain`."""
     if isinstance(value, dict):
-        held = {key: _whole(one) for key, one in value.items() if key != "jeit"}
+        held = {_OLD_FIELDS.get(key, key): _whole(one) for key, one in value.items() if key != "jeit"}
         return _OURS[value["jeit"]](**held) if "jeit" in value else held
     return [_whole(one) for one in value] if isinstance(value, list) else value

@@ -363,8 +363,8 @@ def _in_step(whole: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, 
     reference = None if presses.reference is None else presses.reference[frames]
     moved = replace(presses.rows(answers), frames=presses.frames[frames], reference=reference)
     said = (
-        f"frames seem to be of the press {counted(abs(lag), 'row')} {'before' if lag > 0 else 'after'} (places told "
-        f"{1e3 * late:.3g} mm off, as recorded {1e3 * straight:.3g} mm): learnt so; check the recording."
+        f"frames seem to be of the press {counted(abs(lag), 'row')} {'before' if lag > 0 else 'after'} (places "
+        f"estimated {1e3 * late:.3g} mm off, as recorded {1e3 * straight:.3g} mm): learnt so; check the recording."
     )
     return whole[frames], moved, lag, [said]
 

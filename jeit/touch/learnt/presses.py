@@ -72,7 +72,7 @@ class Presses:
         frames = check_frames("frames", frames)
         if len(frames) < _FEWEST:
             raise ValueError(
-                f"frames: {len(frames)} presses are too few to learn from and to tell how well; give {_FEWEST} or more."
+                f"frames: {len(frames)} presses are too few to learn from and to validate on; give {_FEWEST} or more."
             )
         given = {
             "positions": None if positions is None else _check_positions(positions),
@@ -190,7 +190,7 @@ def _check_positions(given) -> np.ndarray:
             f"than {_LONGEST:g} m."
         )
     if extent == 0:
-        raise ValueError("positions are all the same: there is nothing to tell apart.")
+        raise ValueError("positions are all the same: there is nothing to learn.")
     return positions
 
 
@@ -201,7 +201,7 @@ def _check_force(given) -> np.ndarray:
     if np.abs(force).max() > _HARDEST:
         raise ValueError(f"force is up to {np.abs(force).max():.4g}: are these newtons? 100 g weigh 0.981 N.")
     if np.ptp(force) == 0:
-        raise ValueError("force is the same in all presses: there is nothing to tell apart.")
+        raise ValueError("force is the same in all presses: there is nothing to learn.")
     return force.astype(float)
 
 

@@ -91,7 +91,7 @@ class LabelledClips:
             few = sum(rate < high * (1 - _SAME_RATE) for rate in rates)
             said.append(
                 f"{few} of {counted(len(rates), 'clip')} have fewer than {high:g} samples a second, the fewest "
-                f"'{recordings[int(np.argmin(rates))].name}': nothing above {low / 2:g} Hz is told, which all of them "
+                f"'{recordings[int(np.argmin(rates))].name}': nothing above {low / 2:g} Hz is used, which all of them "
                 "have."
             )
         width = several[0] if len(several) == 1 else 1

@@ -19,9 +19,9 @@ from jeit.touch.learnt.answers import Standing
 from jeit.touch.learnt.classifiers import probabilities, sharpness_of
 from jeit.touch.listening.feature_images import BANDS, EVERY, image_blocks
 from jeit.touch.listening.folds import held_out_folds
-from jeit.touch.listening.heard import Heard
 from jeit.touch.listening.labelled_clips import LabelledClips, mixed
 from jeit.touch.listening.learners import BATCHES, LEARNERS
+from jeit.touch.listening.sound_labels import SoundLabels
 from jeit.touch.listening.windows import LOUD, Windows
 from jeit.touch.training import read_model, write_model
 
@@ -101,8 +101,7 @@ class Listener:
         alone = np.array(windows.names)[np.unique(windows.right_of_clip[fold < 0])]
         if alone.size:
             notes.append(
-                f"{', '.join(alone)}: clips of one group only, which are never held out; how well they are told is not "
-                "known."
+                f"{', '.join(alone)}: clips of one group only, which are never held out; their accuracy is not known."
             )
         names = _TRIED if method == "auto" else (method,)
         if method == "auto" and len(windows.clip) < _FOR_NETWORKS:
@@ -156,7 +155,7 @@ class Listener:
             clips.name,
         )
 
-    def hear(self, recording: Recording, *, calibration: Calibration | None = None) -> Heard:
+    def hear(self, recording: Recording, *, calibration: Calibration | None = None) -> SoundLabels:
         """Classify every window of a recording, 0.5 s long and 0.1 s after the one before.
 
         A shorter recording is padded with silence. With a `calibration` of the microphones, places are estimated where
@@ -178,7 +177,7 @@ class Listener:
         if recording.rate < 2 * self.highest * (1 - 1e-3):
             raise ValueError(
                 f"{recording.name} has {recording.rate:g} samples a second, sound up to {recording.rate / 2:g} Hz, and "
-                f"the listener tells by sound up to {self.highest:g} Hz; record {2 * self.highest:g} a second or more, "
+                f"the listener uses sound up to {self.highest:g} Hz; record {2 * self.highest:g} a second or more, "
                 "or fit one to clips of this rate."
             )
         bad = int((~np.isfinite(recording.samples)).sum())
@@ -203,7 +202,7 @@ class Listener:
             notes.append("all of it is quieter than anything learnt from: is the gain another?")
         place, std = (None, None) if calibration is None else _places(whole, calibration, times)
         share = probabilities(odds, self.sharpness)
-        return Heard(
+        return SoundLabels(
             times,
             (1 - self.doubt) * share + self.doubt / share.shape[1],
             self.names,

@@ -72,7 +72,7 @@ class Windows:
         if cut:
             notes = (
                 f"{', '.join(sorted(cut))}: one recording only, cut into the sounds in it, which are held out in turn; "
-                "how well another recording is told is not known, and likely less well.",
+                "accuracy on another recording is not known, and likely lower.",
             )
         named = tuple(map(str, names))
         own_group = np.unique(group_of_piece, axis=0, return_inverse=True)[1].ravel()

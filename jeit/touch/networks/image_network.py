@@ -160,7 +160,7 @@ class ImageNetwork:
     def _response(self) -> Callable[..., Any]:
         network = self.network
         assert isinstance(network, Unrolled)
-        return jax.jit(lambda maps: network.felt(jnp.asarray(maps, jnp.float32)))
+        return jax.jit(lambda maps: network.predicted_changes(jnp.asarray(maps, jnp.float32)))
 
     def share(self, change: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n rows columns"]:
         """Depths over the thickness, from `change` relative to a reference (`jeit.touch.simulate.relative_changes`)."""
@@ -248,12 +248,12 @@ def _untrained(head: dict[str, Any]) -> ThreeStages | Unrolled:
     channels, key = head["made_for"]["channels"], jax.random.key(0)
     for number in (rows, columns, channels):
         if not (isinstance(number, int) and 1 <= number <= 10_000):
-            raise ValueError(f"its head tells of {describe(number)} rows, columns or channels")
+            raise ValueError(f"its head gives {describe(number)} rows, columns or channels")
     numbers = [head["thickness_m"], head["noise"], *head["extent_m"]]
     if len(numbers) != 6 or not all(is_number(one) for one in numbers):
-        raise ValueError("its head tells of no thickness, noise and extent")
+        raise ValueError("its head gives no thickness, noise and extent")
     if not (isinstance(head["steps"], int) and 0 <= head["steps"] <= _MOST_STEPS):
-        raise ValueError(f"its head tells of {describe(head['steps'])} steps")
+        raise ValueError(f"its head gives {describe(head['steps'])} steps")
     if head["design"] == "three-stages":
         return ThreeStages(channels, (rows, columns), key=key)
     return Unrolled(channels, (rows, columns), head["steps"], key=key)

@@ -133,7 +133,7 @@ def train_unrolled(
         for one in early:
             value = value + _EARLY * jnp.mean((one - wanted) ** 2)
         off = own[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
-        missed = jnp.mean((network.felt(last) - change) ** 2, axis=1) / off
+        missed = jnp.mean((network.predicted_changes(last) - change) ** 2, axis=1) / off
         # The logarithm of the misfit: otherwise touches on electrodes, which the model explains least, would dominate.
         return value / _SCALE + _MISFIT * jnp.mean(jnp.log1p(missed)), network
 

@@ -119,7 +119,7 @@ class Unrolled(eqx.Module):
         operator = operator.reshape(len(operator), -1)
         return operator @ _covariance(places[::2, ::2].reshape(-1, 2)) @ operator.T
 
-    def felt(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
+    def predicted_changes(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
         """Relative changes that the forward model predicts for maps."""
         return strength(maps).reshape(len(maps), -1) @ self.operator.T
 
@@ -129,7 +129,7 @@ class Unrolled(eqx.Module):
         still = jnp.broadcast_to(self.still, (number, *self.still.shape))
         found = []
         for step in self.steps:
-            rest = changes - self.felt(found[-1]) if found else changes
+            rest = changes - self.predicted_changes(found[-1]) if found else changes
             images = (rest @ self.imagers.reshape(len(self.imagers), -1)).reshape(number, rows, columns, -1)
             parts = [images / _DEVIATION, still]
             if found:

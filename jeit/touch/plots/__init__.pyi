@@ -3,9 +3,9 @@ from .contacts import plot_contacts
 from .depth_map import plot_depth_map, plot_losses
 from .health import plot_health
 from .health_course import plot_health_course
-from .heard import plot_heard
 from .kohonen_map import plot_map
 from .learning import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors, plot_tried
+from .sound_labels import plot_sound_labels
 from .timeline import plot_changes, plot_timeline, plot_touch_paths
 from .touches import plot_answers, plot_places
 
@@ -19,12 +19,12 @@ __all__ = [
     "plot_force_errors",
     "plot_health",
     "plot_health_course",
-    "plot_heard",
     "plot_key_errors",
     "plot_losses",
     "plot_map",
     "plot_place_errors",
     "plot_places",
+    "plot_sound_labels",
     "plot_timeline",
     "plot_touch_paths",
     "plot_tried",

@@ -51,7 +51,7 @@ def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | N
         right, said, linestyle="none", marker="o", markersize=3.5, alpha=0.6, color=SERIES_COLOURS[0], markeredgewidth=0
     )
     ax.set_xlabel("Force (N)", color=INK)
-    ax.set_ylabel("Force told of presses held out (N)", color=INK)
+    ax.set_ylabel("Estimated force of presses held out (N)", color=INK)
     ax.set_title(f"Forces: {np.abs(said - right).mean():.3g} N off on average" if title is None else title)
     soften_axes(ax)
     return ax
@@ -73,7 +73,7 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
         for row, column in np.argwhere(shares >= 0.5):
             colour = "white" if shares[row, column] > 50 else INK
             ax.text(column, row, f"{shares[row, column]:.0f}", ha="center", va="center", color=colour, fontsize=8)
-    ax.set_xlabel("Label told", color=INK)
+    ax.set_xlabel("Predicted label", color=INK)
     ax.set_ylabel("True label", color=INK)
     right = 100 * np.mean(label.right == label.held_out)
     ax.set_title(f"Labels: {right:.1f} % right of presses held out" if title is None else title)
@@ -87,7 +87,7 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
     ax.bar(range(len(wrong)), wrong, color=SERIES_COLOURS[0], width=0.7)
     ax.set_xticks(range(len(wrong)))
     ax.set_xlabel("Key", color=INK)
-    ax.set_ylabel("Told wrongly (%)", color=INK)
+    ax.set_ylabel("Classified wrongly (%)", color=INK)
     ax.set_ylim(0, max(1.0, 1.1 * wrong.max()))
     whole = 100 * np.mean((keys.held_out == keys.right).all(axis=1))
     said = f"Keys: {100 - wrong.mean():.1f} % right, whole patterns {whole:.1f} %"

@@ -86,7 +86,7 @@ def draw_learnt_images(learnt: LearntImages):
     panels = maps.subplots(2, len(right), squeeze=False)
     thickness = learnt.network.thickness
     most = thickness * float(right.max())
-    for row, (name, some) in zip(panels, (("right", right), ("told", estimated)), strict=True):
+    for row, (name, some) in zip(panels, (("right", right), ("estimated", estimated)), strict=True):
         for ax, one in zip(row, some, strict=True):
             plot_depth_map(thickness * one, learnt.network.extent, most=most, colour_bar=ax is row[-1], ax=ax)
         row[0].set_title(name)

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from jeit.report.folder import plain, results, version_of, write_json, write_rows
-from jeit.touch.listening import Heard, Listener
+from jeit.touch.listening import Listener, SoundLabels
 from jeit.touch.listening.feature_images import EVERY, LENGTH
 
 LISTENER_FILES = ("listener.jeit", "report.json", "learning.png")
-HEARD_FILES = ("events.csv", "report.json", "timeline.png")
+SOUND_LABEL_FILES = ("events.csv", "report.json", "timeline.png")
 _PACKAGES = ("jeit", "jax", "numpy", "scipy", "scikit-learn")
 
 
@@ -27,7 +27,7 @@ def write_listener(listener: Listener, folder: str | Path) -> None:
         draw_listener(listener).savefig(made / "learning.png", dpi=150)
 
 
-def write_heard(heard: Heard, folder: str | Path, *, model: str) -> None:
+def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -> None:
     """Write `events.csv`, `report.json` and the picture `timeline.png` of the sounds that the listener `model`
     classified.
 
@@ -36,11 +36,11 @@ def write_heard(heard: Heard, folder: str | Path, *, model: str) -> None:
     the loudest `microphone`, numbered from 0; and, where places were estimated, `x_m`, `y_m` (`z_m`) and `std_x_m` …,
     empty where there is none. Raises `ValueError` if `folder` cannot be a folder.
     """
-    columns = _columns(heard)
-    with results(folder, HEARD_FILES) as made:
+    columns = _columns(labels)
+    with results(folder, SOUND_LABEL_FILES) as made:
         write_rows(made / "events.csv", list(columns), zip(*columns.values(), strict=True))
-        write_json(report_heard(heard, model=model), made / "report.json")
-        draw_heard(heard).savefig(made / "timeline.png", dpi=150)
+        write_json(report_sound_labels(labels, model=model), made / "report.json")
+        draw_sound_labels(labels).savefig(made / "timeline.png", dpi=150)
 
 
 def report_listener(listener: Listener) -> dict[str, Any]:
@@ -70,10 +70,10 @@ def report_listener(listener: Listener) -> dict[str, Any]:
     )
 
 
-def report_heard(heard: Heard, *, model: str) -> dict[str, Any]:
+def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
     """Report the classified sounds as plain numbers, strings, lists and dictionaries; what is not known is None."""
-    whole, probability = heard.whole
-    names, counts = np.unique(heard.named, return_counts=True)
+    whole, probability = labels.whole
+    names, counts = np.unique(labels.named, return_counts=True)
     events = [
         {
             "heard": one.name or None,
@@ -82,19 +82,19 @@ def report_heard(heard: Heard, *, model: str) -> dict[str, Any]:
             "probability": one.probability if one.name else None,
             "mean_position_m": one.place,
         }
-        for one in heard.events
+        for one in labels.events
     ]
     return plain(
         {
-            "recording": heard.name,
+            "recording": labels.name,
             "model": model,
-            "windows": len(heard),
+            "windows": len(labels),
             "window_s": LENGTH,
             "every_s": EVERY,
             "whole": {"heard": whole or None, "probability": probability if whole else None},
             "windows_of_each": {name or "quiet": count for name, count in zip(names, counts, strict=True)},
             "events": events,
-            "notes": list(heard.notes),
+            "notes": list(labels.notes),
             "units": {"length": "m", "time": "s"},
             "versions": {package: version_of(package) for package in _PACKAGES},
         }
@@ -126,23 +126,25 @@ def draw_listener(listener: Listener):
     right = 100 * np.mean(listener.standing.held_out == listener.standing.right)
     number = len(listener.standing.right)
     plot_confusion(
-        listener.standing, title=f"{listener.method}: {right:.1f} % of {number} clips held out are told right", ax=ax
+        listener.standing,
+        title=f"{listener.method}: {right:.1f} % of {number} clips held out classified correctly",
+        ax=ax,
     )
     return figure
 
 
-def draw_heard(heard: Heard):
+def draw_sound_labels(labels: SoundLabels):
     """Draw the timeline of a classified recording, as a matplotlib `Figure` that needs no display."""
     from matplotlib.figure import Figure
 
-    from jeit.touch.plots import plot_heard
+    from jeit.touch.plots import plot_sound_labels
 
-    figure = Figure(figsize=(8.0, max(2.4, 1.4 + 0.28 * len(heard.names))), layout="constrained")
-    plot_heard(heard, ax=figure.subplots())
+    figure = Figure(figsize=(8.0, max(2.4, 1.4 + 0.28 * len(labels.names))), layout="constrained")
+    plot_sound_labels(labels, ax=figure.subplots())
     return figure
 
 
-def _columns(result: Heard) -> dict[str, list]:
+def _columns(result: SoundLabels) -> dict[str, list]:
     columns: dict[str, list] = {
         "time_s": [f"{time:.4f}" for time in result.times],
         "heard": result.named.tolist(),

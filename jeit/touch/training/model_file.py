@@ -153,5 +153,5 @@ def _alike(one: Any, other: Any) -> bool:
 
 
 def _said(value: Any) -> str:
-    text = "not told" if value is None else str(value)
+    text = "not given" if value is None else str(value)
     return text if len(text) <= 60 else f"{text[:59]}…"

@@ -5,7 +5,7 @@ import pytest
 
 from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds, probabilities, sharpness_of
 from jeit.touch.learnt.gaussian_process import GaussianProcess, _tuned
-from jeit.touch.learnt.nearest import Nearest, _least
+from jeit.touch.learnt.nearest import Nearest
 from jeit.touch.learnt.regressors import REGRESSORS
 
 RNG = np.random.default_rng(0)
@@ -88,17 +88,6 @@ def test_machines_are_scikit_learns(name, kernel, number):
     np.testing.assert_array_equal(told.argmax(axis=1), theirs.predict(ASKED))
     if number > 2:
         np.testing.assert_allclose(told, theirs.decision_function(ASKED), rtol=1e-9)
-
-
-@pytest.mark.parametrize("number", [13, 100, 193, 500, 2011])
-@pytest.mark.parametrize("count", [1, 3, 12])
-def test_the_least_of_many_are_all_found(number, count):
-    """Also those beyond the last whole comb, and where few combs hold them all."""
-    values = np.random.default_rng(0).normal(size=(40, number))
-    values[0] = np.arange(number)
-    values[1] = -np.arange(number)
-    found = np.sort(_least(values, count), axis=1)
-    np.testing.assert_array_equal(found, np.sort(np.argsort(values, axis=1)[:, :count], axis=1))
 
 
 def test_the_nearest_are_scikit_learns():

@@ -122,5 +122,5 @@ def test_another_skin_is_refused():
     check_same("model", made_for, {"outline": (0.2, 0.2 + 1e-9), "num_channels": 94})
     with pytest.raises(ValueError, match="its num_channels is 94, and here it is 208"):
         check_same("model", made_for, {"num_channels": 208})
-    with pytest.raises(ValueError, match="its protocol is not told, and here it is adjacent"):
+    with pytest.raises(ValueError, match="its protocol is not given, and here it is adjacent"):
         check_same("model", made_for, {"protocol": "adjacent"})

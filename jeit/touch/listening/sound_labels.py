@@ -26,7 +26,7 @@ class Event:
 
 
 @dataclass(frozen=True)
-class Heard:
+class SoundLabels:
     """The classification of W windows of a recording by a listener.
 
     `times` (W,): the middles of the windows, in seconds; `probabilities` (W, C) of the classes `names` (C,); `quiet`

@@ -6,15 +6,15 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from jeit.plot.axes import INK, SERIES_COLOURS, axes_or_new, draw_colour_bar, soften_axes
-from jeit.touch.listening import Heard
+from jeit.touch.listening import SoundLabels
 from jeit.touch.listening.feature_images import EVERY
 
 
-def plot_heard(heard: Heard, *, title: str | None = None, ax: Axes | None = None) -> Axes:
+def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the probabilities of all names over time, a row each, with a bar under the chosen name; quiet is blank."""
     ax = axes_or_new(ax, (8.0, 3.2))
-    names, times = heard.names, heard.times
-    shown = np.where((heard.named != "")[:, None], heard.probabilities, np.nan).T
+    names, times = labels.names, labels.times
+    shown = np.where((labels.named != "")[:, None], labels.probabilities, np.nan).T
     extent = (float(times[0]) - EVERY / 2, float(times[-1]) + EVERY / 2, -0.5, len(names) - 0.5)
     drawn = ax.imshow(
         100 * shown,
@@ -27,15 +27,15 @@ def plot_heard(heard: Heard, *, title: str | None = None, ax: Axes | None = None
         interpolation="nearest",
     )
     draw_colour_bar(ax, drawn, "Probability (%)")
-    for event in heard.events:
+    for event in labels.events:
         if event.name:
             row, span = names.index(event.name) - 0.42, [event.start, event.end]
             ax.plot(span, [row, row], color=SERIES_COLOURS[1], linewidth=2.5, solid_capstyle="butt")
     ax.set_yticks(range(len(names)), names)
     ax.set_xlim(0, extent[1])
     ax.set_xlabel("Time (s)", color=INK)
-    quiet = int((heard.named == "").sum())
-    said = f"{heard.name}: red, what is told" + (f"; blank, {quiet} of {len(heard)} windows quiet" if quiet else "")
+    quiet = int((labels.named == "").sum())
+    said = f"{labels.name}: sounds in red" + (f"; blank, {quiet} of {len(labels)} windows quiet" if quiet else "")
     ax.set_title(said if title is None else title)
     soften_axes(ax)
     return ax
