@@ -107,8 +107,8 @@ def least(uv: Path, python: str, folder: Path) -> Path:
     return made
 
 
-def fill(made: Row, wheel: Path, uv: Path, whole: bool) -> None:
-    """Do everything in one environment: "3.12" or "least-3.11"."""
+def fill(made: Row, wheel: Path, uv: Path, *, whole: bool, tested: bool) -> None:
+    """Do everything in one environment, "3.12" or "least-3.11"; where it is `tested` elsewhere, all but the tests."""
     name, folder = made.name, made.folder
     version = name.removeprefix("least-")
     python = interpreter(version)
@@ -128,7 +128,10 @@ def fill(made: Row, wheel: Path, uv: Path, whole: bool) -> None:
     made.step("install all extras", made.installing(*constraints, f"{wheel}[{together}]"), *sources)
     command = (made.python, "-m", "pytest") if whole else (made.python.with_name("pytest"), *SELECTION)
     tests = (*command, "-n", "2", "-q", "-p", "no:randomly", "-m", "not slow")
-    made.step("tests", tests, found=COUNTS, where=ROOT)
+    if tested:
+        made.cells.append("elsewhere")
+    else:
+        made.step("tests", tests, found=COUNTS, where=ROOT)
     if python == first(PYTHONS[::-1]) and not constraints:
         made.step("each extra alone", *(one for extra in EXTRAS for one in alone(extra, wheel, uv, python)))
 
@@ -150,6 +153,7 @@ def main() -> int:
     every = [*PYTHONS, f"least-{PYTHONS[0]}"]
     parser.add_argument("names", nargs="*", default=every, help="such as 3.12, or least-3.11")
     parser.add_argument("--whole", action="store_true", help="all quick tests, not those of tests/selection.txt alone")
+    parser.add_argument("--tested", nargs="*", default=[], metavar="NAME", help="those whose tests run elsewhere")
     parser.add_argument("--find", choices=("newest", "oldest"), help="print the path of such a Python here, and end")
     asked = parser.parse_args()
     if asked.find:
@@ -157,7 +161,7 @@ def main() -> int:
         print(found or f"no Python of {', '.join(PYTHONS)} here", file=sys.stdout if found else sys.stderr)
         return 0 if found else 1
     known = [*PYTHONS, *(f"least-{one}" for one in PYTHONS)]
-    if strange := [one for one in asked.names if one not in known]:
+    if strange := [one for one in (*asked.names, *asked.tested) if one not in known]:
         parser.error(f"{', '.join(strange)}: give some of {', '.join(known)}")
     uv = shutil.which("uv", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
     if uv is None or find_spec("build") is None:
@@ -171,7 +175,7 @@ def main() -> int:
             for name in asked.names:
                 with tempfile.TemporaryDirectory() as folder:
                     rows.append(Row(name, Path(folder), Path(uv)))
-                    fill(rows[-1], wheel, Path(uv), asked.whole)
+                    fill(rows[-1], wheel, Path(uv), whole=asked.whole, tested=name in asked.tested)
     finally:
         for line in (HEADING, ["---"] * len(HEADING), *([one.name, *one.cells] for one in rows)):
             print(f"| {' | '.join([*line, *[''] * (len(HEADING) - len(line))])} |")
