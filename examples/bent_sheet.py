@@ -12,7 +12,7 @@ from jeit.layout import SurfaceLayout, grid
 from jeit.mesh import Mesh, Rectangle, bend
 from jeit.plot import ColourScale, plot_curved_skin
 from jeit.protocol import opposite
-from jeit.touch.learnt.classifiers import linear_discriminant
+from jeit.touch.learnt.methods import linear_discriminant
 
 SIDE, RADIUS, THICKNESS = 0.13, 0.03, 5e-3  # metres
 JITTER, NOISE = 1e-3, 1e-5  # metres, volts

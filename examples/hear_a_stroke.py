@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities, locate
 from jeit.acoustic import track as follow
-from jeit.acoustic.localisation.overlay import brightness, overlay
+from jeit.acoustic.localisation.pixels import brightness, overlay
 from jeit.acoustic.plots import plot_track
 from jeit.acoustic.simulate import Burst, SoundingSkin, calibration_taps, pat, stroke, tickle
 from jeit.layout import grid

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, one_step, plot_image, ring
 from jeit.inverse import Gaussian, choose_hyperparameter
-from jeit.inverse.prior.defaults import smooth_prior
+from jeit.inverse.prior.matern import smooth_prior
 from jeit.mesh import centroids, measures
 from jeit.plot import ColourScale
 

@@ -1,6 +1,7 @@
 """The house: every module in a room, rooms that look down only, no circles, and nobody in another's private rooms."""
 
 import ast
+from collections import Counter
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -176,3 +177,10 @@ def test_no_two_test_files_have_one_name():
     """pytest imports them by name, and can collect only one of the two."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
     assert len(names) == len(set(names))
+
+
+def test_the_house_is_small_enough_to_enter():
+    """No more modules than a person can know of, and no room with more than fit a screen."""
+    house = [path for top in ("jeit", "solvers/jeit_solvers") for path in modules(ROOT / top).values()]
+    assert len(house) <= 430
+    assert {str(room): number for room, number in Counter(one.parent for one in house).items() if number > 15} == {}

@@ -16,7 +16,7 @@ status = main(sys.argv[1:])
 print(*(name for name in sys.modules if name.split(".")[0] == "jeit"), file=sys.stderr)
 sys.exit(status)
 """
-MOST = 140
+MOST = 130
 
 
 def test_reconstruct_imports_no_application_and_few_modules(tmp_path):

@@ -7,7 +7,7 @@ import sys
 import jax
 import pytest
 
-from jeit.start import compiled_code, take_double_precision
+from jeit.start import jax_setup, take_double_precision
 
 PROGRAM = """
 import jeit, jax, jax.numpy as jnp
@@ -77,11 +77,11 @@ def test_the_oldest_go_when_there_are_too_many(tmp_path, monkeypatch):
         path = tmp_path / "kind" / f"{number}-cache"
         path.write_bytes(b"x" * 100)
         os.utime(path, (number, number))
-    monkeypatch.setattr(compiled_code, "_MOST_FILES", 4)
-    compiled_code._discard_oldest(tmp_path)
+    monkeypatch.setattr(jax_setup, "_MOST_FILES", 4)
+    jax_setup._discard_oldest(tmp_path)
     assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["2", "3", "4", "5"]
-    monkeypatch.setattr(compiled_code, "_MOST_BYTES", 250)
-    compiled_code._discard_oldest(tmp_path)
+    monkeypatch.setattr(jax_setup, "_MOST_BYTES", 250)
+    jax_setup._discard_oldest(tmp_path)
     assert sorted(path.name[0] for path in tmp_path.rglob("*-cache")) == ["4", "5"]
 
 
@@ -91,12 +91,12 @@ def test_what_nothing_was_written_to_is_discarded(tmp_path):
     folder.mkdir()
     (folder / "full-cache").write_bytes(b"x")
     (folder / "empty-cache").write_bytes(b"")
-    compiled_code._discard_oldest(tmp_path)
+    jax_setup._discard_oldest(tmp_path)
     assert [path.name for path in folder.iterdir()] == ["full-cache"]
 
 
 def test_a_warning_of_a_damaged_program_discards_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiled_code, "_cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(jax_setup, "_cache_folder", lambda: tmp_path)
     folder = tmp_path / "jeit" / "jax" / "here"
     folder.mkdir(parents=True)
     for name in ("jit_stage-1-cache", "jit_stage-2-cache", "jit_stages-1-cache"):
@@ -105,10 +105,10 @@ def test_a_warning_of_a_damaged_program_discards_it(tmp_path, monkeypatch):
     before = jax.config.jax_compilation_cache_dir
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path / "another"))
-        assert not compiled_code.discarded_damaged(told)
+        assert not jax_setup.discarded_damaged(told)
         jax.config.update("jax_compilation_cache_dir", str(folder))
-        assert not compiled_code.discarded_damaged("Error writing persistent compilation cache entry for 'jit_stage'")
-        assert compiled_code.discarded_damaged(told)
+        assert not jax_setup.discarded_damaged("Error writing persistent compilation cache entry for 'jit_stage'")
+        assert jax_setup.discarded_damaged(told)
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
     assert [path.name for path in folder.iterdir()] == ["jit_stages-1-cache"]
@@ -119,8 +119,8 @@ def test_a_relative_cache_folder_is_not_taken(monkeypatch):
     for told in ("", "somewhere", "~/cache"):
         monkeypatch.setenv("XDG_CACHE_HOME", told)
         monkeypatch.setenv("LOCALAPPDATA", told)
-        assert compiled_code._cache_folder().is_absolute()
-        assert "~" not in compiled_code._cache_folder().parts
+        assert jax_setup._cache_folder().is_absolute()
+        assert "~" not in jax_setup._cache_folder().parts
 
 
 def test_double_precision_unless_told_otherwise():

@@ -23,7 +23,7 @@ from benchmarks.opponents import scikit_learn
 from benchmarks.opponents.scipy_touches import PlainTouches
 from benchmarks.problems.skins import SIDE, skin
 from jeit.design import Bell, touch_grid
-from jeit.design.measurements.selection import nearest_pairs
+from jeit.design.measurements import nearest_pairs
 from jeit.design.skin.touched_cells import touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.layout import named_layout

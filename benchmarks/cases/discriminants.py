@@ -17,7 +17,7 @@ from benchmarks.harness.tables import duration
 from benchmarks.harness.timing import say
 from benchmarks.problems.fabric import PRESSES, REPETITIONS, Fabric
 from benchmarks.problems.squares_told import Learnt, Told, held_out, seconds_of_a_frame
-from jeit.touch.learnt.classifiers import CLASSIFIERS
+from jeit.touch.learnt.methods import CLASSIFIERS
 
 # Observations a class; in the study of errors one more; of more than MANY these methods would take ten minutes or more.
 SIZES, ERROR_SIZES, MANY = (24, 240, 2400), (24, 240, 1200, 2400), 240

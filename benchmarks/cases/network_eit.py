@@ -26,8 +26,7 @@ from jeit.inverse import Gaussian, Laplace, one_step
 from jeit.inverse.streaming.imager import Imager
 from jeit.mesh import centroids
 from jeit.touch.networks import DESIGNS, PRESETS, ImageNetwork, learn_images, read_network
-from jeit.touch.networks.places import centroids_of, errors, peaks
-from jeit.touch.networks.touches import detection_noise
+from jeit.touch.networks.sensed import centroids_of, detection_noise, errors, peaks
 from jeit.touch.simulate import depth_maps
 from jeit.touch.simulate.contact.indent_sets import image_places
 

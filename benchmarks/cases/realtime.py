@@ -111,7 +111,7 @@ def _median(function, *arguments, rounds: int = 100) -> float:
 
 def breakdown(imager) -> list[tuple[str, float, float]]:
     """(part, milliseconds, milliseconds at the speed of a large matrix product) of one Gauss-Newton iteration."""
-    from jeit.forward.assembly import cell_conductivity
+    from jeit.forward.system import cell_conductivity
     from jeit_solvers import factorise, ridge_model, solve
 
     large = jnp.ones((1000, 1000))

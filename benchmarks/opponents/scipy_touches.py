@@ -15,7 +15,7 @@ class PlainTouches:
     """For one `model` of jeit (its mesh, contact integrals and protocol) and conductivity (m,)."""
 
     def __init__(self, model, conductivity: np.ndarray):
-        from jeit.forward.assembly import stiffness
+        from jeit.forward.system import stiffness
 
         mesh = model.mesh
         contact = model.electrodes.contact(mesh)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from benchmarks.problems.touched_sensors import NOISE
-from jeit.inverse.streaming.frame_check import FrameStatus
+from jeit.inverse.streaming.stream import FrameStatus
 
 
 class Kind(NamedTuple):

@@ -13,8 +13,8 @@ from jaxtyping import Float, Int
 
 from benchmarks.harness.machine import CORES
 from benchmarks.problems.fabric import REPETITIONS, Fabric
-from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds
 from jeit.touch.learnt.extras import one_thread
+from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
 
 # Of six sixths; and of the observations in one.
 HELD_OUT, MOST = (2, 5), 2000

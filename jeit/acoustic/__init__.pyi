@@ -1,6 +1,6 @@
 from .calibration.calibrate import calibrate_microphones
 from .calibration.calibration import Calibration
-from .localisation.cramer_rao import cramer_rao
+from .localisation.likelihood import cramer_rao
 from .localisation.localiser import Localiser
 from .localisation.locate import locate
 from .microphones import MicrophoneArray

@@ -23,7 +23,7 @@ COMMANDS = {
     "layout": "jeit.design.commands.layout",
     "study": "jeit.design.commands.study",
     "touch": "jeit.touch.commands.touch",
-    "learn": "jeit.touch.commands.learn",
+    "learn": "jeit.touch.commands.networks",
 }
 
 

@@ -1,10 +1,8 @@
 from .description import load_description
 from .export import write_table
-from .frame_recording import FrameRecording, join, read_frame_recording
-from .gesture_set import GestureSet
-from .imageable import check_imageable
+from .gesture_set import FrameRecording, GestureSet, join, read_frame_recording
+from .imageable import check_imageable, estimate_noise, impossible_signs, reciprocity_error
 from .measurement import Measurement
-from .quality import estimate_noise, impossible_signs, reciprocity_error
 from .registry import read
 from .round_skin import RoundSkin, simulate_press
 from .screening import screen

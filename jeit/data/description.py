@@ -45,7 +45,7 @@ from jeit.protocol import Protocol
 
 if TYPE_CHECKING:
     from jeit.data.description_tables import DataTable, ProtocolTable
-    from jeit.protocol.potentials import Reading
+    from jeit.protocol.all_at_once import Reading
 
 BUNDLED = ("tank6cm",)
 _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}

@@ -1,14 +1,138 @@
-"""Recordings of gestures, one after the other, and as a file: simulated ones, and those of one's own skin."""
+"""Recordings of frames and of labelled gestures, in files."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from jeit.arguments import readings
+from jeit.data.description import Description, TableLayout
+from jeit.data.formats import table
+from jeit.data.measurement import Measurement
 from jeit.files import need, npz_arrays, written_whole
+
+
+def join(measurements: Sequence[Measurement]) -> Measurement:
+    """Join the frames of measurements of one set-up, one after the other, with their times if all have times that rise.
+
+    The body, the electrodes and the notes are those of the first. Raises `ValueError` for none, and where two drive or
+    read differently.
+    """
+    if not measurements:
+        raise ValueError("measurements: there is none; give at least one.")
+    first, *others = measurements
+    for one in others:
+        if one.protocol is not first.protocol and not one.protocol.same_patterns(first.protocol):
+            raise ValueError(
+                f"'{one.name}' ({one.protocol.name}) is read otherwise than '{first.name}'; join one set-up's."
+            )
+    names = tuple(name for one in measurements for name in one.frame_names)
+    held: list[Any] = [one.times for one in measurements]
+    times = None if any(one is None for one in held) else np.concatenate([np.asarray(one) for one in held])
+    mask = np.concatenate([np.asarray(one.mask) for one in measurements])
+    return replace(
+        first,
+        voltages=np.concatenate([np.asarray(one.voltages) for one in measurements]),
+        mask=mask,
+        frame_names=names if len(names) == len(mask) else (),
+        times=None if times is None or (np.diff(times) <= 0).any() else times,
+    )
+
+
+_FRAMES, _TIMES = ("voltages", "frames"), ("seconds", "time")
+
+
+@dataclass(frozen=True)
+class FrameRecording:
+    """**Fields**: `frames` (F, M), volts, NaN where there is no reading; `seconds` (F,), None where nothing says;
+    `reference` (M,) or (r, M) of the untouched skin, volts, None where there is none; `name`."""
+
+    frames: Float[np.ndarray, "F M"]
+    seconds: Float[np.ndarray, " F"] | None
+    reference: Float[np.ndarray, "r M"] | None
+    name: str
+
+
+def read_frame_recording(path: str | Path, description: Description | None = None) -> FrameRecording:
+    """Frames of a file: NPZ with `frames` or `voltages` (F, M), and if it has them `seconds` or `time` (F,) and
+    `reference` (M,) or (r, M) of the untouched skin; or a table (.csv, .txt, .dat, .npy), a frame a row unless `[data]`
+    of the description says otherwise, where a frame named "reference" is that.
+
+    Without a description, or a protocol in it, any number of channels will do, and units are the file's. Raises
+    `FileNotFoundError`, and `ValueError` for what is no such file, other numbers of channels than the protocol has, and
+    times that fall, are not finite or not as many.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"'{path}': it is a folder; give a file of frames.")
+    if not path.is_file():
+        raise FileNotFoundError(f"'{path}': there is no such file.")
+    if not table.recognises(path):
+        raise ValueError(f"'{path}': give frames as {', '.join(table.SUFFIXES)}.")
+    layout = TableLayout() if description is None else description.layout
+    protocol = None if description is None else description.protocol(path)
+    channels = None if protocol is None else protocol.num_measurements
+    try:
+        arrays = npz_arrays(path, *_FRAMES, *_TIMES, "reference", *layout.keys) if path.suffix == ".npz" else {}
+        frames = _frames(_table(path, arrays, layout), layout, path.name, channels)
+        seconds = next((_times(arrays[one], one, len(frames)) for one in _TIMES if one in arrays), None)
+        reference = None
+        if "reference" in arrays:
+            reference = _checked("reference", np.atleast_2d(arrays["reference"]) * layout.scale, frames.shape[1])
+        elif "reference" in layout.frame_names and len(layout.frame_names) == len(frames):
+            own = np.array(layout.frame_names) == "reference"
+            frames, reference = frames[~own], frames[own]
+    except ValueError as error:
+        raise ValueError(f"'{path}': {error}") from None
+    return FrameRecording(frames, seconds, reference, path.name)
+
+
+def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> np.ndarray:
+    """The numbers of a file as they lie in it."""
+    if not arrays:
+        return np.atleast_2d(table.numbers(path, layout))
+    key = next((one for one in (*layout.keys, *_FRAMES) if one in arrays), None)
+    if key is None:
+        raise ValueError(f"there is no array 'frames'; the file holds {', '.join(arrays[''][:12])}.")
+    return np.atleast_2d(arrays[key])
+
+
+def _frames(given: np.ndarray, layout: TableLayout, name: str, channels: int | None) -> Float[np.ndarray, "F M"]:
+    """Frames of a table, in volts."""
+    if given.dtype.kind not in "iufc":
+        raise ValueError(f"frames are {given.dtype}; give numbers, in volts.")
+    frames = table.frames_from(given, layout, name)
+    if np.iscomplexobj(frames):
+        raise ValueError("frames are complex; choose a part with [data] component: real, imaginary or magnitude.")
+    return _checked("frames", readings(frames) * layout.scale, frames.shape[-1] if channels is None else channels)
+
+
+def _checked(name: str, given: np.ndarray, channels: int) -> Float[np.ndarray, "F M"]:
+    if given.dtype.kind not in "iuf" or given.ndim != 2 or given.shape[1] != channels:
+        raise ValueError(f"{name} have shape {given.shape}; give one row for each frame, of {channels} channels.")
+    if not len(given):
+        raise ValueError(f"{name}: there is none.")
+    return readings(given.astype(float))
+
+
+def _times(given: np.ndarray, name: str, number: int) -> Float[np.ndarray, " F"]:
+    if given.dtype.kind not in "iuf" or given.shape != (number,):
+        raise ValueError(f"{name} is {given.dtype} of shape {given.shape}; give seconds for each of {number} frames.")
+    seconds = given.astype(float)
+    if not np.isfinite(seconds).all():
+        raise ValueError(f"{name}: some are not finite.")
+    if number > 1 and seconds[0] == seconds[-1] and not np.diff(seconds).any():
+        raise ValueError(f"{name} are all {seconds[0]:g}: give when each frame came.")
+    falls = np.flatnonzero(np.diff(seconds) < 0)
+    if falls.size:
+        raise ValueError(f"{name} fall after frame {falls[0]}, {seconds[falls[0]]:g} s: sort frames by time.")
+    return seconds
+
 
 _ARRAYS = ("gesture", "person", "start", "seconds", "voltages", "reference", "untouched")
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Inexact
 
 from jeit.arguments import listed
-from jeit.data import _matlab
+from jeit.data.formats import _matlab
 from jeit.files import check_electrodes, check_memory, npz_arrays
 from jeit.protocol import Protocol, from_matrices, measurement_patterns
 

@@ -32,7 +32,7 @@ class Format:
     @property
     def reader(self) -> Any:
         """The module, with `DESCRIPTION`, `recognises(path)` and `read(path)`."""
-        return importlib.import_module(f"jeit.data.{self.module}")
+        return importlib.import_module(f"jeit.data.formats.{self.module}")
 
     def recognises(self, path: Path) -> bool:
         """Whether a file is of this format, from its ending and its content."""
@@ -45,11 +45,11 @@ FORMATS: dict[str, Format] = {
     "kit4": Format("kit4", (".mat",)),
     "ktc2023": Format("ktc2023", (".mat",)),
     "eidors": Format("eidors", (".mat",), described=True),
-    "sciospec": Format("instruments.sciospec", (".eit",), described=True),
-    "draeger": Format("instruments.draeger", (".eit",), described=True),
-    "carefusion": Format("instruments.carefusion", (".eit",), described=True),
-    "swisstom": Format("instruments.swisstom", (".eit",), described=True),
-    "goettingen": Format("instruments.goettingen", (".get",), described=True),
+    "sciospec": Format("sciospec", (".eit",), described=True),
+    "draeger": Format("draeger", (".eit",), described=True),
+    "carefusion": Format("carefusion", (".eit",), described=True),
+    "swisstom": Format("swisstom", (".eit",), described=True),
+    "goettingen": Format("goettingen", (".get",), described=True),
     "table": Format("table", _TABLES, described=True, borrows=True),
     # A table of 208 rows of real and imaginary pairs, with the bundled description: only where it is named.
     "tank6cm": Format("table", (), bundled="tank6cm"),
@@ -105,7 +105,7 @@ def _recognise(file: Path, description: str | Path | None) -> str:
         if candidate.recognises(file):
             return name
     if file.suffix.lower() == ".mat":
-        from jeit.data import _matlab, eidors, kit4, ktc2023
+        from jeit.data.formats import _matlab, eidors, kit4, ktc2023
 
         if description is not None or eidors.find_description(file) is not None:
             return "eidors"

@@ -9,7 +9,7 @@ from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
 from jeit.arguments import readings
-from jeit.data.electrode_order import order_note
+from jeit.data.imageable import order_note
 from jeit.data.measurement import Measurement
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh

@@ -1,12 +1,10 @@
-from .comparison import compare_layouts
+from .comparison import compare_layouts, skin_response
 from .improvement import improve_layout
-from .measurements.candidates import Candidates
-from .measurements.selection import information_bound, select_measurements
+from .measurements import Candidates, information_bound, select_measurements
 from .optimisation.design_space import DesignSpace
-from .optimisation.objective import Objective
 from .optimisation.optimise import optimise_layout
 from .optimisation.surface_optimise import optimise_surface_layout
-from .response import skin_response
+from .optimisation.variables import Objective
 from .scores import TouchPrior, layout_scores
 from .sensitivity import sensitivity_map
 from .skin.indentation import Bell, Hemisphere

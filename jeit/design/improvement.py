@@ -11,8 +11,8 @@ import numpy as np
 
 from jeit.design.defaults import MINIMUM_SPACING, NOISE, NUM_POINTS, STEPS
 from jeit.design.optimisation.design_space import DesignSpace
-from jeit.design.optimisation.objective import Objective
 from jeit.design.optimisation.optimise import Optimisation, optimise_layout
+from jeit.design.optimisation.variables import Objective
 from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin
 from jeit.design.skin.touch_grid import touch_grid

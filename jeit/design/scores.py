@@ -29,8 +29,8 @@ from jeit.design.sensitivity import uniformity
 from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.design.skin.touch_grid import check_places
 from jeit.forward import ForwardModel
-from jeit.forward.assembly import cell_conductivity, check_conductivity
-from jeit_solvers.dense.cholesky import inverse_cholesky
+from jeit.forward.system import cell_conductivity, check_conductivity
+from jeit_solvers.dense import inverse_cholesky
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, undifferentiated
 
 # The largest eigenvalue to ln(r) / 2^k, relative, however close the next.

@@ -1,12 +1,10 @@
+from .body_mesh import FacePatches
 from .boundary import BoundaryElectrodes
-from .combined import CombinedElectrodes
-from .discs import FaceDiscs, SheetDiscs
-from .electrode_shapes import ElectrodeShapes, shapes_of
+from .discs import FaceDiscs, SheetDiscs, SurfaceDiscs
+from .electrode_shapes import CombinedElectrodes, ElectrodeShapes, shapes_of
 from .electrodes import AbstractElectrodes
 from .facets import FacetElectrodes, electrodes_from_nodes, plates
-from .patches import FacePatches
 from .point import NodeElectrodes, PointElectrodes
-from .surface_discs import SurfaceDiscs
 
 __all__ = [
     "AbstractElectrodes",

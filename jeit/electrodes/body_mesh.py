@@ -1,13 +1,31 @@
-"""The mesh of a body for electrodes on it, fine at their edges, where the current density is unbounded."""
+"""Meshes of bodies with their electrodes, with rectangular patches and facets."""
 
 from __future__ import annotations
 
-import numpy as np
-from jaxtyping import Float
+from collections.abc import Callable
+from typing import Any
 
-from jeit.electrodes.electrodes import AbstractElectrodes
-from jeit.mesh import Body, Mesh, OwnMesh, Rectangle, Solid
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit.arguments import IN_MILLIMETRES
+from jeit.electrodes.discs import facet_normals, nearest_facets, seen_flat
+from jeit.electrodes.electrodes import (
+    AbstractElectrodes,
+    AbstractPlacedElectrodes,
+    Contact,
+    ElectrodePen,
+    as_electrode_values,
+    as_positions,
+    check_dimension,
+)
+from jeit.electrodes.facets import covered_moments
+from jeit.mesh import Body, Mesh, OwnMesh, Rectangle, Refine, Solid
+from jeit.mesh.geometry import facet_measures
 from jeit.mesh.sizes import size_checked
+from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated, values_at_once
 
 # Distance from a face within which a position lies on it, relative to the body's size; as in the check of electrodes.
 _ON = 1e-3
@@ -33,7 +51,6 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
         )
     if not isinstance(body, Solid):
         return body.mesh(num_points=num_points, refine=electrodes.refinement(body) or None)
-    from jeit.electrodes.patches import FacePatches
     from jeit.mesh.graded import graded_box, graded_layers
 
     if not isinstance(electrodes, FacePatches):
@@ -72,3 +89,207 @@ def _rim(outline, place, half, flat: bool) -> Float[np.ndarray, "p 2"]:
     tangent = (ahead - nearest)[np.argmax(np.linalg.norm(ahead - nearest, axis=1))]
     tangent = tangent / np.linalg.norm(tangent)
     return np.asarray(outline.nearest(np.stack([place[:2] - half[0] * tangent, place[:2] + half[0] * tangent])))
+
+
+# Distance within which two electrodes are at the same place, as a share of their smaller size.
+_SAME = 1e-3
+
+Distance = Callable[[Float[np.ndarray, "L 3"]], Float[np.ndarray, " L"]]
+
+
+def check_on_surface(position: Float[np.ndarray, "L 3"], allowed: Float[np.ndarray, " L"], off: Distance) -> None:
+    """Raise `ValueError` for the first of electrodes that is more than `allowed` metres `off` a body's surface."""
+    far = off(position)
+    for number in np.flatnonzero(far > allowed)[:1]:
+        hint = "give a place on it."
+        if _all_on(position / 1000, allowed, off):
+            hint = IN_MILLIMETRES
+        elif _all_on(position * 1000, 1000 * allowed, off):
+            hint = "is the mesh in millimetres? Read it with scale = 1e-3."
+        raise ValueError(
+            f"position: electrode {number + 1} at {np.round(position[number], 6).tolist()} m lies "
+            f"{_length_text(float(far[number]))} off the body's surface; {hint}"
+        )
+
+
+def _all_on(position, allowed, off: Distance) -> bool:
+    """Whether all lie on the surface, and not all in one place of it, as wherever the origin is."""
+    return bool((np.ptp(position, axis=0).max() > allowed).all() and (off(position) <= allowed).all())
+
+
+def check_apart(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"]) -> None:
+    """Raise `ValueError` for the first two electrodes at the same place; `size`: the smaller of each one's, metres."""
+    apart = np.linalg.norm(position[:, None] - position, axis=-1)
+    same = np.argwhere(np.triu(apart < _SAME * np.minimum(size[:, None], size), 1))
+    for first, second in same[:1]:
+        raise ValueError(
+            f"position: electrodes {first + 1} and {second + 1} are at the same place, "
+            f"{np.round(position[first], 6).tolist()} m; give each its own."
+        )
+
+
+def check_size(name: str, sizes: Float[np.ndarray, " L"], most: float, of: str) -> None:
+    """Raise `ValueError`, about the argument `name`, for the first electrode of more than `most` metres, the length
+    `of` what it lies on."""
+    for number in np.flatnonzero(sizes > (1 + _SAME) * most)[:1]:
+        size = float(sizes[number])
+        hint = IN_MILLIMETRES if 10 * most < size <= 1000 * most else "give the size of what lies on it."
+        raise ValueError(
+            f"{name}: electrode {number + 1}'s is {_length_text(size)}, larger than {of}, {_length_text(most)}; {hint}"
+        )
+
+
+def check_placed(electrodes: AbstractPlacedElectrodes, mesh: Mesh) -> None:
+    """Raise `ValueError` for patches of which a mesh has little: off its surface, or larger than it."""
+    sizes = {name: np.asarray(one) for name, one in electrodes.geometry().items() if name in ("width", "height")}
+    points = np.asarray(mesh.points)
+    from jeit.mesh.geodesic import Triangles
+
+    surface = Triangles(points, np.asarray(mesh.facets))
+    half = np.maximum(*sizes.values()) / 2
+    check_on_surface(np.asarray(electrodes.position), half, lambda places: surface.nearest(places).away)
+    across = float(np.linalg.norm(np.ptp(points, axis=0)))
+    for name, one in sizes.items():
+        check_size(name, one, across, "the body")
+
+
+def _length_text(metres: float) -> str:
+    return f"{1e3 * metres:.3g} mm" if metres < 1 else f"{metres:.3g} m"
+
+
+# Patches that do not overlap and can reach one triangle that is not larger than they are.
+_MOST_AT_ONCE = 8
+# A triangle in place of those that a patch does not reach.
+_UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+
+
+class FacePatches(AbstractPlacedElectrodes):
+    """Complete electrodes that are rectangles on the surface of a 3-D mesh, free of its nodes.
+
+    A patch lies in the tangent plane at its position: its width runs horizontally (perpendicular to z) and its
+    height up the surface; on a horizontal face width runs along x and height along y. On a curved face it covers what
+    lies beneath that rectangle: round a cylinder of radius R a plate of arc length a has the width 2 R sin(a / 2 R).
+
+    **Fields**: `position` (L, 3) metres, on the surface; `width`, `height` (L,) metres; `contact_impedance` (L,)
+    ohm·m².
+    """
+
+    position: Float[Array, "L 3"]
+    width: Float[Array, " L"]
+    height: Float[Array, " L"]
+    contact_impedance: Float[Array, " L"]
+
+    def __init__(self, position: ArrayLike, width: ArrayLike, height: ArrayLike, contact_impedance: ArrayLike):
+        """Sizes and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        self.position = as_positions(position, (3,))
+        self.width = as_electrode_values("width", width, len(self.position), unit="metres")
+        self.height = as_electrode_values("height", height, len(self.position), unit="metres")
+        self.contact_impedance = as_electrode_values(
+            "contact_impedance", contact_impedance, len(self.position), unit="ohm·m²"
+        )
+
+    def geometry(self) -> dict[str, Array]:
+        """Positions, widths and heights."""
+        return {"position": self.position, "width": self.width, "height": self.height}
+
+    def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
+        """Rectangles on horizontal faces, dots elsewhere."""
+        places, flat = np.asarray(self.position), seen_flat(mesh, self.position)
+        sizes = np.asarray(self.width), np.asarray(self.height)
+        for place, width, height, whole in zip(places, *sizes, flat, strict=True):
+            if whole:
+                pen.rectangle(place, width, height)
+            else:
+                pen.dot(place)
+
+    def refinement(self, body: Body) -> tuple[Refine, ...]:
+        """None: they are not of a plane mesh."""
+        return ()
+
+    def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
+        """The boundary triangles of `mesh`."""
+        return (mesh.facets,)
+
+    @values_at_once
+    def contact(self, mesh: Mesh) -> Contact:
+        """Contact integrals over what the patches cover of boundary triangles, seen along their normals: exact."""
+        xp = namespace(self, mesh)
+        area, half_size = facet_measures(mesh), xp.stack([self.width, self.height], axis=-1) / 2
+        normal, across, up = _frames(mesh, self.position)
+        corners = mesh.points[mesh.facets]
+        near, reached = _reached(mesh, self.position, half_size, (normal, across, up))
+        some = reached.any(axis=1).nonzero()[0] if xp is np else np.arange(len(area))
+        near, reached = near[some], reached[some]
+        offset = corners[some][:, None] - self.position[near][:, :, None]  # (q, k, 3, 3)
+        place = xp.stack([(offset * axis[near][:, :, None]).sum(axis=-1) for axis in (across, up)], axis=-1)
+        # A triangle seen from its edge covers nothing, and has nothing to divide by.
+        place = xp.where(reached[..., None, None], place, _UNIT)
+        once, twice = covered_moments(place, half_size[near])
+        current = xp.where(reached, area[some][:, None] / self.contact_impedance[near], 0)
+        mass = (current[..., None, None] * twice).sum(axis=1)
+        nodes = mesh.facets[some]
+        shape = mesh.num_points, self.num_electrodes
+        load = sum_into(shape, (nodes[:, None], near[..., None]), current[..., None] * once)
+        if xp is np:
+            every: Any = np.zeros((len(area), 3, 3), mass.dtype)
+            every[some] = mass
+            mass = every
+        return Contact((mesh.facets,), (mass,), load)
+
+    def check(self, mesh: Mesh) -> None:
+        """Raise `ValueError` for patches off the surface, overlapping, larger than the body, or too small for the
+        mesh."""
+        check_dimension("FacePatches", mesh, 3)
+        if not has_values(self, mesh):
+            return
+        electrodes, mesh = on_host((self, mesh))
+        check_apart(electrodes.position, np.minimum(electrodes.width, electrodes.height))
+        touched = electrodes.contact(mesh).load * electrodes.contact_impedance
+        share = touched.sum(axis=0) / (electrodes.width * electrodes.height)
+        # A patch bent round a wall is longer than its chord, by a tenth at 80° of arc.
+        wrong = np.flatnonzero((share < 0.8) | (share > 1.25))
+        if wrong.size:
+            check_placed(electrodes, mesh)
+            raise ValueError(
+                f"position: {100 * share[wrong[0]]:.0f} % of electrode {wrong[0] + 1}'s area is found on the mesh's "
+                "surface; move it onto the surface, or refine the mesh there if the patch is smaller than a facet."
+            )
+        overlap = (touched.T @ touched) / np.sqrt(np.outer(*(2 * [(touched**2).sum(axis=0)])))
+        np.fill_diagonal(overlap, 0)
+        if overlap.max() > 0.2:
+            first, second = np.unravel_index(overlap.argmax(), overlap.shape)
+            raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap; move them apart.")
+
+
+def _reached(mesh: Mesh, position, half_size, frames):
+    """Patches (b, k) that may cover a part of each boundary triangle, the nearest first, and whether they do.
+
+    On the same side of the body: facing as the patch does, and no deeper than it is large. Not differentiated.
+    """
+    xp = namespace(mesh, position)
+    corners = mesh.points[mesh.facets]
+    middle = corners.mean(axis=1)
+    radius = xp.sqrt(((corners - middle[:, None]) ** 2).sum(axis=-1).max(axis=1))
+    away = [middle @ axis.T - (position * axis).sum(axis=1) for axis in frames]
+    beyond = [xp.maximum(abs(away[1 + i]) - half_size[:, i], 0) for i in range(2)]
+    facing = (facet_normals(mesh) @ frames[0].T > 0.5) & (abs(away[0]) < half_size.max(axis=1))
+    distance = undifferentiated(xp.where(facing, beyond[0] ** 2 + beyond[1] ** 2, xp.inf))
+    reaches = distance <= undifferentiated(radius**2)[:, None]
+    count = min(_MOST_AT_ONCE, len(position))
+    if xp is np:
+        count = max(1, min(count, int(reaches.sum(axis=1).max(initial=0))))
+        near = np.argsort(distance, axis=1, kind="stable")[:, :count]
+    else:
+        near = jax.lax.top_k(-distance, count)[1]
+    return near, xp.take_along_axis(reaches, near, axis=1)
+
+
+def _frames(mesh: Mesh, position):
+    """Unit vectors (L, 3) at each electrode: normal of the nearest facet, across, and up. Not differentiated."""
+    xp = namespace(mesh, position)
+    normal = facet_normals(mesh)[nearest_facets(mesh, position)]
+    horizontal = abs(normal[:, 2:]) > 0.9
+    upward = xp.where(horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
+    across = xp.cross(upward, normal)
+    across = across / xp.linalg.norm(across, axis=1, keepdims=True)
+    return tuple(map(undifferentiated, (normal, across, xp.cross(normal, across))))

@@ -16,8 +16,8 @@ from jeit.electrodes.electrodes import (
 )
 from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import boundary_loops, facet_measures
-from jeit.mesh.loops import along
 from jeit.mesh.outline import polyline
+from jeit.mesh.topology import along
 from jeit_solvers.engines import (
     either_engine,
     has_values,

@@ -1,6 +1,16 @@
-from .limits import MOST_ELECTRODES, check_electrodes, check_memory
+from .limits import (
+    MOST_ELECTRODES,
+    check_electrodes,
+    check_memory,
+    check_size,
+    parsed_toml,
+    read_as,
+    read_json,
+    read_text,
+    read_toml,
+    reason,
+)
 from .npz_file import check_archive, need, npy_array, npz_arrays
-from .text import check_size, parsed_toml, read_as, read_json, read_text, read_toml, reason
 from .whole import clear_unfinished, whole_files, written_whole
 
 __all__ = [

@@ -14,8 +14,7 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from jeit.files.limits import TooLarge, check_memory
-from jeit.files.text import reason
+from jeit.files.limits import TooLarge, check_memory, reason
 
 _COPIES = 2
 # Bytes of a member that is no array, such as a head of JSON.

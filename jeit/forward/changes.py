@@ -19,8 +19,8 @@ import scipy.sparse
 from jaxtyping import Float, Int
 
 from jeit.electrodes.electrodes import AbstractElectrodes
-from jeit.forward.assembly import field_gradients, stiffness
 from jeit.forward.model import ForwardModel, channel_voltages, evaluate, fields_and_impedance_of, select_channels
+from jeit.forward.system import field_gradients, stiffness
 from jeit.forward.transfer import ElectrodeImpedance
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol

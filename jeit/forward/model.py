@@ -17,8 +17,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.point import IntegratedElectrodes
-from jeit.forward.assembly import check_conductivity, field_gradients
-from jeit.forward.system import System
+from jeit.forward.system import System, check_conductivity, field_gradients
 from jeit.forward.transfer import ElectrodeImpedance, electrode_fields, impedance_parts, solved_system
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol

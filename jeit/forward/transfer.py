@@ -23,8 +23,7 @@ from numpy.typing import ArrayLike
 
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrodes import Contact
-from jeit.forward.assembly import cell_conductivity, field_gradients
-from jeit.forward.system import System
+from jeit.forward.system import System, cell_conductivity, field_gradients
 from jeit.mesh import Mesh
 from jeit_solvers import NearInverse, SparseSymmetric, Strips, near_inverse, symmetric_inverse
 from jeit_solvers.engines import namespace, undifferentiated

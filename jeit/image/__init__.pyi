@@ -1,11 +1,9 @@
-from .image_series import ImageSeries
-from .inclusions import Inclusion, find_inclusions
+from .image_series import ImageSeries, Oscillation, amplitude_spectrum, oscillation
+from .inclusions import Inclusion, SolidForm, find_inclusions
 from .merit import figures_of_merit
-from .oscillations import Oscillation, amplitude_spectrum, oscillation
 from .plane import Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
 from .raster import Raster
 from .segmentation import ball_region, box_region, half_region, segment
-from .solid_form import SolidForm
 
 __all__ = [
     "ImageSeries",

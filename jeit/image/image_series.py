@@ -1,13 +1,27 @@
-"""Series of images of one body: the mean change of a region over time, and the functional image."""
+"""Series of images, and oscillations in them such as breathing.
+
+Oscillations in a series of values: spectra, and amplitude and phase at a frequency.
+
+With weights w (a window over the time measured) the values x are fitted, at a frequency f, by
+
+    x(t) ≈ a + b t + A cos(2πf t + φ),
+
+least squares weighted by w: for even times and whole periods that is the discrete Fourier transform at f, and for any
+other it has neither its leak from the mean, nor from the drift, nor from -f. Frequencies nearer to each other than the
+resolution, 1 / T without a window and 2 / T with Hann's, T the time measured, are not distinguished.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
+import scipy.optimize
 from jaxtyping import Bool, Float, Real
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_name, describe, is_number
 from jeit.mesh import Mesh, measures
 
 
@@ -70,3 +84,152 @@ class ImageSeries:
             raise ValueError(f"region must be {self.mesh.num_cells} booleans, one a cell, at least one of them True.")
         size = np.asarray(measures(self.mesh))[chosen]
         return self.changes[:, chosen].astype(float) @ (size / size.sum())
+
+
+Window = Literal["hann", "none"]
+# Widths of a peak, in 1 / T; frequencies looked at in a resolution, where the strongest is looked for.
+_WIDTH = {"hann": 2.0, "none": 1.0}
+_FINE = 8
+# Periods that have to be seen at least.
+_PERIODS = 1.0
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """The part of values (F, …) that oscillates at `frequency`, hertz.
+
+    - `amplitude` (…), in the unit of the values: half of what lies between highest and lowest.
+    - `phase` (…), radians from -π to π: the values go as cos(2πf t + phase), t as in the times given. Where the
+      amplitude is nothing but noise the phase means nothing.
+    - `noise` (…): the standard deviation of the amplitude, from all that the fit leaves, other oscillations included.
+    - `resolution`, hertz.
+    """
+
+    frequency: float
+    amplitude: Float[np.ndarray, "..."]
+    phase: Float[np.ndarray, "..."]
+    noise: Float[np.ndarray, "..."]
+    resolution: float
+
+
+def oscillation(
+    values: ArrayLike, times: ArrayLike, frequency: float | tuple[float, float], *, window: Window = "hann"
+) -> Oscillation:
+    """Amplitude and phase of values (F, …) at times (F,) seconds, even or not.
+
+    - `frequency`: hertz; or a band, (lowest, highest), in which the strongest is looked for, over all values together,
+      among those of a period at least.
+    - `window`: "hann", which keeps apart what is not near in frequency, or "none", twice as sharp for what is alone.
+
+    Rows of NaN are left out. Raises `ValueError` for fewer than five frames, less than a period, a frequency at or
+    above half the frame rate, and bad options.
+    """
+    kept, at = _finite(values, times)
+    check_name("window", window, _WIDTH)
+    spread = float(at[-1] - at[0])
+    resolution = _WIDTH[window] / spread
+    low, high = _band(frequency)
+    rate = (len(at) - 1) / spread
+    if high >= rate / 2:
+        raise ValueError(
+            f"frequency: {high:g} Hz is not below half the frame rate of {rate:.4g} Hz, and would be another."
+        )
+    if high * spread < _PERIODS:
+        raise ValueError(f"frequency: {high:g} Hz has no whole period in the {spread:.3g} s measured; measure longer.")
+    low = max(low, _PERIODS / spread)
+    weight = _weight(at, window)
+    flat = kept.reshape(len(kept), -1)
+    found = low if low == high else _strongest(flat, at, weight, (low, high, resolution))
+    coefficients, left, spreads = _fit(flat, at, weight, found)
+    shape = kept.shape[1:]
+    cosine, sine = coefficients[2], coefficients[3]
+    noise = np.sqrt(left) * np.sqrt((spreads[2] + spreads[3]) / 2)
+    return Oscillation(
+        found,
+        np.hypot(cosine, sine).reshape(shape),
+        np.arctan2(-sine, cosine).reshape(shape),
+        noise.reshape(shape),
+        resolution,
+    )
+
+
+def amplitude_spectrum(
+    values: ArrayLike, times: ArrayLike, *, window: Window = "hann"
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K ..."]]:
+    """Frequencies (K,) in hertz from the first whole period to half the frame rate, half a resolution apart, and the
+    amplitude (K, …) of values (F, …) at each, in their unit: a lone oscillation peaks at its own amplitude.
+
+    The mean is taken out first. Rows of NaN are left out. Raises `ValueError` as `oscillation` does.
+    """
+    kept, at = _finite(values, times)
+    check_name("window", window, _WIDTH)
+    spread = float(at[-1] - at[0])
+    frequencies = np.arange(1 / spread, (len(at) - 1) / spread / 2, _WIDTH[window] / spread / 2)
+    weight = _weight(at, window)
+    rest = kept - np.tensordot(weight, kept, 1) / weight.sum()
+    turned = weight * np.exp(-2j * np.pi * frequencies[:, None] * (at - at[0]))
+    return frequencies, 2 * np.abs(np.tensordot(turned, rest, 1)) / weight.sum()
+
+
+def _band(frequency) -> tuple[float, float]:
+    """The lowest and the highest frequency."""
+    band = (frequency, frequency) if is_number(frequency) else frequency
+    if not (isinstance(band, tuple | list) and len(band) == 2 and all(is_number(one) and one > 0 for one in band)):
+        raise ValueError(f"frequency must be positive hertz, or a band (lowest, highest); it is {describe(frequency)}.")
+    if band[0] > band[1]:
+        raise ValueError(f"frequency: the band from {band[0]:g} to {band[1]:g} Hz is the wrong way round.")
+    return float(band[0]), float(band[1])
+
+
+def _finite(values, times) -> tuple[np.ndarray, np.ndarray]:
+    """Rows without NaN, as real numbers, and their times."""
+    given, at = np.asarray(values), np.asarray(times, float)
+    if given.ndim < 1 or given.dtype.kind not in "iuf" or at.shape != given.shape[:1]:
+        raise ValueError(
+            f"values are {given.dtype} of shape {given.shape}, times {at.shape}; give a row for each time."
+        )
+    if not np.isfinite(at).all() or (np.diff(at) <= 0).any():
+        raise ValueError("times must be finite and rise, in seconds.")
+    kept = np.isfinite(given.reshape(len(given), -1)).all(axis=1)
+    if kept.sum() < 5:
+        raise ValueError(f"values: {int(kept.sum())} frames without NaN; an oscillation takes five at least.")
+    return given[kept].astype(float), at[kept]
+
+
+def _weight(times: np.ndarray, window: Window) -> np.ndarray:
+    """Weight of each time; Hann's window is not quite zero at the first and last frames."""
+    if window == "none":
+        return np.ones(len(times))
+    step = (times[-1] - times[0]) / (len(times) - 1)
+    return np.sin(np.pi * (times - times[0] + step / 2) / (times[-1] - times[0] + step)) ** 2
+
+
+def _fit(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: float):
+    """Coefficients (4, n), the variance left (n,), and each coefficient's variance (4,) for noise of variance one."""
+    turn = 2 * np.pi * frequency * times
+    middle = times - times.mean()
+    design = np.stack([np.ones(len(times)), middle / middle[-1], np.cos(turn), np.sin(turn)], axis=1)
+    inverse = np.linalg.pinv(np.sqrt(weight)[:, None] * design) * np.sqrt(weight)
+    coefficients = inverse @ values
+    left = ((values - design @ coefficients) ** 2).sum(axis=0) / max(len(times) - 4, 1)
+    return coefficients, left, (inverse**2).sum(axis=1)
+
+
+def _strongest(values: np.ndarray, times: np.ndarray, weight: np.ndarray, band: tuple[float, float, float]) -> float:
+    """The frequency within a band (lowest, highest, resolution) at which all values together oscillate most."""
+    low, high, resolution = band
+    # The combinations of the values that carry all their power.
+    rest = values - values.mean(axis=0)
+    left, size, _ = np.linalg.svd(rest @ rest.T if rest.shape[1] > len(rest) else rest, full_matrices=False)
+    size = np.sqrt(size) if rest.shape[1] > len(rest) else size
+    combined = left[:, :8] * size[:8]
+
+    def power(frequency: float) -> float:
+        coefficients, _, _ = _fit(combined, times, weight, frequency)
+        return -float((coefficients[2:] ** 2).sum())
+
+    tried = np.linspace(low, high, max(int(np.ceil((high - low) / resolution * _FINE)), 2) + 1)
+    best = int(np.argmin([power(one) for one in tried]))
+    around = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
+    found: Any = scipy.optimize.minimize_scalar(power, bounds=around, method="bounded", options={"xatol": 1e-9})
+    return float(found.x)

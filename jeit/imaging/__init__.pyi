@@ -1,10 +1,8 @@
 from .compared_rules import ComparedRules, RuleOutcome, compare_on_data
 from .difference import ImagedDifference, image_difference
-from .frequencies import ImagedFrequencies, frequency_weight, image_frequencies
-from .method import METHODS
+from .method import CONTACTS, METHODS, ImagingSettings
 from .preparation import PreparedDifference, calibrated_model, imaging_mesh, prepare_difference, select_frames
-from .sequence import ImagedSequence, image_sequence
-from .settings import CONTACTS, ImagingSettings
+from .sequence import ImagedFrequencies, ImagedSequence, frequency_weight, image_frequencies, image_sequence
 from .stream_preparation import StreamSettings, frames_of, prepare_imager
 
 __all__ = [

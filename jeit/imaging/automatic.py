@@ -12,7 +12,7 @@ from jeit.arguments import percent
 from jeit.imaging.method import METHODS, Asked, Imaged, of_shapes, shapes_in
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
-from jeit.inverse.prior.defaults import MEASURED
+from jeit.inverse.prior.matern import MEASURED
 from jeit.inverse.shapes import ShapeReconstruction
 
 # Change relative to the background beyond which voltages are far from linear in it; and beyond which the same is

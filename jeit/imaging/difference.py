@@ -21,10 +21,8 @@ from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.merit import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
-from jeit.imaging.clock import Clock
-from jeit.imaging.method import METHODS, Asked
-from jeit.imaging.preparation import prepare_difference
-from jeit.imaging.settings import AUTO, ImagingSettings, as_settings
+from jeit.imaging.method import AUTO, METHODS, Asked, ImagingSettings, as_settings
+from jeit.imaging.preparation import Clock, prepare_difference
 from jeit.imaging.wiring import Wiring
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.image_noise import image_noise

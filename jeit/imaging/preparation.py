@@ -1,9 +1,10 @@
-"""Preparation of two measured frames for imaging: checks, a mesh, and a model calibrated on the reference."""
+"""Prepare two frames for imaging: checks, mesh, model and calibration, with progress and timing."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -18,13 +19,28 @@ from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
-from jeit.imaging.clock import Clock
 from jeit.imaging.wiring import Wiring, exchanges_message, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channels import electrode_misfits
 from jeit.mesh import Body, Mesh, OwnMesh, Solid
 from jeit_solvers.engines import as_array
+
+
+class Clock:
+    """Reports each step to `progress` and keeps the seconds that it took in `seconds`."""
+
+    def __init__(self, progress: Callable[[str], None] | None):
+        self.progress = progress
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, step: str):
+        if self.progress is not None:
+            self.progress(step)
+        start = time.perf_counter()
+        yield
+        self.seconds[step] = time.perf_counter() - start
 
 
 def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> int:

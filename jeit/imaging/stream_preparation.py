@@ -11,9 +11,9 @@ from jaxtyping import Float
 from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.forward import ForwardModel
-from jeit.imaging.clock import Clock
-from jeit.imaging.method import NamedPrior, prior_for
+from jeit.imaging.method import NamedPrior, check_body, check_hyperparameter, check_prior, prior_for
 from jeit.imaging.preparation import (
+    Clock,
     body_of,
     calibrated_model,
     check_measurement,
@@ -22,13 +22,12 @@ from jeit.imaging.preparation import (
     imaging_mesh,
     select_frames,
 )
-from jeit.imaging.settings import check_body, check_hyperparameter, check_prior
 from jeit.imaging.wiring import find_wiring
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear import GaussNewton
 from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
-from jeit.inverse.prior.defaults import MEASURED
+from jeit.inverse.prior.matern import MEASURED
 from jeit.inverse.streaming.imager import check_memory
 
 # Default number of nodes of the mesh, for a body that is not a mesh itself.
@@ -42,7 +41,7 @@ class StreamSettings:
     - `solver`: `GaussNewton()`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or the name of one
       ("gauss-newton", "levenberg-marquardt", "one-step"). `max_steps`: most iterations for a frame, where the solver
       has none of its own; as an `Imager` has it, 4, unless given.
-    - `prior`: a name in `jeit.inverse.prior.defaults.PRIORS`, or a quadratic prior.
+    - `prior`: a name in `jeit.inverse.prior.matern.PRIORS`, or a quadratic prior.
     - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; "noise-figure" unless given.
     - `memory`: frames over which an image changes, see `jeit.inverse.Imager`; 0 takes every frame alone.
     - `contact`, `num_points` (1,200 unless given), `as_is`: as in `jeit.imaging.ImagingSettings`.

@@ -2,9 +2,8 @@ from .calibration import calibrate
 from .channels import relative_noise
 from .hyperparameter.comparison import choose_hyperparameter, compare_rules
 from .hyperparameter.rules import RULES
-from .linear.back_projection import back_projection
 from .linear.greit import greit
-from .linear.one_step import one_step
+from .linear.one_step import back_projection, one_step
 from .nonlinear.parametrisation import Parametrisation
 from .nonlinear.reconstruct import reconstruct
 from .prior.matern import Matern

@@ -18,7 +18,7 @@ from jeit.forward import ForwardModel
 from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
 from jeit.inverse.linearisation import check_mask
-from jeit.inverse.nonlinear.checks import check_steps
+from jeit.inverse.nonlinear.problem import check_steps
 from jeit_solvers import Status, as_minimum, ended_number, symmetric_inverse
 from jeit_solvers.engines import as_array, has_values, on_device, on_host, undifferentiated
 

@@ -21,9 +21,9 @@ from jaxtyping import Array, Bool, Float, Inexact, Int
 
 from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
-from jeit.forward.assembly import check_conductivity
 from jeit.forward.model import check_model, evaluate, field_products, fields_and_impedance_of, jacobian_blocks
-from jeit.inverse.prior.defaults import PRIOR
+from jeit.forward.system import check_conductivity
+from jeit.inverse.prior.matern import PRIOR
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit.inverse.spectrum import Spectrum
 from jeit.protocol import Protocol

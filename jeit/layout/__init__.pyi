@@ -1,10 +1,8 @@
-from .arrangements import grid, perimeter, quasi_uniform, ring, ring_and_centre
-from .even_spread import spread
+from .csv_file import read_surface_layout
 from .files import read_layout, write_layout
 from .layout import Layout
-from .names import BUILT_IN, named_layout
-from .surface_csv import read_surface_layout
-from .surface_layout import SurfaceLayout
+from .names import BUILT_IN, grid, named_layout, perimeter, quasi_uniform, ring, ring_and_centre
+from .surface_layout import SurfaceLayout, spread
 
 __all__ = [
     "BUILT_IN",

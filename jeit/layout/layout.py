@@ -1,4 +1,4 @@
-"""`Layout`: positions and sizes of round electrodes on a flat skin."""
+"""A layout of electrodes in a plane, and their labels."""
 
 from __future__ import annotations
 
@@ -11,9 +11,27 @@ from numpy.typing import ArrayLike
 
 from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions
-from jeit.layout.labels import check_labels
 from jeit.mesh import Domain
 from jeit_solvers.engines import has_values
+
+
+def check_labels(labels: Sequence[str] | None, number: int) -> tuple[str, ...]:
+    """Labels of so many electrodes, "1", "2", … if None are given. Raises `ValueError` for others than one for each."""
+    if labels is None:
+        return tuple(str(index + 1) for index in range(number))
+    labels = list(labels)
+    if len(labels) != number:
+        raise ValueError(f"labels: there are {len(labels)}; give one for each of the {number} electrodes.")
+    for label in labels:
+        if not isinstance(label, str) or not label or label != label.strip() or not label.isprintable():
+            raise ValueError(
+                f"labels: {label!r} is no label; give text on one line, without blanks before or after it."
+            )
+    repeated = sorted({label for label in labels if labels.count(label) > 1})
+    if repeated:
+        raise ValueError(f"labels: {repeated[0]!r} is the label of several electrodes; give each its own.")
+    return tuple(labels)
+
 
 # Range of sizes of skins: outside it, lengths are likely in millimetres, or have been divided by 1000 twice.
 SMALLEST, LARGEST = 1e-3, 5.0  # m

@@ -1,5 +1,4 @@
 from .bisection import bisect, cut
-from .body import Body
 from .cell_quality import quality
 from .files import read, write
 from .generate.refine import Refine
@@ -7,9 +6,9 @@ from .geometry import centroids, check_flat, gradients, measures, normals
 from .gmsh import from_gmsh
 from .mesh import Mesh
 from .outline import Disk, Domain, Polygon, Rectangle
-from .shapes import disk, polygon, rectangle
+from .outline.domain import Body
 from .solid_body import OwnMesh, Solid
-from .solids import box, cylinder, layer
+from .solids import box, cylinder, disk, layer, polygon, rectangle
 from .surface import bend, cap, forearm, node_normals, shell, sphere, surface_of, tube
 
 __all__ = [

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from jeit.mesh import _topology
+from jeit.mesh import topology
 from jeit.mesh.sizes import warn_large
 
 # A cell flatter than this, relative to its longest edge, has gradients of no use in double precision.
@@ -165,9 +165,9 @@ def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, 
 
 def _match(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
     count = int(max(facets.max(), nodes.max())) + 1
-    keys = _topology.facet_keys(facets, count)
+    keys = topology.facet_keys(facets, count)
     order = np.argsort(keys)
-    wanted = _topology.facet_keys(nodes, count)
+    wanted = topology.facet_keys(nodes, count)
     place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
     missing = np.flatnonzero((keys[order][place] != wanted) | (nodes.min(axis=1) < 0))
     if missing.size:

@@ -1,15 +1,137 @@
-"""Triangles in space as a surface: edges of two triangles at most, sides that agree, one sheet round every node."""
+"""Surfaces of bodies: triangles that bound them, their orientation, and where they cross."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
-from jeit.mesh import _topology
-from jeit.mesh._crossings import first_crossing
+from jeit.mesh import topology
+
+# Relative to the extent of the surface: closer is touching.
+_TOUCHING = 1e-9
+# Pairs of triangles that are looked at together.
+_PAIRS = 500_000
+# Corners in the order of the three edges.
+_NEXT = np.array([1, 2, 0])
+
+
+def first_crossing(points: np.ndarray, cells: np.ndarray) -> tuple[int, int] | None:
+    """The first found of the pairs of triangles (m, 3) that cross, touch, or lie on each other, but in what they share;
+    None where there is none."""
+    tolerance = _TOUCHING * float(np.ptp(points, axis=0).max())
+    for pairs in _near(points[cells], tolerance):
+        shared = (cells[pairs[:, 0], :, None] == cells[pairs[:, 1], None, :]).sum(axis=(1, 2))
+        meet = np.zeros(len(pairs), bool)
+        apart, one, two = shared == 0, shared == 1, shared == 2
+        meet[apart] = _cross(points, cells, pairs[apart], tolerance)
+        meet[one] = _cross_opposite(points, cells, pairs[one], tolerance)
+        meet[two] = _folded(points, cells, pairs[two])
+        if meet.any():
+            first, second = np.sort(pairs[meet][0]).tolist()
+            return first, second
+    return None
+
+
+def _near(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
+    """Pairs (p, 2) of triangles whose boxes overlap, some at a time.
+
+    Triangles of about one size are looked up in a tree of their own, so that a few large ones do not widen the search
+    for all.
+    """
+    middle = corners.mean(axis=1)
+    reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    low, high = corners.min(axis=1) - tolerance, corners.max(axis=1) + tolerance
+    size = np.floor(np.log2(reach)).astype(int)
+    kinds = [np.flatnonzero(size == value) for value in np.unique(size)]
+    for k, members in enumerate(kinds):
+        tree = KDTree(middle[members])
+        larger = np.concatenate(kinds[k:])
+        step = max(1, _PAIRS // 64)
+        for start in range(0, len(larger), step):
+            asked = larger[start : start + step]
+            found = tree.query_ball_point(middle[asked], reach[asked] + reach[members].max() + tolerance)
+            number = np.fromiter(map(len, found), int, len(found))
+            first = np.repeat(asked, number)
+            second = members[np.concatenate([np.asarray(each, int) for each in found])]
+            # Each pair within one size class is found twice.
+            once = np.where(size[first] == size[second], first < second, True)
+            overlap = (low[first] <= high[second]).all(axis=1) & (low[second] <= high[first]).all(axis=1)
+            yield np.column_stack([first, second])[once & overlap]
+
+
+def _cross(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
+    """Whether triangles without a common node have a point in common (p,)."""
+    first, second = points[cells[pairs[:, 0]]], points[cells[pairs[:, 1]]]
+    meet = _overlap_in_plane(first, second, tolerance)
+    for one, other in ((first, second), (second, first)):
+        for k in range(3):
+            meet |= _pierces(one[:, k], one[:, _NEXT[k]], other, tolerance)
+    return meet
+
+
+def _cross_opposite(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
+    """Whether triangles with one common node have more than that in common: an edge away from it pierces the other."""
+    meet = np.zeros(len(pairs), bool)
+    for one, other in (pairs.T, pairs.T[::-1]):
+        mine = cells[one]
+        common = (mine[:, :, None] == cells[other][:, None, :]).any(axis=2).argmax(axis=1)
+        start, end = (points[mine[np.arange(len(mine)), (common + step) % 3]] for step in (1, 2))
+        meet |= _pierces(start, end, points[cells[other]], tolerance)
+    return meet
+
+
+def _folded(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Whether triangles with a common edge lie on each other."""
+    first, second = cells[pairs[:, 0]], cells[pairs[:, 1]]
+    own = ~(first[:, :, None] == second[:, None, :]).any(axis=2)
+    others = ~(second[:, :, None] == first[:, None, :]).any(axis=2)
+    tips = points[first[own]], points[second[others]]
+    edge = first[~own].reshape(-1, 2)
+    start, along = points[edge[:, 0]], points[edge[:, 1]] - points[edge[:, 0]]
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
+    away = [tip - start - ((tip - start) * along).sum(axis=1, keepdims=True) * along for tip in tips]
+    lengths = [np.linalg.norm(one, axis=1) for one in away]
+    return (away[0] * away[1]).sum(axis=1) > (1 - 1e-12) * lengths[0] * lengths[1]
+
+
+def _pierces(start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance: float) -> np.ndarray:
+    """Whether segments from `start` to `end` (p, 3) meet triangles (p, 3, 3) whose plane they do not lie in (p,)."""
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(a, b)
+    size = np.linalg.norm(normal, axis=1)
+    unit = normal / size[:, None]
+    ahead, behind = (((place - corners[:, 0]) * unit).sum(axis=1) for place in (start, end))
+    through = (np.minimum(ahead, behind) <= tolerance) & (np.maximum(ahead, behind) >= -tolerance)
+    through &= np.maximum(np.abs(ahead), np.abs(behind)) > tolerance
+    share = np.clip(ahead / np.where(through, ahead - behind, 1.0), 0, 1)
+    place = start + share[:, None] * (end - start) - corners[:, 0]
+    u = (np.cross(place, b) * unit).sum(axis=1) / size
+    v = (np.cross(a, place) * unit).sum(axis=1) / size
+    return through & (np.minimum(np.minimum(u, v), 1 - u - v) >= -_TOUCHING)
+
+
+def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
+    """Whether triangles (p, 3, 3) that lie in one plane overlap (p,): no edge of either has them on its two sides."""
+    normal = np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
+    unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    height = np.einsum("pki,pi->pk", second - first[:, :1], unit)
+    overlap = np.abs(height).max(axis=1) <= tolerance
+    first, second, unit = first[overlap], second[overlap], unit[overlap]
+    apart = np.zeros(len(first), bool)
+    for one in (first, second):
+        for k in range(3):
+            outward = np.cross(one[:, _NEXT[k]] - one[:, k], unit)
+            outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
+            spans = [np.einsum("pki,pi->pk", corners, outward) for corners in (first, second)]
+            gap = np.maximum(spans[0].min(axis=1) - spans[1].max(axis=1), spans[1].min(axis=1) - spans[0].max(axis=1))
+            apart |= gap > tolerance
+    overlap[overlap] = ~apart
+    return overlap
 
 
 def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
@@ -22,7 +144,7 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     """
     first, second = _pair_edges(cells)
     row, other = first // 3, second // 3
-    odd = _topology.odd_permutation(_topology.cell_facets(cells))
+    odd = topology.odd_permutation(topology.cell_facets(cells))
     # Two triangles agree where they run along their edge in opposite directions; else one of them must be turned.
     turn = odd[first] == odd[second]
     turned = _sides(row, other, turn, cells)
@@ -59,8 +181,8 @@ def enclosed_volume(points: np.ndarray, cells: np.ndarray) -> float:
 
 def _pair_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of `cell_facets` that are the same edge."""
-    edges = _topology.cell_facets(cells)
-    first, second, crowded = _topology.match_facets(edges, int(cells.max()) + 1)
+    edges = topology.cell_facets(cells)
+    first, second, crowded = topology.match_facets(edges, int(cells.max()) + 1)
     if crowded.size:
         nodes = np.sort(edges[crowded[0]]).tolist()
         raise ValueError(
@@ -92,7 +214,7 @@ def _sides(first: np.ndarray, second: np.ndarray, turn: np.ndarray, cells: np.nd
 def _check_fans(cells: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
     """Raise `ValueError` where the triangles round a node are not one fan: sheets that meet in nothing but a node."""
     corner = np.arange(cells.size).reshape(cells.shape)
-    ends = _topology.LOCAL_FACETS[2]
+    ends = topology.LOCAL_FACETS[2]
     pairs = []
     for a in range(2):
         for b in range(2):

@@ -1,10 +1,18 @@
-"""Shape measures of the cells of a mesh."""
+"""The quality of cells, and triangles without shared nodes welded into a mesh."""
 
 from __future__ import annotations
 
+import re
+from itertools import pairwise
+from pathlib import Path
+
 import equinox as eqx
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
+from jeit.files import check_memory
 from jeit.mesh.mesh import Mesh
 
 
@@ -77,3 +85,105 @@ def _tetrahedra(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     squares = np.stack([(a**2).sum(1), (b**2).sum(1), (c**2).sum(1)], axis=1)
     circumradius = np.linalg.norm((squares[..., None] * normals[:, :3]).sum(axis=1), axis=1) / (2 * volume)
     return angle, 3 * (volume / area.sum(axis=1)) / circumradius
+
+
+def merged(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, d) without those within `tolerance` metres of an earlier one, and cells (m, k) that use these.
+
+    Cells that lose a corner by it are left out.
+    """
+    close = KDTree(points).query_pairs(tolerance, output_type="ndarray")
+    graph = coo_array((np.ones(len(close)), close.T), shape=(len(points), len(points)))
+    _, label = connected_components(graph, directed=False)
+    _, first, number = np.unique(label, return_index=True, return_inverse=True)
+    # In the order in which they first occur.
+    order = np.argsort(first)
+    place = np.empty(len(order), int)
+    place[order] = np.arange(len(order))
+    renumbered = place[number][cells]
+    ordered = np.sort(renumbered, axis=1)
+    whole = (ordered[:, 1:] != ordered[:, :-1]).all(axis=1)
+    return points[first[order]], renumbered[whole]
+
+
+# The bytes of a triangle in a binary .stl file: a normal, three corners, and two that some give a meaning.
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_HEADER = 84
+_VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
+# Nodes that are nearer, relative to the largest coordinate, are one: such files keep six digits of them.
+_SEAM = 2e-6
+# Greatest number of letters of messages about a file's content.
+_LONGEST = 120
+# Greatest memory that a file takes when read, over the file's size: faces of an .obj file are written in few letters.
+_GROWTH = {".stl": 8, ".obj": 16}
+
+
+def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3), those at one place made one, and triangles (m, 3) of an .stl or .obj file, in the file's unit.
+
+    Polygons are cut into triangles from their first corner on; triangles without an area are left out. Raises
+    `ValueError`, about `name`, for a file that holds none.
+    """
+    ending = path.suffix.lower()
+    check_memory(name, _GROWTH[ending] * path.stat().st_size)
+    content = path.read_bytes()
+    try:
+        points, cells = _stl(content) if ending == ".stl" else _obj(content)
+    except (ValueError, IndexError, OverflowError) as error:
+        said = " ".join(str(error).split())
+        said = said if len(said) <= _LONGEST else f"{said[:_LONGEST]} …"
+        raise ValueError(f"path: {name} does not work as a mesh file: {said}.") from None
+    if not len(cells):
+        raise ValueError(f"path: {name} does not work as a mesh file: there are no triangles in it.")
+    if not np.isfinite(points[cells]).all():
+        raise ValueError(f"path: {name} does not work as a mesh file: a coordinate is no finite number.")
+    used, number = np.unique(cells, return_inverse=True)
+    points, cells = points[used], number.reshape(cells.shape)
+    size, place = float(np.ptp(points, axis=0).max()), points[0].tolist()
+    points, cells = merged(points, cells, _SEAM * float(np.abs(points).max()))
+    if not len(cells):
+        raise ValueError(
+            f"path: {name} does not work as a mesh file: no triangle in it has an area. All that it holds lies within "
+            f"{size:.3g} of {place}. Were its digits lost? Write it again, in millimetres, and read it with scale=1e-3."
+        )
+    return points, cells
+
+
+def _stl(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    number = int.from_bytes(content[_HEADER - 4 : _HEADER], "little")
+    if len(content) == _HEADER + number * _TRIANGLE.itemsize:
+        corners = np.frombuffer(content, _TRIANGLE, offset=_HEADER)["corners"].astype(float)
+    elif content[:5].lower() != b"solid":
+        raise ValueError("it is neither a text that begins with 'solid' nor as long as its number of triangles asks")
+    else:
+        corners = np.array([[float(value) for value in found] for found in _VERTEX.findall(content)])
+        if corners.size % 9:
+            raise ValueError("a facet has not three vertices")
+    points = corners.reshape(-1, 3)
+    return points, np.arange(len(points)).reshape(-1, 3)
+
+
+def _obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    points: list[list[float]] = []
+    cells: list[tuple[int, int, int]] = []
+    for line in content.replace(b"\\\n", b" ").splitlines():
+        word, *values = line.split() or [b""]
+        if word == b"v":
+            points.append([float(value) for value in values[:3]])  # colours may follow
+            if len(points[-1]) != 3:
+                raise ValueError("a vertex has not three coordinates")
+        elif word == b"f":
+            corners = [_index(value, len(points)) for value in values]
+            cells += [(corners[0], *pair) for pair in pairwise(corners[1:])]
+    array = np.array(cells, np.int64).reshape(-1, 3)
+    if array.size and array.max() >= len(points):
+        raise ValueError(f"a face names vertex {array.max() + 1}, and there are {len(points)}")
+    return np.array(points, float).reshape(-1, 3), array
+
+
+def _index(value: bytes, count: int) -> int:
+    """Of what a face says of a corner, vertex/texture/normal; negative numbers count back from the last vertex."""
+    number = int(value.split(b"/")[0])
+    if number == 0 or number < -count:
+        raise ValueError(f"a face names vertex {number}, and {count} came before it")
+    return number - 1 if number > 0 else count + number

@@ -8,8 +8,8 @@ import operator
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.mesh._topology import cell_facets, pair_facets
 from jeit.mesh.mesh import Mesh
+from jeit.mesh.topology import cell_facets, pair_facets
 from jeit_solvers.engines import either_engine, has_values, namespace
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.mesh import _checks, _topology
+from jeit.mesh import _checks, topology
 from jeit_solvers.engines import as_array, has_values
 
 
@@ -98,11 +98,11 @@ class Mesh(eqx.Module):
             from jeit.mesh import _surface
 
             indices = _surface.orient_surface(indices, coordinates)
-        first, second, single = _topology.pair_facets(indices)
+        first, second, single = topology.pair_facets(indices)
         _checks.check_connected(first // (dimension + 1), second // (dimension + 1), len(indices))
-        facets = _topology.cell_facets(indices)[single]
+        facets = topology.cell_facets(indices)[single]
         if dimension == 2:
-            facets = _topology.order_loops(facets, coordinates) if len(facets) else facets
+            facets = topology.order_loops(facets, coordinates) if len(facets) else facets
         located = _checks.locate_tags(tags or {}, facets)
         return Mesh(
             points=as_array(points if coordinates is None else coordinates),

@@ -1,15 +1,12 @@
-from .colour_scale import ColourScale
-from .imaging.admittivity import plot_admittivity
-from .imaging.figures_of_merit import plot_figures_of_merit
-from .imaging.frames import plot_frames
-from .imaging.hyperparameter import plot_choice
-from .imaging.image import plot_image
-from .imaging.mesh import plot_mesh
-from .solid.camera import Camera
+from .axes import ColourScale
+from .imaging.hyperparameter import plot_choice, plot_figures_of_merit
+from .imaging.image import plot_admittivity, plot_image, plot_mesh
+from .imaging.series import plot_frames
 from .solid.curved_skin import plot_curved_skin
 from .solid.interactive import view_solid
 from .solid.isosurfaces import plot_isosurfaces
 from .solid.overview import plot_solid
+from .solid.scene import Camera
 from .solid.shaded_surface import plot_surface
 from .solid.slices import plot_slice, plot_slices
 

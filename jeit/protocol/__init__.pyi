@@ -1,7 +1,5 @@
-from .all_at_once import haar, optimal, trigonometric
-from .matrices import from_channels, from_matrices
+from .all_at_once import from_channels, from_matrices, haar, measurement_patterns, optimal, trigonometric
 from .patterns import adjacent, all_against_one, bipolar, opposite, reference_electrode, skip, two_terminal
-from .potentials import measurement_patterns
 from .protocol import Protocol
 
 __all__ = [

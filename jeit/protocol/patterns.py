@@ -13,8 +13,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.protocol._check import check_choice, check_count, check_current, check_pairs, electrode_indices
-from jeit.protocol.protocol import Protocol, shares_electrode
+from jeit.protocol.protocol import (
+    Protocol,
+    check_choice,
+    check_count,
+    check_current,
+    check_pairs,
+    electrode_indices,
+    shares_electrode,
+)
 from jeit.protocol.reciprocity import reciprocal_channel_pairs
 
 Order = Literal["rotating", "fixed"]

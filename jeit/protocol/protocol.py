@@ -1,4 +1,4 @@
-"""The protocol: which currents are driven, and which voltages are read, as matrices."""
+"""The protocol: what is driven and what is measured, and checks of it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,125 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.protocol._check import (
-    check_indices,
-    check_patterns,
-    electrode_indices,
-)
+from jeit.arguments import did_you_mean
 from jeit.protocol.reciprocity import reciprocal_channel_pairs
-from jeit_solvers.engines import as_array, either_engine
+from jeit_solvers.engines import as_array, either_engine, has_values
+
+
+def check_patterns(patterns, what: str) -> None:
+    """Raise `ValueError` unless patterns (rows, L) are finite, without zero rows, and every row sums to zero."""
+    if patterns.ndim != 2 or patterns.shape[0] == 0 or patterns.shape[1] < 2:
+        raise ValueError(
+            f"Protocol: {what} patterns have shape {tuple(patterns.shape)}. Give a matrix with one row per "
+            "pattern and one column per electrode, at least 1 x 2."
+        )
+    if not has_values(patterns):
+        return
+    values = np.asarray(patterns)
+    bad = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
+    if bad.size:
+        raise ValueError(
+            f"Protocol: {what} pattern {bad[0]} contains NaN or infinity. Leave missing electrodes out of "
+            "the patterns with 0, and mask their channels."
+        )
+    size = np.max(np.abs(values), axis=1)
+    bad = np.flatnonzero(size == 0)
+    if bad.size:
+        raise ValueError(
+            f"Protocol: {what} pattern {bad[0]} is all zero: it drives or measures nothing. Remove it "
+            f"({bad.size} such rows)."
+        )
+    total = np.abs(values.sum(axis=1)) / size
+    bad = np.flatnonzero(total > 1e-9)
+    if bad.size:
+        reason = (
+            "current that goes in must come out"
+            if what == "drive"
+            else "only differences of potential can be measured; subtract a reference electrode"
+        )
+        raise ValueError(
+            f"Protocol: {what} pattern {bad[0]} sums to {values[bad[0]].sum():.6g}, not to zero ({reason}). "
+            "If the matrix has one row per electrode, transpose it."
+        )
+
+
+def check_indices(index, size: int, name: str, of: str) -> None:
+    """Raise `ValueError` unless indices (M,) are 0-based integers into `size` patterns."""
+    if index.ndim != 1 or index.shape[0] == 0:
+        raise ValueError(
+            f"Protocol: {name} has shape {tuple(index.shape)}; give one integer per channel, at least one."
+        )
+    if not has_values(index):
+        return
+    values = np.asarray(index)
+    if values.min() < 0 or values.max() >= size:
+        raise ValueError(
+            f"Protocol: {name} runs from {values.min()} to {values.max()}, but there are {size} {of} "
+            f"patterns, numbered 0 to {size - 1}. Indices are 0-based: subtract 1 from MATLAB's."
+        )
+
+
+def check_current(current, where: str) -> None:
+    """Raise `ValueError` unless an amplitude in amperes is positive, and not in milliamperes by mistake."""
+    if not has_values(current):
+        return
+    value = np.asarray(current)
+    if value.ndim != 0 or value.dtype.kind not in "fiu" or not np.isfinite(value) or value <= 0:
+        raise ValueError(f"{where}: current must be one positive, finite number in amperes; got {current!r}.")
+    check_amplitude(float(value), where)
+
+
+def check_amplitude(value: float, where: str) -> None:
+    """Raise `ValueError` for a current above one ampere: the number is in milliamperes or microamperes."""
+    if value > 1.0 + 1e-9:
+        raise ValueError(
+            f"{where}: a current of {value:.6g} A is far above what a tank or a skin carries. Currents are "
+            f"in amperes: if you meant {value:.6g} mA, write {value:.6g}e-3 (microamperes: {value:.6g}e-6); "
+            "1.0 is accepted as a unit current."
+        )
+
+
+def check_count(number, where: str, least: int) -> int:
+    """Return the number of electrodes. Raises `ValueError` unless it is an integer of at least `least`."""
+    if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
+        raise ValueError(f"{where}: the number of electrodes must be an integer of at least {least}; got {number!r}.")
+    return int(number)
+
+
+def electrode_indices(electrodes, num_electrodes: int) -> np.ndarray:
+    """Return 0-based electrode indices as an array. Raises `ValueError` for one that does not exist."""
+    values = np.atleast_1d(np.asarray(electrodes))
+    if values.size == 0:
+        return np.zeros(0, dtype=int)
+    if values.ndim != 1 or values.dtype.kind not in "iu" or values.min() < 0 or values.max() >= num_electrodes:
+        raise ValueError(
+            f"electrodes {electrodes!r}: give integers from 0 to {num_electrodes - 1} "
+            f"(0-based; there are {num_electrodes} electrodes)."
+        )
+    return values
+
+
+def check_pairs(pairs, num_electrodes: int, what: str) -> np.ndarray:
+    """Return electrode pairs (P, 2), 0-based. Raises `ValueError` for an electrode paired with itself."""
+    values = np.asarray(pairs)
+    if values.ndim != 2 or values.shape[1] != 2 or values.shape[0] == 0 or values.dtype.kind not in "iu":
+        raise ValueError(
+            f"{what}: give pairs of electrodes as integers of shape (P, 2); got shape {values.shape} of {values.dtype}."
+        )
+    electrode_indices(values.ravel(), num_electrodes)
+    same = np.flatnonzero(values[:, 0] == values[:, 1])
+    if same.size:
+        raise ValueError(
+            f"{what}: pair {same[0]} is electrode {values[same[0], 0]} with itself. Use two different electrodes."
+        )
+    return values
+
+
+def check_choice(value, choices: tuple[str, ...], where: str, name: str) -> None:
+    """Raise `ValueError` unless the argument `name` is one of `choices`."""
+    if value not in choices:
+        meant = did_you_mean(value, choices)
+        raise ValueError(f"{where}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}{meant}.")
 
 
 def _as_float(values) -> Array:

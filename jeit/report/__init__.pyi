@@ -1,9 +1,7 @@
-from .compared_rules import draw_choice, report_choice, write_choice
-from .film import write_film
+from .compared_rules import draw_choice, report_choice, report_measurement, write_choice
 from .image import draw_image, report_image, write_image
-from .measurement import report_measurement
 from .saved_image import SavedImage, read_image, write_views
-from .series import write_series
+from .series import write_film, write_series
 from .stream import write_stream
 from .volume_files import write_vtk_series, write_vtu, write_xdmf
 

@@ -10,8 +10,7 @@ import numpy as np
 
 from jeit.image import Inclusion
 from jeit.imaging.difference import ImagedDifference
-from jeit.imaging.method import METHODS
-from jeit.imaging.settings import ImagingSettings
+from jeit.imaging.method import METHODS, ImagingSettings
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.protocol import Protocol
@@ -81,12 +80,12 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     """The picture of a result, as a matplotlib `Figure` that needs no display; both parts of one of admittivity."""
     from matplotlib.figure import Figure
 
-    from jeit.plot.colour_scale import CHANGE, LOGARITHM
+    from jeit.plot.axes import CHANGE, LOGARITHM
     from jeit.plot.imaging.electrodes import draw_labels, draw_outlines
     from jeit.plot.imaging.image import plot_image
 
     if result.is_complex:
-        from jeit.plot.imaging.admittivity import plot_admittivity
+        from jeit.plot.imaging.image import plot_admittivity
 
         figure = Figure(figsize=(11.5, 5.2), layout="constrained")
         figure.suptitle(result.measurement.name)

@@ -253,7 +253,7 @@ def write_views(
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
     """Values per cell that are drawn of an image, and their scale: the departure of iterative images, the real part of
     complex ones."""
-    from jeit.plot.colour_scale import CHANGE, LOGARITHM, ColourScale
+    from jeit.plot.axes import CHANGE, LOGARITHM, ColourScale
 
     if image.departure is not None:
         return image.departure, LOGARITHM
@@ -263,9 +263,9 @@ def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
 
 
 def _figures(image: SavedImage, camera, levels, planes, axis: str, slices: int) -> dict[str, "Figure"]:
-    from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
     from jeit.plot.solid.isosurfaces import plot_isosurfaces
     from jeit.plot.solid.overview import plot_solid
+    from jeit.plot.solid.scene import FROM_THE_CORNER, Camera
     from jeit.plot.solid.shaded_surface import plot_surface
     from jeit.plot.solid.slices import plot_slice, plot_slices
 

@@ -12,12 +12,11 @@ from jaxtyping import Float
 from jeit.arguments import describe, is_number
 from jeit.files import clear_unfinished, whole_files, written_whole
 from jeit.inverse.calibration import Calibration
-from jeit.inverse.streaming.frame_check import FrameStatus
-from jeit.inverse.streaming.stream import FrameImage
+from jeit.inverse.streaming.stream import FrameImage, FrameStatus
 from jeit.mesh import centroids
-from jeit.report.film import FILM_FRAMES, check_film, write_film
 from jeit.report.folder import results_folder
 from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_is_left
+from jeit.report.series import FILM_FRAMES, check_film, write_film
 
 PICTURES = ("contact sheet", "film")
 """Pictures of a stream, by the names that are passed to `drawing`."""
@@ -143,7 +142,7 @@ class _Pictures:
     def draw(self, rows: GrowingRows, seen: _Seen) -> None:
         """The contact sheet, and the film, of some of the rows."""
         from jeit.plot import ColourScale, plot_frames
-        from jeit.plot.imaging.frames import SHEET_FRAMES, FrameCount
+        from jeit.plot.imaging.series import SHEET_FRAMES, FrameCount
 
         model, limit = seen.calibration.model, seen.limit
         self.report(PICTURES[0])
@@ -170,7 +169,7 @@ class _Pictures:
             )
 
     def _some(self, rows: GrowingRows, seen: _Seen, most: int) -> tuple[Float[np.ndarray, "k m"], list[str]]:
-        from jeit.plot.imaging.frames import chosen_frames
+        from jeit.plot.imaging.series import chosen_frames
 
         chosen = chosen_frames(rows.number, most)
         images = rows.read(chosen)

@@ -3,8 +3,13 @@ compiler, and what happens in forked processes."""
 
 from __future__ import annotations
 
-from jeit.start.compiled_code import discarded_damaged, keep_compiled_code
-from jeit.start.jax_setup import quick_compilation, refuse_compiled_code_in_forks, take_double_precision
+from jeit.start.jax_setup import (
+    discarded_damaged,
+    keep_compiled_code,
+    quick_compilation,
+    refuse_compiled_code_in_forks,
+    take_double_precision,
+)
 
 __all__ = [
     "discarded_damaged",

@@ -19,8 +19,7 @@ from .health.health_learning import doubts_of, learn_health
 from .kohonen import PlacedMap, SelfOrganisingMap
 from .learnt.file import read_skin, write_skin
 from .learnt.learnt_skin import LearntSkin, Standing
-from .learnt.presses import Presses, read_frames, read_presses
-from .learnt.touches import Touches
+from .learnt.presses import Presses, Touches, read_frames, read_presses
 
 __all__ = [
     "CellFinder",

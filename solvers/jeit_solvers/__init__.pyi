@@ -1,10 +1,25 @@
-from .batching import in_turn
 from .clustering import KMeans, kmeans
 from .cores import number_of_cores, on_cores, over_cores
-from .dense.cholesky import lower_cholesky, symmetric_eigen, symmetric_inverse
-from .dense.ridge import QuadraticModel, ridge_model, ridge_step, solve_definite
-from .optimise.bounded import BoundedMinimum, lbfgsb, projected_gradient, scipy_lbfgsb
-from .optimise.descent import Descent
+from .dense import (
+    QuadraticModel,
+    lower_cholesky,
+    ridge_model,
+    ridge_step,
+    solve_definite,
+    symmetric_eigen,
+    symmetric_inverse,
+)
+from .engines import in_turn
+from .optimise.descent import (
+    BoundedMinimum,
+    Descent,
+    Status,
+    ended,
+    ended_number,
+    lbfgsb,
+    projected_gradient,
+    scipy_lbfgsb,
+)
 from .optimise.implicit import as_minimum
 from .optimise.small_problems import (
     Minimum,
@@ -16,15 +31,12 @@ from .optimise.small_problems import (
     solve_small,
     symmetric_small,
 )
-from .optimise.status import Status, ended, ended_number
-from .sparse.choose import choose_solver
-from .sparse.conjugate_gradient import ConjugateGradient
+from .sparse.choose import ConjugateGradient, SparseCholesky, choose_solver
 from .sparse.multifrontal import Factor, factorise, half_solve, inverse_entries, inverse_root, quadratic_form, solve
 from .sparse.near_inverse import NearInverse, Strips, near_inverse
 from .sparse.operator import SparseSymmetric
 from .sparse.pattern import SparsityPattern
 from .sparse.plan import FactorisationPlan, analyse
-from .sparse.sparse_cholesky import SparseCholesky
 
 __all__ = [
     "BoundedMinimum",

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jeit_solvers.batching import in_turn
-from jeit_solvers.engines import has_values
+from jeit_solvers.engines import has_values, in_turn
 
 
 class KMeans(eqx.Module):

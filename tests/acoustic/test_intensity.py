@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jeit.acoustic.signal import _band_power
+from jeit.acoustic.signal import intensity
 from jeit.acoustic.signal.intensity import (
     IntensitySettings,
     degrees_of_freedom,
@@ -89,18 +89,18 @@ def test_freedom_is_the_trace(high, length):
     """(tr A)² / tr A², with A from the responses to unit samples: xᵀAx for e_i + e_j and e_i - e_j gives A_ij."""
     rate, hop = 8000.0, 16
     settings = IntensitySettings(low=260.0, high=high, window=length / rate, hop=hop / rate)
-    grid = _band_power.make_grid(settings, rate, None, "")
+    grid = intensity.make_grid(settings, rate, None, "")
 
     one, other = np.eye(length)[:, None], np.eye(length)
-    plus = _band_power.band_power((one + other).reshape(-1, length), grid)
-    minus = _band_power.band_power((one - other).reshape(-1, length), grid)
+    plus = intensity.band_power((one + other).reshape(-1, length), grid)
+    minus = intensity.band_power((one - other).reshape(-1, length), grid)
     form = ((plus - minus) / 4).reshape(length, length)
     assert np.trace(form) ** 2 / (form**2).sum() == pytest.approx(degrees_of_freedom(settings, rate), rel=1e-9)
     # The same of windows that overlap: correlation is tr(A B) / tr(A²), with B the form moved on by the hop.
     moved = np.zeros((2, length + hop, length + hop))
     moved[0, :length, :length] = moved[1, hop:, hop:] = form
     correlation = (moved[0] * moved[1]).sum() / (form**2).sum()
-    shared = _band_power.shared_noise(grid, 5)
+    shared = intensity.shared_noise(grid, 5)
     assert shared[0, 1] == shared[3, 2] == pytest.approx(correlation, rel=1e-9)
     assert 0.2 < correlation < 0.9
     assert shared[0, 4] == shared[4, 0] == 0
@@ -122,7 +122,7 @@ def test_times_are_the_middle_of_windows():
 def test_chunks_do_not_matter(monkeypatch):
     recording = Recording(white((3, 30_000)), RATE)
     whole = intensities(recording)
-    monkeypatch.setattr(_band_power, "_CHUNK", 20_000)
+    monkeypatch.setattr(intensity, "_CHUNK", 20_000)
     np.testing.assert_allclose(intensities(recording).power, whole.power, rtol=1e-12)
     single = intensities(Recording(recording.samples.astype(np.float32), RATE))
     np.testing.assert_allclose(single.power, whole.power, atol=1e-6 * whole.power.max())

@@ -9,7 +9,7 @@ from microphone_arrays import MICROPHONES, OUTLINE, listen, models
 
 from jeit.acoustic import Calibration, Intensities, Taps, calibrate_microphones, locate
 from jeit.acoustic.calibration.calibrate import calibrate_each, choose
-from jeit.acoustic.calibration.left_out import LeftOutTaps, _deal
+from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, _deal
 from jeit.acoustic.decay import DECAYS
 from jeit.layout import grid
 

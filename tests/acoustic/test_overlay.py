@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.acoustic.localisation.overlay import brightness, overlay
+from jeit.acoustic.localisation.pixels import brightness, overlay
 
 
 def maps():

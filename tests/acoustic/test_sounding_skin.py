@@ -16,10 +16,10 @@ from jeit.acoustic.simulate import (
     tap,
     tickle,
 )
-from jeit.acoustic.simulate.layer import Elastomer, ElastomerLayer
 from jeit.acoustic.simulate.microphones import MicrophoneModel, Readout
 from jeit.acoustic.simulate.propagation import expected_power, noise_power, nominal_power, transfer
 from jeit.acoustic.simulate.sound import superpose
+from jeit.acoustic.simulate.sounding_skin import Elastomer, ElastomerLayer
 from jeit.data import RoundSkin, simulate_press
 
 KEY = jax.random.key(0)

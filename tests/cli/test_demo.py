@@ -8,7 +8,7 @@ import pytest
 
 import jeit
 from jeit.imaging.preparation import SHEET_POINTS, SOLID_POINTS
-from jeit.inverse.prior.defaults import PRIORS
+from jeit.inverse.prior.matern import PRIORS
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from jeit.cli.console import in_one_unit
 from jeit.cli.options import NETWORK
 from jeit.data import read, write_table
 from jeit.imaging import METHODS, StreamSettings
-from jeit.imaging.settings import AUTO
+from jeit.imaging.method import AUTO
 from jeit.imaging.stream_preparation import STREAM_POINTS
 from jeit.inverse.streaming.imager import FRAME_STEPS
 

@@ -33,8 +33,8 @@ sys.exit(main(sys.argv[1:]))
 STREAM = {
     "its third line": ("jeit.report.growing", "GrowingTable", "write", 4, {"frames.csv"}),
     "its images": ("zipfile", "_ZipWriteFile", "write", 3, {"frames.csv"}),
-    "its sheet": ("jeit.plot.imaging.frames", "FramePicture", "show", 3, {"frames.csv", "images.npz"}),
-    "its film": ("jeit.plot.imaging.frames", "FramePicture", "show", 9, {"frames.csv", "images.npz", "frames.png"}),
+    "its sheet": ("jeit.plot.imaging.series", "FramePicture", "show", 3, {"frames.csv", "images.npz"}),
+    "its film": ("jeit.plot.imaging.series", "FramePicture", "show", 9, {"frames.csv", "images.npz", "frames.png"}),
 }
 
 

@@ -10,10 +10,9 @@ from small_networks import SKIN
 
 from jeit.design import read_described_skin
 from jeit.touch.networks import PRESETS, read_network
-from jeit.touch.networks.learn import stand
+from jeit.touch.networks.learn import Examples, Runs, shuffled, stand, train_unrolled
 from jeit.touch.networks.sensed import Sensed
 from jeit.touch.networks.three_stages import ThreeStages
-from jeit.touch.networks.training import Examples, Runs, shuffled, train_unrolled
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.simulate.contact.indent_sets import image_places
 

@@ -13,8 +13,8 @@ from instrument_files import (
 )
 
 from jeit import data, protocol
-from jeit.data import table
-from jeit.data.quality import impossible_signs
+from jeit.data.formats import table
+from jeit.data.imageable import impossible_signs
 from jeit.data.registry import FORMATS
 
 RING = (

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from jeit import data, protocol
-from jeit.data.imageable import assess
-from jeit.data.quality import channel_reciprocity_error, expected_signs
+from jeit.data.imageable import assess, channel_reciprocity_error, expected_signs
 from jeit.inverse import relative_noise
-from jeit.report.measurement import report_measurement
+from jeit.report.compared_rules import report_measurement
 
 
 def test_missing_saturated_and_dead_channels_are_masked_and_noted(tank, setup):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jeit.design import Skin, read_described_skin, touch_grid
-from jeit.design.reports.study_pictures import draw_maps
+from jeit.design.reports.study import draw_maps
 from jeit.design.study import open_results, read_study, run_study
 from jeit.design.study.batch import check_points
 from jeit.layout import SurfaceLayout, read_surface_layout, write_layout

@@ -19,10 +19,8 @@ from jeit.design import (
     touch_grid,
     touches_away_from_the_edge,
 )
-from jeit.design.optimisation.constraints import Constraints
-from jeit.design.optimisation.objective import balanced
-from jeit.design.optimisation.search import descend
-from jeit.design.optimisation.variables import Variables, Varied
+from jeit.design.optimisation.design_space import Constraints, descend
+from jeit.design.optimisation.variables import Variables, Varied, balanced
 from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel

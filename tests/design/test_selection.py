@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize
 
 from jeit.design import Candidates, information_bound, select_measurements
-from jeit.design.measurements.selection import farthest_pairs, information, nearest_pairs, random_selections
+from jeit.design.measurements import farthest_pairs, information, nearest_pairs, random_selections
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian
 from jeit.layout import named_layout

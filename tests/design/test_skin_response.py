@@ -20,7 +20,7 @@ from jeit.design import (
     touches_away_from_the_edge,
 )
 from jeit.design.comparison import comparison
-from jeit.design.measurements.selection import random_selections
+from jeit.design.measurements import random_selections
 from jeit.design.skin.protocol import skin_protocol
 from jeit.layout import Layout, grid
 from jeit.mesh import Polygon, Rectangle

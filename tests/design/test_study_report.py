@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from studies import SMALL
 
-from jeit.design.reports import study_pictures as pictures
+from jeit.design.reports import study as pictures
 from jeit.design.reports import write_study_report
 from jeit.design.study import open_results, read_study, run_study
 from jeit.design.study.store import Store

@@ -18,7 +18,7 @@ from jeit.design import (
     skin_response,
     touch_grid,
 )
-from jeit.design.measurements.selection import nearest_pairs
+from jeit.design.measurements import nearest_pairs
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.protocol import skin_protocol
 from jeit.design.skin.sheet_touches import sheet_touches

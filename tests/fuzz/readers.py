@@ -29,7 +29,7 @@ from jeit import data
 from jeit.acoustic import Calibration, IntensitySettings, Taps, read_recording, read_taps
 from jeit.acoustic.signal.recording import write_taps
 from jeit.data import GestureSet, load_description, write_table
-from jeit.data.frame_recording import read_frame_recording
+from jeit.data.gesture_set import read_frame_recording
 from jeit.design import Skin
 from jeit.design.skin.skin_file import read_described_skin
 from jeit.design.study import read_study, run_study, study_progress

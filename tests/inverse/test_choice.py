@@ -10,8 +10,7 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import RULES, Laplace, Noser, choose_hyperparameter, compare_rules, one_step
 from jeit.inverse.hyperparameter.choice import Choice
-from jeit.inverse.hyperparameter.point_spread import best_resolution, blur_radius, spread_cells
-from jeit.inverse.hyperparameter.rules import choose, discrepancy
+from jeit.inverse.hyperparameter.rules import best_resolution, blur_radius, choose, discrepancy, spread_cells
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.spectrum import Spectrum
 from jeit.layout import ring

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jeit.mesh import disk, from_gmsh, read
-from jeit.mesh._foreign import FORMATS
+from jeit.mesh.files import FORMATS
 
 MESH = disk(0.1, num_points=40)
 POINTS = np.column_stack([np.asarray(MESH.points), np.zeros(MESH.num_points)])

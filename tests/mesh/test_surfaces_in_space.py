@@ -13,7 +13,7 @@ from jeit.electrodes import BoundaryElectrodes, NodeElectrodes, PointElectrodes,
 from jeit.forward import ForwardModel
 from jeit.image import Raster
 from jeit.mesh import Mesh, centroids, gradients, measures, normals, quality, rectangle
-from jeit.mesh._crossings import first_crossing
+from jeit.mesh._surface import first_crossing
 from jeit.mesh.geometry import boundary_loops, facet_measures
 
 FLAT = rectangle(0.2, 0.1, num_points=200)

@@ -23,8 +23,7 @@ from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, r
 from jeit.plot import ColourScale, plot_image, plot_mesh
 from jeit.plot.axes import bare, extent_of
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions
-from jeit.plot.imaging.image import plot_raster
-from jeit.plot.imaging.sensitivity import plot_sensitivity
+from jeit.plot.imaging.image import plot_raster, plot_sensitivity
 from jeit.plot.imaging.series import plot_series
 from jeit.plot.imaging.voltages import plot_voltages
 from jeit.protocol import adjacent

@@ -9,8 +9,7 @@ import pytest
 
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
-from jeit.inverse.streaming.frame_check import FrameStatus
-from jeit.inverse.streaming.stream import FrameImage
+from jeit.inverse.streaming.stream import FrameImage, FrameStatus
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent

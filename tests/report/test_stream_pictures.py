@@ -8,8 +8,8 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.layout import ring
 from jeit.mesh import Disk, Solid, centroids
 from jeit.plot import plot_frames
-from jeit.plot.imaging.frames import chosen_frames
-from jeit.report import film, write_film
+from jeit.plot.imaging.series import chosen_frames
+from jeit.report import series, write_film
 
 RADIUS = 0.05
 MESH = Disk(RADIUS).mesh(num_points=200)
@@ -90,7 +90,7 @@ def test_a_film_has_every_frame_at_the_pace_of_the_stream(tmp_path):
 
 
 def test_long_streams_make_short_films(tmp_path, monkeypatch):
-    monkeypatch.setattr(film, "FILM_FRAMES", 4)
+    monkeypatch.setattr(series, "FILM_FRAMES", 4)
     write_film(tmp_path / "a.gif", MESH, changes(40), rate=1000.0)
     with Image.open(tmp_path / "a.gif") as shown:
         assert (shown.n_frames, shown.info["duration"]) == (4, 40)  # no faster than 25 a second
@@ -110,7 +110,7 @@ def test_films_of_other_kinds_are_refused(tmp_path, monkeypatch):
 
     for name in ("a.avi", "there/a.gif"):
         with pytest.raises(ValueError, match=r"film must be a name that ends in \.gif or \.mp4; it is"):
-            film.check_film(name)
+            series.check_film(name)
     monkeypatch.setattr(FFMpegWriter, "isAvailable", classmethod(lambda cls: False))
     with pytest.raises(ValueError, match=r"'a\.mp4' needs ffmpeg, which is not installed; name it \.gif"):
         write_film(tmp_path / "a.mp4", MESH, changes(2))

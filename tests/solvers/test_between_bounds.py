@@ -56,4 +56,4 @@ def test_one_module_knows_jaxopt():
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             if any(name.split(".")[0] == "jaxopt" for name in names):
                 found.add(path.relative_to(ROOT).as_posix())
-    assert found == {"solvers/jeit_solvers/optimise/bounded.py"}
+    assert found == {"solvers/jeit_solvers/optimise/descent.py"}

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit_solvers.dense.cholesky import inverse_cholesky
+from jeit_solvers.dense import inverse_cholesky
 
 # Row by row; in halves, unrolled; in halves, row by row; halves of halves; block rows of either width, with padding.
 ROUTES = [(1, 1), (3, 7), (20, 13), (2, 29), (1, 70), (1, 130), (1, 300)]

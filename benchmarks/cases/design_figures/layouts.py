@@ -74,7 +74,7 @@ def selected(name: str, number: int, cell_sizes: tuple[float, float], correlatio
     import jax
 
     from jeit.design import Candidates, information_bound, select_measurements
-    from jeit.design.measurements.selection import information, nearest_pairs, random_selections
+    from jeit.design.measurements import information, nearest_pairs, random_selections
     from jeit.forward import ForwardModel
     from jeit.inverse import Gaussian
     from jeit.layout import named_layout

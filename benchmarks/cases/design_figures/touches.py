@@ -15,7 +15,7 @@ from benchmarks.harness.timing import say
 if TYPE_CHECKING:
     from jaxtyping import Array
 
-    from jeit.design.response import SkinResponse
+    from jeit.design.comparison import SkinResponse
     from jeit.design.skin.indentation import AbstractIndentation
 
 LAYOUTS = ("park-inner", "park-boundary")
@@ -72,8 +72,8 @@ def response_of(
     import jax
 
     from jeit.design import find_taxels, touches_away_from_the_edge
-    from jeit.design.measurements.selection import nearest_pairs
-    from jeit.design.response import SkinResponse
+    from jeit.design.comparison import SkinResponse
+    from jeit.design.measurements import nearest_pairs
     from jeit.design.sensitivity import SensitivityMap
     from jeit.layout import named_layout
     from jeit.mesh import Rectangle

@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.acoustic.calibration.calibration import Calibration
-from jeit.acoustic.calibration.left_out import LeftOutTaps, locate_left_out
 from jeit.acoustic.calibration.robust_least_squares import TapFit, fit_taps, standard_errors
-from jeit.acoustic.calibration.usable_microphones import check_received, leave_out
+from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, check_received, leave_out, locate_left_out
 from jeit.acoustic.decay import DECAYS, AbstractDecay, find_decay
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.noise import IntensityNoise, below_nothing

@@ -50,8 +50,7 @@ def calibrate_microphones(
     from jeit.acoustic import read_taps
     from jeit.acoustic.calibration.calibrate import AUTO
     from jeit.acoustic.decay import find_decay
-    from jeit.acoustic.reports import write_calibration
-    from jeit.acoustic.reports.calibration import calibration_files
+    from jeit.acoustic.reports import calibration_files, write_calibration
     from jeit.cli.console import Steps, plain_console, say_written
 
     settings = intensity_settings(low, high, window, hop)

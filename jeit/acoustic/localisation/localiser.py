@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.localisation.consistency import Consistency
+from jeit.acoustic.localisation.consistency import Consistency, differentiable_minima, find_minima
 from jeit.acoustic.localisation.likelihood import Likelihood
-from jeit.acoustic.localisation.minima import differentiable_minima, find_minima
 from jeit.acoustic.localisation.pixels import Pixels, valleys
 from jeit.acoustic.microphones import MicrophoneArray, check_array
 from jeit.acoustic.surface import bounding_box, in_space, longer_side

@@ -1,6 +1,5 @@
 from .localisation_error import plot_error_curve, plot_pairs
-from .loss_map import Marks, plot_loss_map
-from .receptive_fields import plot_receptive_fields
+from .maps import Marks, plot_loss_map, plot_receptive_fields
 from .track import plot_track
 
 __all__ = [

@@ -47,7 +47,7 @@ def plot_track(
 
     `array`: the `Calibration`, whose unusable microphones are crossed, as are those not used at all in `locations`; or
     `MicrophoneArray`. `overlay` (rows, columns), bottom row first, over the box of the outline: brightness, 0 to 1, as
-    the last image of `jeit.acoustic.localisation.overlay`. `truth` (N, d), metres: the true path, if known. A touch at
+    the last image of `jeit.acoustic.localisation.pixels`. `truth` (N, d), metres: the true path, if known. A touch at
     rest is drawn as a dot with its 95 % ellipse. Frames with a status other than "touch" are marked, and listed in the
     legend. On a curved surface everything is in its chart. Raises `ValueError` for shapes that disagree, and for
     arguments of the wrong type.

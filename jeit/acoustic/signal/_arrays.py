@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import KDTree
 
-from jeit.mesh.loops import distance, inside
+from jeit.mesh.topology import distance, inside
 
 # Lowest sampling rate at which the vibrations of a touch can be recorded.
 LOWEST_RATE = 100.0  # Hz

@@ -1,10 +1,9 @@
-from .bursts import Burst
 from .calibration_recording import calibration_taps
 from .microphones import microphone_grid
-from .people.clips import SoundClip, sound_clips
-from .people.sounding_person import SoundingPerson
+from .people import SoundClip, SoundingPerson, sound_clips
 from .sound import quiet
 from .sounding_skin import SoundingSkin
+from .synthesis import Burst
 from .touches import pat, stroke, tap, tickle
 from .wind_sound import room_sound, wind
 

@@ -12,13 +12,16 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.simulate.bursts import ONSET, VIBRATOR, Burst, check_burst
 from jeit.acoustic.simulate.checks import check_not_negative
 from jeit.acoustic.simulate.propagation import noise_power, transfer
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import (
+    ONSET,
     RINGING,
+    VIBRATOR,
+    Burst,
     bin_frequencies,
+    check_burst,
     filled_bins,
     noise_spectrum,
     sample_times,

@@ -1,4 +1,4 @@
-"""Synthesis of random sound: the spectrum of a touch under its envelope, and the microphones' own noise.
+"""Synthesis of noise with a spectrum, and of bursts.
 
 A touch of soft rubber is random noise in a band, in bursts or steadily. White noise is shaped in time first and in
 frequency after. Every function takes an explicit key: the same key, the same samples.
@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.fft import next_fast_len
 
+from jeit.acoustic.simulate.checks import check_positive
 from jeit.acoustic.simulate.propagation import band_filter, noise_power, source_density
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin
+from jeit.arguments import check_kind
 
 # The source's filter has no phase: it rings before and after a burst, for about the inverse of its lowest frequency.
 RINGING = 0.05
@@ -72,3 +75,52 @@ def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> Float[np.nda
 def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]:
     """Sampling times of the first channel in `duration` seconds, (S,) s."""
     return np.arange(max(2, round(duration * skin.rate))) / skin.rate
+
+
+# When the first burst begins, seconds: time for its ringing.
+ONSET = 0.02
+
+
+class Burst(eqx.Module):
+    """Envelope of one tap: it rises fast and decays within `length` seconds, over which its root mean square is
+    `strength`. Raises `ValueError` for what is not positive."""
+
+    strength: float = 1.0
+    length: float = 0.06
+
+    def __check_init__(self):
+        check_positive("strength", self.strength)
+        check_positive("length", self.length)
+
+    def check_fits(self, duration: float) -> None:
+        """Raises `ValueError` unless a recording of `duration` seconds holds one burst."""
+        check_positive("duration", duration)
+        if duration < ONSET + self.length:
+            raise ValueError(
+                f"duration: a burst of {self.length:g} s that begins at {ONSET:g} s does not fit in {duration:g} s. "
+                f"Give at least {ONSET + self.length:g} s, or a shorter length."
+            )
+
+    def envelope(
+        self, times: Float[np.ndarray, " S"], onsets: Float[np.ndarray, " N"], strengths: Float[np.ndarray, " N"]
+    ) -> Float[np.ndarray, " S"]:
+        """Root mean square at `times` (s) of N bursts of this length that begin at `onsets` (s), with `strengths`.
+
+        A burst is t e^(-t / a), a = length / 6: risen in a sixth of `length`, at its end down to 4 %. Its square,
+        t² e^(-2t / a), integrates to a³ / 4: divided by `length`, that is the mean square to scale by.
+        """
+        rise = self.length / 6
+        after = np.maximum(times - onsets[:, None], 0)
+        shape = after * np.exp(-after / rise) / np.sqrt(rise**3 / 4 / self.length)
+        # Bursts that overlap are independent noises: their powers add.
+        return np.sqrt(((strengths[:, None] * shape) ** 2).sum(axis=0))
+
+
+def check_burst(burst: Burst, duration: float) -> None:
+    """Raises `ValueError` for what is no `Burst`, and unless a recording of `duration` seconds holds one of it."""
+    check_kind("burst", burst, Burst, "a Burst, such as Burst(strength=2.0)")
+    burst.check_fits(duration)
+
+
+# A vibrator with a rubber tip, the palm of a hand, and fingers that tickle.
+VIBRATOR, FIRM, LIGHT = Burst(), Burst(2.0, 0.08), Burst(0.7, 0.04)

@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.simulate.bursts import FIRM, LIGHT, ONSET, VIBRATOR, Burst, check_burst
 from jeit.acoustic.simulate.checks import check_positive
 from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, record
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
-from jeit.acoustic.simulate.synthesis import sample_times
+from jeit.acoustic.simulate.synthesis import FIRM, LIGHT, ONSET, VIBRATOR, Burst, check_burst, sample_times
 
 # Friction turns force times speed into heat and sound: a stroke's power goes as its speed, its amplitude as the root.
 NOMINAL_SPEED = 0.1

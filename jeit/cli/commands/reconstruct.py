@@ -122,7 +122,7 @@ def reconstruct(
         return
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.imaging import METHODS, ImagingSettings, image_difference
-    from jeit.imaging.settings import AUTO
+    from jeit.imaging.method import AUTO
     from jeit.report import write_image
 
     check_method(method, (AUTO, *METHODS))

@@ -89,8 +89,7 @@ def series(
     from jeit.image import oscillation
     from jeit.imaging import ImagingSettings, image_sequence
     from jeit.report import write_series
-    from jeit.report.film import check_film
-    from jeit.report.series import SERIES_FILES
+    from jeit.report.series import SERIES_FILES, check_film
 
     given = {
         "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),

@@ -106,7 +106,7 @@ def stream(
     from jeit.inverse import stream as images_of
     from jeit.inverse.nonlinear.solvers import SOLVERS, frame_solvers
     from jeit.report import write_stream
-    from jeit.report.film import check_film
+    from jeit.report.series import check_film
     from jeit.report.stream import PICTURES
 
     if method not in SOLVERS:

@@ -43,7 +43,7 @@ def view(
     """
     from jeit.cli.console import plain_console, say_written
     from jeit.plot.solid import interactive
-    from jeit.plot.solid.camera import Camera
+    from jeit.plot.solid.scene import Camera
     from jeit.report import read_image, write_views
     from jeit.report.saved_image import VIEW_FILES, drawn_values
 

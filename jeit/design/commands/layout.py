@@ -128,7 +128,7 @@ def compare(
 def _show(console, result: "LayoutComparison") -> None:
     from rich.table import Table
 
-    from jeit.design.reports.layout_comparison import distinct_names
+    from jeit.design.reports.layouts import distinct_names
 
     figures = result.figures
     table = Table("", *distinct_names([one["layout"] for one in figures]), box=None, padding=(0, 2, 0, 0))

@@ -1,19 +1,64 @@
-"""`DesignSpace`: the layouts allowed in an optimisation, and the parameters varied besides the positions."""
+"""The space of layouts that are searched: variables between bounds, constraints, and starting points."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind, check_metres, describe, is_number
-from jeit.design.optimisation.constraints import Constraints
 from jeit.design.optimisation.variables import Symmetry, Variables, Varied
 from jeit.design.skin.skin import Skin, longer_side
 from jeit.layout import SurfaceLayout
 from jeit.mesh import Domain
+from jeit_solvers import Status, scipy_lbfgsb
+
+
+class Constraints(eqx.Module):
+    """Discs wholly inside `outline` and wholly outside every domain of `keep_out`, their centres `minimum_spacing`
+    metres apart or more, and no two of them overlapping.
+
+    Raises `ValueError` for a spacing below zero.
+    """
+
+    outline: Domain
+    minimum_spacing: float
+    keep_out: tuple[Domain, ...] = ()
+
+    def __check_init__(self):
+        if not 0 <= self.minimum_spacing < np.inf:
+            raise ValueError(f"minimum_spacing must be in metres, not negative; it is {self.minimum_spacing!r}.")
+
+    def check_room(self, radii) -> None:
+        """Raise `ValueError` for more discs of `radii` (L,), metres, than the densest packing of circles allows."""
+        x_min, x_max, y_min, y_max = self.outline.extent
+        least = float(np.min(radii))
+        apart = max(self.minimum_spacing, 2 * least)
+        # Circles of half that distance lie apart, and reach beyond where centres may be by their radius.
+        room = (x_max - x_min - 2 * least + apart) * (y_max - y_min - 2 * least + apart)
+        if len(radii) * apart**2 > 2 / np.sqrt(3) * room:
+            raise ValueError(
+                f"minimum_spacing: {len(radii)} electrodes {1e3 * apart:.3g} mm apart do not fit the outline, "
+                f"{1e3 * (x_max - x_min):.3g} × {1e3 * (y_max - y_min):.3g} mm; give less, or fewer electrodes."
+            )
+
+    def shortfall(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> Float[Array, " q"]:
+        """Violation of each constraint, metres: positive where it is violated. Differentiable almost everywhere."""
+        return jnp.concatenate(list(self.shortfalls(centres, radii).values()))
+
+    def shortfalls(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> dict[str, Float[Array, " q"]]:
+        """Violations by the names of the constraints: "minimum_spacing", "outline" and "keep_out"."""
+        first, second = np.triu_indices(len(radii), 1)
+        distance = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
+        outside = [radii + domain.signed_distance(centres) for domain in self.keep_out]
+        return {
+            "minimum_spacing": jnp.maximum(self.minimum_spacing, radii[first] + radii[second]) - distance,
+            "outline": radii - self.outline.signed_distance(centres),
+            "keep_out": jnp.concatenate(outside) if outside else jnp.zeros(0),
+        }
 
 
 class DesignSpace(eqx.Module):
@@ -99,3 +144,48 @@ def _check_thickness(thickness: tuple[float, float], depth: float, outline: Doma
     if np.min(thickness) <= depth:
         raise ValueError(f"thickness: the touches are {1e3 * depth:.3g} mm deep; let the sheet be thicker.")
     check_metres("thickness", np.max(thickness), longer_side(outline), "the skin is wide")
+
+
+# Relative decrease of the cost in a step below which it has converged.
+_TOLERANCE = 1e-5
+
+
+class Record:
+    """History of S starts: variables (S, v) and scores (S,) after every step."""
+
+    def __init__(self, callback: Callable[[int, Float[np.ndarray, " S"]], None] | None = None):
+        self.variables: list[np.ndarray] = []
+        self.values: list[np.ndarray] = []
+        self._callback = callback
+
+    def add(self, variables, values) -> None:
+        """Add a step."""
+        self.variables.append(np.array(variables))
+        self.values.append(np.array(values))
+        if self._callback is not None:
+            self._callback(len(self.values) - 1, self.values[-1])
+
+
+def descend(
+    cost, variables: Float[Array, "S v"], steps: int, record: Record, *, tolerance: float = _TOLERANCE
+) -> tuple[Float[Array, "S v"], Status]:
+    """Minimise the sum of the starts' costs over variables between 0 and 1 by L-BFGS. Returns the final variables and
+    the termination: converged, step limit, or stalled where no step along the gradient lowers the cost.
+
+    `cost`: of variables (S, v) to costs (S,), scores (S,) for the record, and the gradient (S, v) of the costs.
+    """
+    last = {}
+
+    def value_and_slope(variables):
+        value, score, slope = cost(variables)
+        last.update(variables=np.asarray(variables), score=np.asarray(score))
+        return jnp.sum(value), slope
+
+    def after_step(variables):
+        same = np.array_equal(last["variables"], variables)
+        record.add(variables, last["score"] if same else cost(variables)[1])
+
+    found, _, status = scipy_lbfgsb(
+        value_and_slope, variables, 0.0, 1.0, tolerance=tolerance, max_steps=steps, callback=after_step
+    )
+    return jnp.asarray(found), status

@@ -18,11 +18,8 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_key, check_kind
 from jeit.design.defaults import STEPS
-from jeit.design.optimisation.constraints import Constraints
-from jeit.design.optimisation.design_space import DesignSpace, varied_of
-from jeit.design.optimisation.objective import Objective
-from jeit.design.optimisation.search import Record, descend
-from jeit.design.optimisation.variables import Variables, Varied
+from jeit.design.optimisation.design_space import Constraints, DesignSpace, Record, descend, varied_of
+from jeit.design.optimisation.variables import Objective, Variables, Varied
 from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin, check_skin
 from jeit.layout import Layout, SurfaceLayout

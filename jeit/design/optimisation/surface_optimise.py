@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind, describe, is_number
-from jeit.design.optimisation.objective import Objective
+from jeit.design.optimisation.variables import Objective
 from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin, check_skin
 from jeit.electrodes import SurfaceDiscs

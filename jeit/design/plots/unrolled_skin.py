@@ -16,8 +16,18 @@ from jeit.arguments import check_kind
 from jeit.electrodes import FaceDiscs, SurfaceDiscs
 from jeit.layout import SurfaceLayout
 from jeit.mesh.geodesic import Unrolled
-from jeit.plot.axes import INK, SERIES_COLOURS, SOFT, axes_or_new, bare, draw_scale_bar, extent_of
-from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
+from jeit.plot.axes import (
+    CHANGE,
+    INK,
+    SERIES_COLOURS,
+    SOFT,
+    ColourScale,
+    axes_or_new,
+    bare,
+    check_scale,
+    draw_scale_bar,
+    extent_of,
+)
 
 # Relative distortion of lengths from which on the plot states it.
 _TOLD = 0.005

@@ -8,7 +8,7 @@ import numpy as np
 
 from jeit.arguments import check_name
 from jeit.design.defaults import CURRENT, NUM_PAIRS, PROTOCOL
-from jeit.design.measurements.selection import nearest_pairs
+from jeit.design.measurements import nearest_pairs
 from jeit.layout import Layout, SurfaceLayout
 from jeit.layout.surface_layout import check_layout
 from jeit.protocol import Protocol, adjacent, opposite, two_terminal

@@ -8,12 +8,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jeit.design.skin.touched_cells import TouchedCells
-from jeit.design.skin.touched_nodes import touched_nodes
+from jeit.design.skin.touched_cells import TouchedCells, touched_nodes
 from jeit.design.skin.voltage_changes import EXACT_AT_ONCE, cell_stiffness, changes_between, check_found
 from jeit.forward import ForwardModel
-from jeit.forward.assembly import cell_conductivity, check_conductivity
 from jeit.forward.model import channel_voltages, check_model, evaluate, solved_system_of
+from jeit.forward.system import cell_conductivity, check_conductivity
 from jeit.forward.transfer import fields_and_inverse
 from jeit_solvers import NearInverse, Strips, over_cores
 from jeit_solvers.engines import on_device

@@ -21,7 +21,7 @@ from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.forward import ForwardModel
-from jeit.forward.assembly import check_conductivity
+from jeit.forward.system import check_conductivity
 from jeit.layout import Layout, SurfaceLayout
 from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.mesh import Domain, Mesh, Rectangle, layer, shell

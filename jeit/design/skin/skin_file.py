@@ -1,20 +1,85 @@
-"""Skins described by a TOML file: layout, material, protocol and mesh."""
+"""Files that describe a skin: the tables of their keys, and how they are read."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Annotated, Literal
 
+from pydantic import Field, model_validator
+
+from jeit.design import defaults
 from jeit.design.skin.described_surface import described_surface
-from jeit.design.skin.protocol import skin_protocol
+from jeit.design.skin.protocol import ProtocolName, skin_protocol
 from jeit.design.skin.skin import Skin
-from jeit.design.study.curved_layouts import curved_layout
-from jeit.design.study.layouts import study_layout
-from jeit.files import check_memory, read_toml
+from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_of_curved
+from jeit.design.study.layouts import curved_layout, study_layout
+from jeit.files import MOST_ELECTRODES, check_memory, read_toml
+from jeit.files.schema import Number, Table, Word
 from jeit.mesh import Rectangle
 
-if TYPE_CHECKING:
-    from jeit.design.skin.skin_tables import SkinTable
+SIDE = Number(5, 5000, "mm")
+THICKNESS = Number(0.05, 200, "mm")
+CONDUCTIVITY = Number(1e-6, 1e8, "S/m")
+DIAMETER = Number(0.1, 200, "mm")
+IMPEDANCE = Number(1e-9, 1e3, "ohm·m²")
+PAIRS = Number(0, MOST_ELECTRODES * (MOST_ELECTRODES - 1) // 2)
+CURRENT = Number(1e-4, 1e3, "mA")
+CELL = Number(0.1, 200, "mm")
+LAYERS = Number(1, 50)
+
+
+class MaterialTable(Table):
+    """The skin's model and material."""
+
+    what = "a skin"
+    model: Literal["sheet", "layer"] = "sheet"
+    width_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
+    height_mm: Annotated[float, SIDE] = 1e3 * defaults.SIDE
+    thickness_mm: Annotated[float, THICKNESS] = 1e3 * defaults.THICKNESS
+    conductivity_S_per_m: Annotated[float, CONDUCTIVITY] = defaults.CONDUCTIVITY
+
+
+class LayoutTable(Table):
+    """The electrodes. NaN means the layout's own value."""
+
+    what = "a skin"
+    layout: Word
+    diameter_mm: Annotated[float, DIAMETER] = math.nan
+    contact_impedance_ohm_m2: Annotated[float, IMPEDANCE] = math.nan
+
+
+class MeasurementTable(Table):
+    """The measurement protocol."""
+
+    what = "a skin"
+    protocol: ProtocolName = defaults.PROTOCOL
+    pairs: Annotated[int, PAIRS] | None = None
+    current_mA: Annotated[float, CURRENT] = 1e3 * defaults.CURRENT
+
+
+class CellsTable(Table):
+    """The mesh."""
+
+    what = "a skin"
+    cell_mm: Annotated[float, CELL] = 1e3 * defaults.CELL_SIZE
+    layers: Annotated[int, LAYERS] = defaults.NUM_LAYERS
+
+
+class SkinTable(Table):
+    """A complete skin file."""
+
+    what = "a skin"
+    skin: MaterialTable = MaterialTable()
+    surface: Annotated[SurfaceTable | None, SURFACE] = None
+    electrodes: LayoutTable = Field(default_factory=dict, validate_default=True)
+    measurement: MeasurementTable = MeasurementTable()
+    mesh: CellsTable = CellsTable()
+
+    @model_validator(mode="after")
+    def _of_curved(self) -> "SkinTable":
+        check_of_curved(self.surface, self.skin, self.mesh)
+        return self
 
 
 def describes_skin(path: str | Path) -> bool:
@@ -37,7 +102,6 @@ def read_described_skin(path: str | Path) -> Skin:
     if not path.is_file():
         raise FileNotFoundError(f"'{path}': there is no such file.")
     # pydantic takes longer to import than most of what jeit does with a skin's file.
-    from jeit.design.skin.skin_tables import SkinTable
     from jeit.files.limits import faults_message
     from jeit.files.schema import validated
 

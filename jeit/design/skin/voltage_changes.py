@@ -22,11 +22,10 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind
 from jeit.design.skin.reached_cells import said
-from jeit.design.skin.touched_cells import TouchedCells
-from jeit.design.skin.touched_nodes import touched_nodes
+from jeit.design.skin.touched_cells import TouchedCells, touched_nodes
 from jeit.forward import ForwardModel
-from jeit.forward.assembly import cell_conductivity, check_conductivity, stiffness
 from jeit.forward.model import check_model, evaluate, select_channels, solved_system_of
+from jeit.forward.system import cell_conductivity, check_conductivity, stiffness
 from jeit.forward.transfer import fields_and_inverse
 from jeit.protocol import Protocol
 from jeit_solvers import over_cores

@@ -1,5 +1,4 @@
-from .progress import Progress
-from .run import run_study, study_progress
+from .run import Progress, run_study, study_progress
 from .spec import Point, Study, read_study
 from .store import open_results
 

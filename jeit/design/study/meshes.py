@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jeit.design.skin.described_surface import described_surface, typical_cell
-from jeit.design.study.curved_layouts import curved_layout
-from jeit.design.study.layouts import study_layout
+from jeit.design.study.layouts import curved_layout, study_layout
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Mesh, Rectangle
 from jeit.mesh.geodesic import Triangles

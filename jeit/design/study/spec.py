@@ -23,7 +23,7 @@ from jeit.design.study.meshes import meshes_of
 from jeit.design.study.scores import OPTIMALITY
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.files import check_memory, read_text
-from jeit.files.text import parsed_toml
+from jeit.files.limits import parsed_toml
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Rectangle
 from jeit.mesh.geodesic import Triangles

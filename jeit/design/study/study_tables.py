@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from jeit.design import defaults
 from jeit.design.skin.protocol import ProtocolName
-from jeit.design.skin.skin_tables import (
+from jeit.design.skin.skin_file import (
     CELL,
     CONDUCTIVITY,
     CURRENT,

@@ -1,5 +1,4 @@
-from .point_spread import best_resolution
-from .rules import discrepancy, generalised_cross_validation, l_curve, noise_figure
+from .rules import best_resolution, discrepancy, generalised_cross_validation, l_curve, noise_figure
 
 __all__ = [
     "best_resolution",

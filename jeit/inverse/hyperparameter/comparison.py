@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
-from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
 from jeit.inverse.hyperparameter.choice import Choice

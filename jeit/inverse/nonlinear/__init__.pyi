@@ -1,6 +1,5 @@
-from .parametrisation import Bounded, Linear, Log
+from .parametrisation import Background, Bounded, ContactImpedance, ElectrodePosition, Linear, Log, Scale
 from .solvers import LBFGSB, GaussNewton, LevenbergMarquardt, OneStep, ProjectedGradient
-from .unknowns import Background, ContactImpedance, ElectrodePosition, Scale
 
 __all__ = [
     "LBFGSB",

@@ -13,16 +13,22 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_has_values
 from jeit.forward import ForwardModel
-from jeit.forward.assembly import check_conductivity
 from jeit.forward.model import channel_voltages, evaluate, fields_and_impedance_of, jacobian_blocks, voltages_of
+from jeit.forward.system import check_conductivity
 from jeit.inverse.channels import Data
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
-from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
-from jeit.inverse.nonlinear.problem import Inversion, independent_data, informed
+from jeit.inverse.nonlinear.problem import (
+    Inversion,
+    check_background,
+    check_frame,
+    check_noise,
+    independent_data,
+    informed,
+)
 from jeit.inverse.nonlinear.solvers import LBFGSB, SOLVERS, AbstractSolver, GaussNewton, as_solver
-from jeit.inverse.prior.defaults import PRIOR
+from jeit.inverse.prior.matern import PRIOR
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status

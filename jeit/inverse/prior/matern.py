@@ -1,4 +1,4 @@
-"""Matérn fields: smooth images whose length scale comes from solving a differential equation on the mesh.
+"""The Matérn prior, and priors by name.
 
 (κ² - Δ) x = white noise has, in all of space, the Matérn correlation of smoothness ν = 2 - d / 2,
 
@@ -12,6 +12,7 @@ of that off (Roininen, Huttunen and Lasanen, Inverse Probl. Imaging 8 (2014) 561
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from jaxtyping import Float
 from jeit.arguments import check_has_values
 from jeit.inverse.prior.bases import DenseBasis
 from jeit.inverse.prior.nodal import NodalSystem, Solve, by_columns
-from jeit.inverse.prior.priors import AbstractPrior, informed_shapes
+from jeit.inverse.prior.priors import AbstractPrior, Gaussian, Laplace, Noser, Tikhonov, informed_shapes
 from jeit.mesh import Mesh, gradients, measures
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, host, on_host
@@ -132,3 +133,29 @@ def _fields(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n
         return solve(np.diag(np.sqrt(mass)))
     noise = np.random.default_rng(0).standard_normal((len(mass), _FIELDS)) / np.sqrt(_FIELDS)
     return solve(np.sqrt(mass)[:, None] * noise)
+
+
+PRIOR = Noser()
+"""Of `one_step` and `reconstruct`: needs no length, and serves where nothing is known of a body."""
+MEASURED = "gaussian"
+"""Of images of measured data, in `PRIORS`; streams take it too."""
+
+
+def smooth_prior(size: float) -> Gaussian:
+    """The smooth prior that worked on measured tanks and skins, for a body of this size: its longer side, metres."""
+    return Gaussian(0.085 * size)
+
+
+def _matern(size: float) -> AbstractPrior:
+
+    return Matern(smooth_prior(size).length)
+
+
+PRIORS: dict[str, Callable[[float], AbstractPrior]] = {
+    "tikhonov": lambda size: Tikhonov(),
+    "laplace": lambda size: Laplace(),
+    "noser": lambda size: Noser(),
+    "gaussian": smooth_prior,
+    "matern": _matern,
+}
+"""Quadratic priors by name, made for a body of a given size: its longer side, metres."""

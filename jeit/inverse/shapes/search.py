@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_has_values, check_kind, describe, is_number
 from jeit.forward import ForwardModel
-from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
-from jeit.inverse.nonlinear.problem import independent_data
+from jeit.inverse.nonlinear.problem import check_background, check_frame, check_noise, independent_data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
 from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids, alternatives, contrast_deviations

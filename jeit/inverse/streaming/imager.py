@@ -23,12 +23,11 @@ from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
 from jeit.inverse.hyperparameter.rules import Rule
-from jeit.inverse.nonlinear.checks import check_background, check_frame, check_noise
 from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
-from jeit.inverse.nonlinear.problem import Inversion, informed
+from jeit.inverse.nonlinear.problem import Inversion, check_background, check_frame, check_noise, informed
 from jeit.inverse.nonlinear.reconstruct import pose
 from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solver, expand, residual
-from jeit.inverse.prior.defaults import smooth_prior
+from jeit.inverse.prior.matern import smooth_prior
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit_solvers.engines import as_array
 

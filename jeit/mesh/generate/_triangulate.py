@@ -1,4 +1,4 @@
-"""Triangulate any outline with cells of a wanted size (NumPy and SciPy; deterministic).
+"""Triangulation of points by the Delaunay criterion, repair of slivers, and outlines kept as edges.
 
 The steps:
 
@@ -11,21 +11,291 @@ The steps:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.spatial import Delaunay, KDTree
 
-from jeit.mesh.generate import _repair
-from jeit.mesh.generate._delaunay import (
-    Front,
-    circumcircles,
-    clear_of_outline,
-    doubled_areas,
-    select_apart,
-    smallest_angles,
-    triangulate,
-)
-from jeit.mesh.generate.curve import Curve, Size, divide
+from jeit.mesh.generate.curve import Curve, Size, divide, within
+
+
+@dataclass
+class Front:
+    """Working state of the generator: nodes on every curve by arc length, fixed and free nodes inside.
+
+    `guards[k]` holds the arc lengths on curve k of sharp corners, whose two sides are not to be divided.
+    """
+
+    curves: list[Curve]
+    stops: list[np.ndarray]
+    guards: list[np.ndarray]
+    fixed: np.ndarray
+    free: np.ndarray
+
+    @property
+    def num_outline(self) -> int:
+        """Number of nodes on the outline."""
+        return sum(len(stops) for stops in self.stops)
+
+    @property
+    def num_held(self) -> int:
+        """Number of nodes that may not move: those on the outline and the fixed ones."""
+        return self.num_outline + len(self.fixed)
+
+    def points(self) -> np.ndarray:
+        """All nodes (n, 2): curve after curve, then fixed, then free ones."""
+        on_curves = [curve.at(stops) for curve, stops in zip(self.curves, self.stops, strict=True)]
+        return np.concatenate([*on_curves, self.fixed, self.free])
+
+    def segments(self) -> np.ndarray:
+        """Outline segments as node pairs (s, 2), in the order of the nodes they start at."""
+        pieces, offset = [], 0
+        for stops in self.stops:
+            index = np.arange(offset, offset + len(stops))
+            pieces.append(np.stack([index, np.roll(index, -1)], axis=1))
+            offset += len(stops)
+        return np.concatenate(pieces)
+
+    def guarded(self) -> np.ndarray:
+        """True for the nodes on the outline that are sharp corners, (num_outline,)."""
+        return np.concatenate([np.isin(s, g) for s, g in zip(self.stops, self.guards, strict=True)])
+
+    def divide(self, chosen: np.ndarray) -> None:
+        """Put a node in the middle of the chosen outline segments (indices)."""
+        offset = 0
+        for k, stops in enumerate(self.stops):
+            mine = chosen[(chosen >= offset) & (chosen < offset + len(stops))] - offset
+            length = self.curves[k].length
+            following = np.append(stops[1:], stops[0] + length)
+            self.stops[k] = np.sort(np.concatenate([stops, (0.5 * (stops + following))[mine] % length]))
+            offset += len(stops)
+
+
+def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
+    """Delaunay triangles (m, 3), counter-clockwise, that lie inside the outline."""
+    outline = points[: front.num_outline]
+    # Far nodes around the domain keep the outline off the hull, where collinear nodes make slivers.
+    reach = np.ptp(outline, axis=0).max()
+    angle = 2 * np.pi * (np.arange(16) + 0.37) / 16
+    far = outline.mean(axis=0) + 4 * reach * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    cells = Delaunay(np.concatenate([points, far])).simplices
+    cells = cells[(cells < len(points)).all(axis=1)]
+    # A cell with a node inside the domain is inside; only those spanned by the outline need a test.
+    doubtful = np.flatnonzero((cells < front.num_outline).all(axis=1))
+    keep = np.ones(len(cells), bool)
+    keep[doubtful] = within(front.curves, points[cells[doubtful]].mean(axis=1))
+    cells = cells[keep]
+    clockwise = doubled_areas(points, cells) < 0
+    cells[clockwise] = cells[clockwise][:, [0, 2, 1]]
+    return cells
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross product of plane vectors (…, 2)."""
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+def doubled_areas(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Twice the signed area (m,) of the triangles."""
+    corners = points[cells]
+    return cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def circumcircles(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (m, 2) and radii (m,) of the circumscribed circles."""
+    a = points[cells[:, 0]]
+    b, c = points[cells[:, 1]] - a, points[cells[:, 2]] - a
+    area = 2 * cross(b, c)
+    area = np.where(np.abs(area) < 1e-300, 1e-300, area)
+    bb, cc = (b**2).sum(1), (c**2).sum(1)
+    centre = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / area[:, None]
+    return a + centre, np.linalg.norm(centre, axis=1)
+
+
+def smallest_angles(corners: np.ndarray) -> np.ndarray:
+    """Smallest angle (…) in degrees of triangles (…, 3, 2); negative where they are clockwise."""
+    edges = np.roll(corners, -1, axis=-2) - corners
+    length = np.sort(np.sqrt((edges**2).sum(-1)), axis=-1)
+    area = cross(edges[..., 0, :], edges[..., 1, :])
+    # sin of the angle opposite the shortest side; that angle is below 90°, so the arcsine is the angle.
+    sine = area / np.maximum(length[..., 1] * length[..., 2], 1e-300)
+    return np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
+
+
+def select_apart(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -> np.ndarray:
+    """Indices of points taken greedily by falling `priority`, none within `radius` of one taken before."""
+    order = np.argsort(-priority, kind="stable")
+    near = KDTree(points[order]).query_ball_point(points[order], radius[order], return_sorted=False)
+    taken = np.zeros(len(points), bool)
+    blocked = np.zeros(len(points), bool)
+    for index, others in enumerate(near):
+        if not blocked[index]:
+            taken[index] = True
+            blocked[others] = True
+    return order[taken]
+
+
+def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
+    """True for `points` that lie inside the outline and farther than `gap` from it; `nodes` as in the front."""
+    if not len(points):
+        return np.zeros(0, bool)
+    segments = front.segments()
+    start, end = nodes[segments[:, 0]], nodes[segments[:, 1]]
+    tree = KDTree(0.5 * (start + end))
+    _, nearest = tree.query(points, k=min(3, len(segments)))
+    apart = np.full(len(points), np.inf)
+    for column in nearest.reshape(len(points), -1).T:
+        along, offset = end[column] - start[column], points - start[column]
+        fraction = np.clip((offset * along).sum(1) / (along**2).sum(1), 0.0, 1.0)
+        apart = np.minimum(apart, np.linalg.norm(offset - fraction[:, None] * along, axis=1))
+    clear = apart > gap
+    clear[clear] = within(front.curves, points[clear])
+    return clear
+
+
+# Degrees. What is asked of the repair is a little more than what is promised.
+PROMISED_ANGLE = 25.0
+_REPAIR_ANGLE = 25.5
+_POLISH_ANGLE = 31.0
+_ROUNDS = 120
+
+_ANGLES = 2 * np.pi * np.arange(8) / 8
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+_STEPS = np.concatenate([length * _DIRECTIONS for length in (0.02, 0.06, 0.15, 0.3)])
+
+
+def improvable(front: Front, cells: np.ndarray) -> np.ndarray:
+    """True for cells not cut off by a sharp corner of the outline, whose shape is given."""
+    sharp = np.zeros(cells.max() + 1, bool)
+    sharp[: front.num_outline] = front.guarded()
+    return np.logical_not(sharp[cells].any(axis=1))
+
+
+def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.ndarray:
+    """Indices of outline segments that are not an edge of any cell."""
+    edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]]).astype(np.int64)
+    segments = front.segments().astype(np.int64)
+    present = np.isin(segments[:, 0] * num_points + segments[:, 1], edges[:, 0] * num_points + edges[:, 1])
+    return np.flatnonzero(~present)
+
+
+def polish(front: Front, passes: int = 4) -> None:
+    """Move the free nodes of the worst cells to where the smallest angle around them is largest.
+
+    Every node tries steps in eight directions, which raises the least angle without needing its gradient
+    (it has none where two cells tie).
+    """
+    held = front.num_held
+    for _ in range(passes):
+        points = front.points()
+        cells = triangulate(front, points)
+        angle = smallest_angles(points[cells])
+        bad = np.flatnonzero((angle < _POLISH_ANGLE) & improvable(front, cells))
+        movable = np.unique(cells[bad])
+        movable = movable[movable >= held]
+        if not movable.size:
+            return
+        order = np.argsort(cells.ravel(), kind="stable")
+        bounds = np.searchsorted(cells.ravel()[order], np.arange(len(points) + 1))
+        moved = False
+        for node in movable.tolist():
+            star = order[bounds[node] : bounds[node + 1]]
+            corner = star % 3
+            around = cells[star // 3]
+            second = points[around[np.arange(len(star)), (corner + 1) % 3]]
+            third = points[around[np.arange(len(star)), (corner + 2) % 3]]
+            reach = np.linalg.norm(second - points[node], axis=1).mean()
+            places = points[node] + np.concatenate([np.zeros((1, 2)), reach * _STEPS])
+            shape = (len(places), len(star), 2)
+            corners = np.stack(
+                [
+                    np.broadcast_to(places[:, None], shape),
+                    np.broadcast_to(second, shape),
+                    np.broadcast_to(third, shape),
+                ],
+                axis=2,
+            )
+            worst = smallest_angles(corners).min(axis=1)
+            best = int(np.argmax(worst))
+            if worst[best] > worst[0] + 1e-3:
+                points[node] = places[best]
+                moved = True
+        front.free = points[held:]
+        if not moved:
+            return
+
+
+def repair(front: Front) -> bool:
+    """Insert nodes until the outline is there and every cell meets the angle asked; False if it does not end.
+
+    J. Ruppert, J. Algorithms 18 (1995) 548: a bad cell gets a node at its circumcentre, unless that comes too
+    close to an outline segment, which is halved instead. Many are done at a time, apart from each other.
+    """
+    for round_number in range(_ROUNDS):
+        points = front.points()
+        cells = triangulate(front, points)
+        missing = missing_segments(front, cells, len(points))
+        if missing.size:
+            _recover(front, points, missing, remove=round_number < 10)
+            continue
+        angle = smallest_angles(points[cells])
+        bad = np.flatnonzero((angle < _REPAIR_ANGLE) & improvable(front, cells))
+        if not bad.size:
+            return True
+        _refine(front, points, cells[bad], angle[bad])
+        if round_number % 3 == 2:
+            polish(front, passes=2)
+    return False
+
+
+def _diametral(front: Front, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    ends = points[front.segments()]
+    return ends.mean(axis=1), 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+
+
+def _divisible(front: Front) -> np.ndarray:
+    """True for outline segments that do not end in a sharp corner."""
+    return np.logical_not(front.guarded()[front.segments()].any(axis=1))
+
+
+def _recover(front: Front, points: np.ndarray, missing: np.ndarray, *, remove: bool) -> None:
+    """Make missing segments appear: remove the free nodes close to them, or else halve them."""
+    middle, half = _diametral(front, points)
+    if remove and len(front.free):
+        near = KDTree(front.free).query_ball_point(middle[missing], half[missing])
+        doomed = np.unique(np.concatenate([np.asarray(n, dtype=int) for n in near]))
+        if doomed.size:
+            front.free = np.delete(front.free, doomed, axis=0)
+            return
+    divisible = _divisible(front)[missing]
+    front.divide(missing[divisible])
+
+
+def _refine(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray) -> None:
+    centre, radius = circumcircles(points, bad)
+    chosen = select_apart(centre, radius, -angle)
+    centre = centre[chosen]
+    middle, half = _diametral(front, points)
+    divisible = _divisible(front)
+    # A segment is encroached upon if the new node falls into the circle over it.
+    near = KDTree(centre).query_ball_point(middle, half * (1 - 1e-9))
+    encroached = np.array([len(n) > 0 for n in near])
+    spoilt = np.zeros(len(centre), bool)
+    for index in np.flatnonzero(encroached):
+        spoilt[near[index]] = True
+    outside = ~within(front.curves, centre)
+    lost = np.flatnonzero(outside & ~spoilt)
+    if lost.size:
+        encroached[KDTree(middle).query(centre[lost])[1]] = True
+    accepted = centre[~spoilt & ~outside]
+    if len(accepted):
+        accepted = accepted[clear_of_outline(front, points, accepted, np.zeros(len(accepted)))]
+    halved = np.flatnonzero(encroached & divisible)
+    front.free = np.concatenate([front.free, accepted])
+    front.divide(halved)
+
 
 # Largest circumradius per wanted cell size: makes the mean edge equal the size (an equilateral cell has 0.577).
 _FILLING = 0.74
@@ -108,13 +378,13 @@ def generate(
             front = outline_nodes(curves, stops, fixed, size, guard)
             fill(front, size)
         smooth(front, size)
-        _repair.polish(front)
-        done = _repair.repair(front)
-        _repair.polish(front, passes=1)
+        polish(front)
+        done = repair(front)
+        polish(front, passes=1)
         points = front.points()
         cells = triangulate(front, points)
         angle = smallest_angles(points[cells])
-        if done and angle[_repair.improvable(front, cells)].min(initial=90.0) >= _repair.PROMISED_ANGLE:
+        if done and angle[improvable(front, cells)].min(initial=90.0) >= PROMISED_ANGLE:
             return order_nodes(points, cells)
         front = None
     raise ValueError(

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from jeit.mesh import loops
+from jeit.mesh import topology
 
 Size = Callable[[np.ndarray], np.ndarray]
 
@@ -71,7 +71,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
     def distance(points: np.ndarray) -> np.ndarray:
         result = np.full(len(points), np.inf)
         for start, end in pairwise(closed):
-            result = np.minimum(result, loops.distance(points, start[None], end[None])[:, 0])
+            result = np.minimum(result, topology.distance(points, start[None], end[None])[:, 0])
         return result
 
     forward = np.roll(vertices, -1, axis=0) - vertices
@@ -82,7 +82,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
     return Curve(
         length=float(stops[-1]),
         at=at,
-        inside=lambda points: loops.inside(points, [vertices]),
+        inside=lambda points: topology.inside(points, [vertices]),
         distance=distance,
         corners=stops[:-1],
         angles=np.mod(angles, 2 * np.pi),

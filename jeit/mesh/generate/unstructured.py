@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jeit.arguments import check_metres
-from jeit.mesh import loops
+from jeit.mesh import topology
 from jeit.mesh.generate import _triangulate
-from jeit.mesh.generate._delaunay import Front, doubled_areas, triangulate
+from jeit.mesh.generate._triangulate import Front, doubled_areas, triangulate
 from jeit.mesh.generate.curve import Curve, Size, within
 from jeit.mesh.generate.refine import Refinement, SizeField, TooFewNodes
 from jeit.mesh.mesh import Mesh
@@ -176,7 +176,7 @@ def _room(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tu
         for k, (start, end) in enumerate(pairwise(np.concatenate([chain, chain[:1]]))):
             if count < 2 or (start == end).all():
                 continue
-            apart = loops.distance(held, start[None], end[None])[:, 0]
+            apart = topology.distance(held, start[None], end[None])[:, 0]
             apart[[offset + k, offset + (k + 1) % count]] = np.inf
             spacing = np.minimum(spacing, np.where(apart > 0, apart, np.inf))
         offset += count

@@ -1,21 +1,46 @@
-"""`Domain`, the base of all outlines in metres, and what all of them check."""
+"""Bodies, which can be meshed, and domains: bodies bounded by an outline."""
 
 from __future__ import annotations
 
 import abc
 from typing import Any, Protocol
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.arguments import describe
-from jeit.mesh.body import Body
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.sizes import warn_large
 from jeit_solvers.engines import has_values
+
+
+class Body(eqx.Module):
+    """Base of all bodies: plane outlines (`Domain`), solids above one (`Solid`), and meshes of your own (`OwnMesh`)."""
+
+    @property
+    @abc.abstractmethod
+    def extent(self) -> tuple[float, float, float, float]:
+        """Bounding box seen from above, (x_min, x_max, y_min, y_max) in metres."""
+
+    @abc.abstractmethod
+    def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
+        """Vertices (k, 2) in metres of the edges of a plane body, the outer one first; none of a solid."""
+
+    @abc.abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """The name of the "shape" and its sizes, lengths in metres, in words that JSON and TOML have."""
+
+    @abc.abstractmethod
+    def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
+        """A mesh of it with `num_points` nodes or of `cell_size` metres, finer where `refine` asks, seen from above.
+
+        Raises `ValueError` on bad or contradicting arguments.
+        """
+
 
 # Greatest distance of an outline from the origin, over its size: ten digits of its shape are left there.
 _FARTHEST = 1e6

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jeit.mesh import loops
+from jeit.mesh import topology
 from jeit.mesh.generate.curve import closed_line
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.generate.unstructured import Target, mesh_within
@@ -37,9 +37,9 @@ class Polygon(Domain):
             self.vertices = jnp.asarray(vertices)
             self.holes = tuple(jnp.asarray(hole) for hole in holes)
             return
-        outer = loops.check_loop(vertices, "vertices", clockwise=False)
-        inner = [loops.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
-        loops.check_apart(outer, inner)
+        outer = topology.check_loop(vertices, "vertices", clockwise=False)
+        inner = [topology.check_loop(hole, f"holes[{k}]", clockwise=True) for k, hole in enumerate(holes)]
+        topology.check_apart(outer, inner)
         check_near_origin("vertices", outer, np.ptp(outer, axis=0).max())
         warn_large(float(np.ptp(outer, axis=0).max()), "vertices")
         self.vertices = as_array(outer)

@@ -2,7 +2,7 @@
 
 `loops` holds the vertices (k, 2) in metres of each, first not repeated: the outer one counter-clockwise, holes
 clockwise. Distances are worked out by NumPy where all values are known, for JAX would compile anew for every number of
-points. For checks of loops see `jeit.mesh.loops`.
+points. For checks of loops see `jeit.mesh.topology`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jeit.mesh.loops import inside as enclosed
 from jeit.mesh.outline.domain import numerics
+from jeit.mesh.topology import inside as enclosed
 from jeit_solvers.engines import either_engine, namespace
 
 Loop = Float[Array, "k 2"]

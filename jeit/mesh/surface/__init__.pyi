@@ -1,7 +1,5 @@
-from .bending import bend, node_normals, surface_of
-from .shells import shell
-from .sleeves import forearm, tube
-from .spheres import cap, sphere
+from .shells import bend, node_normals, shell, surface_of
+from .sleeves import cap, forearm, sphere, tube
 
 __all__ = [
     "bend",

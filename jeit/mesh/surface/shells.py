@@ -1,17 +1,216 @@
-"""`shell`: a skin of some thickness on any surface."""
+"""Shells: sheets with a thickness, flat, tubular or bent."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
 
-from jeit.mesh._crossings import first_crossing
-from jeit.mesh._topology import odd_permutation
+from jeit.arguments import check_name, describe
+from jeit.mesh._surface import first_crossing
 from jeit.mesh.generate import unstructured
+from jeit.mesh.geometry import normals
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import check_length
+from jeit.mesh.sizes import size_checked
 from jeit.mesh.solids import stacked_cells, stacked_wall
-from jeit.mesh.surface.bending import node_normals
+from jeit.mesh.topology import odd_permutation
+
+
+def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
+    """The boundary triangles of a solid, those of one `tag` or all, as a surface in space that faces outward.
+
+    Raises `ValueError` for a mesh that is no solid, for a tag that it does not have, and where the triangles are no
+    surface, as those of a shell are not: it has two, 'inner' and 'outer'.
+    """
+    if mesh.dimension != 3:
+        raise ValueError("mesh: only solids have a boundary surface; this one consists of triangles.")
+    facets = np.asarray(mesh.facets)
+    if tag is not None:
+        check_name("tag", tag, mesh.tags)
+        facets = facets[np.asarray(mesh.tags[tag])]
+    used, cells = np.unique(facets, return_inverse=True)
+    with size_checked():
+        return Mesh.create(np.asarray(mesh.points)[used], cells.reshape(facets.shape))
+
+
+# Cosine of the angle between triangles at a node beyond which there is an edge, which is not smoothed.
+_CREASE = np.cos(np.radians(50.0))
+# Number of coefficients of the quadratic form fitted to neighbours, and how well they must determine it.
+_TERMS, _LEAST = 5, 1e-6
+
+
+def node_normals(mesh: Mesh) -> np.ndarray:
+    """Unit normals (n, 3) at the nodes of a surface in space.
+
+    That of a quadratic surface through the neighbours of each node and theirs, to the second order of the cell size on
+    a smooth surface, up to its edge; at creases, and where neighbours are few, the mean of the triangles' normals
+    weighted with their angles. NumPy; not differentiated. Raises `ValueError` for a solid.
+    """
+    points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+    facing = np.asarray(normals(mesh))
+    if not mesh.is_surface:
+        return np.broadcast_to(facing[:1], (mesh.num_points, 3)).copy()
+    corners = points[cells]
+    before, after = np.roll(corners, 1, axis=1) - corners, np.roll(corners, -1, axis=1) - corners
+    lengths = np.linalg.norm(before, axis=2) * np.linalg.norm(after, axis=2)
+    angle = np.arccos(np.clip((before * after).sum(axis=2) / lengths, -1, 1))
+    mean = np.zeros_like(points)
+    np.add.at(mean, cells, angle[..., None] * facing[:, None])
+    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+    least = np.ones(len(points))
+    np.minimum.at(least, cells, (mean[cells] * facing[:, None]).sum(axis=2))
+    slope, determined = _slopes(points, cells, mean)
+    smooth = (least > _CREASE) & determined
+    fitted = mean - np.where(smooth[:, None], slope, 0)
+    return fitted / np.linalg.norm(fitted, axis=1, keepdims=True)
+
+
+def _slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes (n, 3) at each node of a quadratic surface through its neighbours and theirs, as a height over the plane
+    across `normal`; and whether there are enough of them."""
+    count = len(points)
+    pairs = np.concatenate([cells[:, [a, b]] for a in range(3) for b in range(3)])
+    near = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)).tocsr()
+    within_two = coo_array(near @ near)
+    one, other = within_two.row, within_two.col
+    apart = one != other
+    one, other = one[apart], other[apart]
+    helper = np.eye(3)[np.abs(normal).argmin(axis=1)]
+    across = np.cross(normal, helper)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    axes = np.stack([across, np.cross(normal, across), normal], axis=1)  # (n, 3, 3)
+    offset = np.einsum("pij,pj->pi", axes[one], points[other] - points[one])
+    scale = np.sqrt(np.bincount(one, (offset**2).sum(axis=1), count) / np.bincount(one, minlength=count))
+    u, v, height = (offset / scale[one][:, None]).T
+    terms = np.stack([u, v, u * u / 2, u * v, v * v / 2], axis=1)
+    matrix, right = np.zeros((count, _TERMS, _TERMS)), np.zeros((count, _TERMS))
+    for k in range(_TERMS):
+        right[:, k] = np.bincount(one, terms[:, k] * height, count)
+        for j in range(_TERMS):
+            matrix[:, k, j] = np.bincount(one, terms[:, k] * terms[:, j], count)
+    values = np.linalg.eigvalsh(matrix)
+    determined = values[:, 0] > _LEAST * values[:, -1]
+    matrix[~determined] = np.eye(_TERMS)
+    found = np.linalg.solve(matrix, right[..., None])[:, :2, 0]
+    return np.einsum("ni,nij->nj", found, axes[:, :2]), determined
+
+
+# A fold is moved onto a node within this share of the distance of folds, for cells would be cut into slivers.
+_ONTO = 0.1
+# Nodes within this share of the sheet's width of a line are on it.
+_ON = 1e-12
+
+
+def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = None) -> Mesh:
+    """A flat sheet, rolled round a cylinder of `radius` metres that touches it from below along its middle.
+
+    Paper bends without stretching, and so does this: the sheet is folded along straight lines, parallel to the
+    cylinder's `axis` ("x" or "y"), and stays flat between them. Every length on it stays what it was, and so do all
+    voltages. Folds run along the rows of nodes where the mesh has such rows (`jeit.mesh.rectangle` has, for axis "x");
+    else there are `num_folds` strips, about one for each cell across, and cells are cut where folds pass through them:
+    `bend(mesh, numpy.inf)` is the flat sheet with the same cells. Fold lines lie on the cylinder. The upper side is the
+    outer one; a negative `radius` bends the sheet upward. Tags stay.
+
+    Raises `ValueError` for what is no flat sheet, a radius of zero, and a sheet so wide that it would overlap itself.
+    """
+    if mesh.dimension != 2 or mesh.is_surface:
+        raise ValueError("mesh: only a flat (2-D) sheet bends without stretching; this one is not flat.")
+    if axis not in ("x", "y"):
+        raise ValueError(f"axis: the cylinder's axis is 'x' or 'y', not {describe(axis)}.")
+    if isinstance(radius, bool) or not isinstance(radius, float | int | np.floating) or not abs(radius) > 0:
+        raise ValueError(f"radius: expected a length in metres that is not zero, got {describe(radius)}.")
+    if num_folds is not None and (isinstance(num_folds, bool) or not isinstance(num_folds, int) or num_folds < 1):
+        raise ValueError(f"num_folds: expected a whole number of at least 1, got {describe(num_folds)}.")
+    across = 0 if axis == "y" else 1
+    points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
+    folds = _folds(points[:, across], points[cells], across, num_folds)
+    edges = {name: np.asarray(mesh.facets)[np.asarray(index)] for name, index in mesh.tags.items()}
+    for line in folds[1:-1]:
+        points, cells, edges = _cut(points, cells, edges, points[:, across] - line)
+    out, up = _rolled(points[:, across], folds, float(radius))
+    columns = [out, points[:, 1], up] if across == 0 else [points[:, 0], out, up]
+    return Mesh.create(np.stack(columns, axis=1), cells, tags=edges)
+
+
+def _folds(places: np.ndarray, corners: np.ndarray, across: int, num_folds: int | None) -> np.ndarray:
+    """Places where the sheet is folded, from one side to the other, both included."""
+    width = np.ptp(places)
+    ordered = np.sort(places)
+    rows = ordered[np.concatenate([[True], np.diff(ordered) > _ON * width])]
+    own = corners[..., across]
+    low, high = (np.searchsorted(rows, side - _ON * width) for side in (own.min(axis=1), own.max(axis=1)))
+    if num_folds is None and (high - low <= 1).all():
+        return rows
+    edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
+    lines = np.linspace(rows[0], rows[-1], 1 + (num_folds or max(1, round(width / edge))))
+    nearest = ordered[np.abs(ordered - lines[:, None]).argmin(axis=1)]
+    near = np.abs(nearest - lines) < _ONTO * (lines[1] - lines[0])
+    return np.where(near, nearest, lines)
+
+
+def _cut(
+    points: np.ndarray, cells: np.ndarray, edges: dict[str, np.ndarray], height: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Points, cells and named edges after all are cut along a line; `height` (n,), distances of the nodes from it."""
+    side = np.where(np.abs(height) <= _ON * np.ptp(height), 0, np.sign(height)).astype(int)
+    sides = side[cells]
+    crossed = (sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)
+    if not crossed.any():
+        return points, cells, edges
+    pairs = np.sort(cells[crossed][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    pairs = np.unique(pairs[side[pairs].prod(axis=1) < 0], axis=0)
+    share = (height[pairs[:, 0]] / (height[pairs[:, 0]] - height[pairs[:, 1]]))[:, None]
+    middles = {(a, b): len(points) + k for k, (a, b) in enumerate(map(tuple, pairs.tolist()))}
+    points = np.concatenate([points, (1 - share) * points[pairs[:, 0]] + share * points[pairs[:, 1]]])
+
+    def middle(a: int, b: int) -> int:
+        return middles[min(a, b), max(a, b)]
+
+    pieces = []
+    for corners in cells[crossed].tolist():
+        signs = side[corners].tolist()
+        if 0 in signs:
+            k = signs.index(0)
+            a, b, c = corners[k:] + corners[:k]
+            d = middle(b, c)
+            pieces += [(a, b, d), (a, d, c)]
+        else:
+            k = signs.index(-sum(signs))
+            a, b, c = corners[k:] + corners[:k]
+            d, e = middle(a, b), middle(a, c)
+            pieces.append((a, d, e))
+            shorter = np.linalg.norm(points[d] - points[c]) < np.linalg.norm(points[b] - points[e])
+            pieces += [(d, b, c), (d, c, e)] if shorter else [(d, b, e), (b, c, e)]
+    named = {}
+    for name, ends in edges.items():
+        through = side[ends].prod(axis=1) < 0
+        halves = [[(a, middle(a, b)), (middle(a, b), b)] for a, b in ends[through].tolist()]
+        named[name] = np.concatenate([ends[~through], np.array(halves, int).reshape(-1, 2)])
+    return points, np.concatenate([cells[~crossed], np.array(pieces)]), named
+
+
+def _rolled(places: np.ndarray, folds: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates across and up of places (n,) on the sheet, whose `folds` lie on a circle; the middle stays at 0."""
+    middle = (folds[0] + folds[-1]) / 2
+    if np.isinf(radius):
+        return places - middle, np.zeros_like(places)
+    strips = np.diff(folds)
+    size = abs(radius)
+    too_wide = strips.max() > 2 * size
+    turned = 2 * np.arcsin(np.minimum(strips / (2 * size), 1))
+    if too_wide or turned.sum() >= 2 * np.pi:
+        width = folds[-1] - folds[0]
+        raise ValueError(
+            f"radius: a sheet {width:.4g} m wide would overlap itself on a cylinder of radius {size:.4g} m. It needs "
+            f"more than {width / (2 * np.pi):.4g} m, and finer cells where these are large; a closed sleeve is a "
+            "jeit.mesh.tube."
+        )
+    angle = np.concatenate([[0.0], np.cumsum(turned)])
+    angle -= np.interp(middle, folds, angle)
+    out, up = size * np.sin(angle), size * (np.cos(angle) - 1) * np.sign(radius)
+    return np.interp(places, folds, out), np.interp(places, folds, up)
+
 
 _TAGS = ("inner", "outer", "side")
 # Number of bisections that find the largest thickness.

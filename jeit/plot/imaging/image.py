@@ -1,22 +1,83 @@
-"""Images: conductivity, or its change, on the mesh or on a raster."""
+"""Draw meshes, and images on them: conductivity, its change, complex admittivity, sensitivity."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 from numpy.typing import ArrayLike
 
+from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
+from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster
-from jeit.mesh import Mesh
-from jeit.plot.axes import axes_or_new, bare, draw_scale_bar, extent_of
-from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
+from jeit.mesh import Mesh, check_flat, measures
+from jeit.plot.axes import CHANGE, INK, SOFT, ColourScale, axes_or_new, bare, check_scale, draw_scale_bar, extent_of
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions
-from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline
+
+
+def plot_mesh(
+    mesh: Mesh, electrodes: AbstractElectrodes | None = None, *, title: str | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw a 2-D mesh with its outline, and `electrodes` numbered; of a 3-D mesh its surface, seen from above.
+
+    Raises `ValueError` for what is neither.
+    """
+    check_body(mesh, electrodes)
+    ax = axes_or_new(ax)
+    points = np.asarray(mesh.points)
+    triangles = np.asarray(mesh.cells if mesh.dimension == 2 else mesh.facets)
+    ax.triplot(points[:, 0], points[:, 1], triangles, color=SOFT, linewidth=0.7)
+    if mesh.dimension == 2:
+        draw_outline(mesh, ax)
+    if electrodes is not None:
+        draw_electrodes(mesh, electrodes, ax=ax)
+    extent = extent_of(points)
+    bare(ax, extent)
+    draw_scale_bar(ax, extent)
+    ax.set_title(f"{mesh.num_points:,} nodes, {mesh.num_cells:,} cells" if title is None else title)
+    return ax
+
+
+def check_body(mesh: Mesh, electrodes: AbstractElectrodes | None) -> None:
+    """Raises `ValueError` for what is no mesh, a surface in space, and what are no electrodes, if any are given."""
+    check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
+    check_flat(mesh, "pictures seen from above")
+    if electrodes is not None:
+        check_kind("electrodes", electrodes, AbstractElectrodes, "those of jeit.electrodes, such as BoundaryElectrodes")
+
+
+def draw_outline(mesh: Mesh, ax: Axes) -> None:
+    """The boundary of a 2-D mesh, holes included."""
+    edges = np.asarray(mesh.points)[np.asarray(mesh.facets)]
+    ax.add_collection(LineCollection(list(edges), colors=INK, linewidths=0.9, capstyle="round", zorder=2))
+
+
+def draw_slice_outline(
+    pixels: Float[np.ndarray, "rows columns"], extent: tuple[float, float, float, float], ax: Axes
+) -> None:
+    """The edge of a slice through a solid, sampled on `pixels`, NaN outside it; `extent` in metres."""
+    # A rim of nothing all round, for the edge to be closed where it touches the picture's.
+    shown = np.pad(np.isfinite(pixels).astype(float), 1)
+    width, height = (extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]
+    wider = (extent[0] - width, extent[1] + width, extent[2] - height, extent[3] + height)
+    ax.contour(shown, [0.5], extent=wider, origin="upper", colors=INK, linewidths=0.9, zorder=2)
+
+
+def slice_text(mesh: Mesh, height: float | None = None, what: str = "slice") -> str:
+    """Text of the height of a slice, z = `height` metres or half way up: "slice at z = 20.0 mm"; empty for a plane
+    mesh."""
+    if mesh.dimension == 2:
+        return ""
+    z = np.asarray(mesh.points)[:, 2]
+    return f"{what} at z = {1e3 * ((z.min() + z.max()) / 2 if height is None else height):.1f} mm"
 
 
 def plot_image(
@@ -116,3 +177,73 @@ def _dress(ax: Axes, mesh: Mesh | None, electrodes, inclusions, extent, title: s
     draw_scale_bar(ax, extent)
     if title:
         ax.set_title(title)
+
+
+def plot_admittivity(
+    mesh: Mesh,
+    values: ArrayLike,
+    electrodes: AbstractElectrodes | None = None,
+    *,
+    difference: bool = True,
+    limits: tuple[float | None, float | None] = (None, None),
+    titles: tuple[str, str] = ("Conductivity σ", "Susceptivity ωε"),
+    figure: Figure | None = None,
+    **options: Any,
+) -> tuple[Axes, Axes]:
+    """Draw σ and ωε of complex `values` (m,) or (n,) in two pictures of one figure; S (3-D: S/m).
+
+    `difference`: whether values are changes, centred at zero. `limits`: values at the ends of the two colour bars, the
+    largest magnitude of each part unless given; a part that is much the smaller so shows, and its bar says how small.
+    `figure`: to draw in, a new one unless given. Other options as for `plot_image`. Raises `ValueError` for values that
+    are not complex, and as `plot_image` does.
+    """
+    image: Any = np.asarray(values)
+    if not np.iscomplexobj(image):
+        raise ValueError("values are real; draw them with plot_image.")
+    if figure is None:
+        figure = Figure(figsize=(11.5, 5), layout="constrained")
+    beginning = "Change of " if difference else ""
+    names = [f"{beginning}{name}" for name in ("conductivity σ", "susceptivity ωε")]
+    first, second = (
+        plot_image(
+            mesh,
+            part,
+            electrodes,
+            scale=ColourScale(difference=difference, quantity=name[0].upper() + name[1:], limit=limit),
+            title=title,
+            ax=ax,
+            **options,
+        )
+        for ax, part, name, limit, title in zip(
+            figure.subplots(1, 2), (image.real, image.imag), names, limits, titles, strict=True
+        )
+    )
+    return first, second
+
+
+def plot_sensitivity(
+    model: ForwardModel, conductivity, *, title: str | None = None, height: float | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw ‖∂v/∂σ_e‖ / |e| of every cell, over all channels and relative to the largest, in decibels.
+
+    Divided by the cell's area (3-D: volume), so that it does not show the mesh. `conductivity` as in
+    `model.voltages`, scalar or per cell, in S (3-D: S/m); `height` as in `plot_image`. Raises `ValueError` for a
+    conductivity per node.
+    """
+    jacobian = np.asarray(model.jacobian(conductivity))
+    if jacobian.shape[1] != model.mesh.num_cells:
+        raise ValueError("conductivity: give a scalar or one value per cell, for a sensitivity per cell.")
+    density = np.linalg.norm(jacobian, axis=0) / np.asarray(measures(model.mesh))
+    decibels = 20 * np.log10(np.maximum(density / density.max(), 1e-12))
+    # Beside the ends of electrodes the field is singular: the scale begins where 1 % of the cells are brighter.
+    ceiling = np.quantile(decibels, 0.99)
+    quantity = "Sensitivity per area (dB)" if model.mesh.dimension == 2 else "Sensitivity per volume (dB)"
+    return plot_image(
+        model.mesh,
+        np.minimum(decibels, ceiling) - ceiling,
+        model.electrodes,
+        scale=ColourScale(difference=False, quantity=quantity, unit="", limit=0.0, colour_map="magma"),
+        title=title,
+        height=height,
+        ax=ax,
+    )

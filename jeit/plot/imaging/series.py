@@ -1,25 +1,174 @@
-"""Pictures of image series: the functional image, maps of amplitude and phase, and curves and spectra of regions."""
+"""Draw series of frames: images side by side, and time courses.
+
+Frames of a stream: some side by side on a contact sheet, or one after the other, all on one colour scale.
+
+A frame that was refused has no image: its body is grey, and says so.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from jeit.electrodes import AbstractElectrodes
 from jeit.image import ImageSeries, Oscillation, Raster, amplitude_spectrum
-from jeit.plot.axes import INK, bare, draw_scale_bar, prefixed
-from jeit.plot.colour_scale import ColourScale, FittedScale
+from jeit.mesh import Mesh
+from jeit.plot.axes import (
+    CHANGE,
+    INK,
+    SOFT,
+    ColourScale,
+    FittedScale,
+    bare,
+    check_scale,
+    draw_colour_bar,
+    draw_scale_bar,
+    prefixed,
+)
 from jeit.plot.imaging.electrodes import draw_electrodes
-from jeit.plot.imaging.mesh import check_body, draw_outline, draw_slice_outline, slice_text
+from jeit.plot.imaging.image import check_body, draw_outline, draw_slice_outline, slice_text
 from jeit_solvers.engines import as_array
+
+# Pixels along a side of a picture, and the grey of a body without an image.
+_PIXELS, _GREY = 160, "#dfe2e6"
+SHEET_FRAMES = 12
+"""Default greatest number of frames of a contact sheet."""
+# Refused frames that are named beneath it.
+_NAMED = 6
+
+
+class FrameCount(NamedTuple):
+    """Number of frames of a stream, of which some are drawn: the `number`, how many were `refused`, and the `names` of
+    the first of those."""
+
+    number: int
+    refused: int
+    names: Sequence[str]
+
+
+def chosen_frames(number: int, most: int) -> list[int]:
+    """Numbers of `most` of `number` frames, or of all, evenly apart, the first and the last among them."""
+    return [int(one) for one in np.unique(np.linspace(0, number - 1, min(number, most)).round())]
+
+
+class FramePicture:
+    """One frame at a time on `ax`: `show` draws the next in the place of the last.
+
+    `fitted`: the scale for all frames; `number` the electrodes or not. What is drawn is sampled on a raster, of a solid
+    half way up.
+    """
+
+    def __init__(
+        self,
+        ax: Axes,
+        mesh: Mesh,
+        electrodes: AbstractElectrodes | None,
+        fitted: FittedScale,
+        *,
+        number: bool = True,
+        bar: bool = True,
+    ):
+        self.ax, self.fitted = ax, fitted
+        self.raster = Raster.create(mesh, shape=(_PIXELS, _PIXELS))
+        extent, inside = self.raster.extent, np.asarray(self.raster.cell) >= 0
+        body = np.where(inside, 0.0, np.nan)
+        ax.imshow(body, extent=extent, cmap=ListedColormap([_GREY]), interpolation="nearest", zorder=0)
+        self.drawn = ax.imshow(body, extent=extent, interpolation="nearest", zorder=1, **fitted.keywords)
+        if mesh.dimension == 2:
+            draw_outline(mesh, ax)
+        else:
+            draw_slice_outline(body, extent, ax)
+        if electrodes is not None:
+            draw_electrodes(mesh, electrodes, numbers=number, ax=ax)
+        bare(ax, extent, numbered=number and electrodes is not None)
+        if bar:
+            draw_scale_bar(ax, extent)
+        middle = (extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2
+        style = {"ha": "center", "va": "center", "color": INK, "fontsize": 10, "zorder": 5}
+        self.refused = ax.text(*middle, "refused", **style)  # pyright: ignore[reportArgumentType]
+
+    def show(self, change: Float[np.ndarray, " m"], title: str) -> None:
+        """The change of conductivity of a frame, per cell; of a refused one NaN."""
+        imaged = bool(np.isfinite(change).all())
+        if imaged:
+            self.drawn.set_data(self.fitted.factor * np.asarray(self.raster.sample(as_array(change))))
+        self.drawn.set_visible(imaged)
+        self.refused.set_visible(not imaged)
+        self.ax.set_title(title, fontsize=10)
+
+
+def fit_scale(changes: Float[np.ndarray, "F m"], mesh: Mesh, scale: ColourScale = CHANGE) -> FittedScale:
+    """One scale for all frames that were imaged. Raises `ValueError` where none was."""
+    check_scale(scale)
+    finite = changes[np.isfinite(changes)]
+    if not finite.size:
+        raise ValueError("changes: every frame was refused; there is nothing to draw.")
+    return scale.of(finite, "S" if mesh.dimension == 2 else "S/m")
+
+
+def plot_frames(
+    mesh: Mesh,
+    changes: Float[np.ndarray, "F m"],
+    electrodes: AbstractElectrodes | None = None,
+    *,
+    titles: Sequence[str] | None = None,
+    scale: ColourScale = CHANGE,
+    most: int = SHEET_FRAMES,
+    count: FrameCount | None = None,
+) -> Figure:
+    """A contact sheet of a stream: some of its frames, evenly chosen, on one colour scale, each with its title.
+
+    `changes` (F, m): of conductivity, S (3-D: S/m, drawn half way up), a row of NaN for a frame that was refused, shown
+    as such. `titles`: one a frame, their numbers unless given, from 0. `most`: frames on the sheet. `count`: of all
+    frames, where `changes` are only some. The scale is that of all frames, drawn or not. Raises `ValueError` for
+    changes of another shape, another number of titles than of frames, and where every frame was refused.
+    """
+    check_body(mesh, electrodes)
+    values = np.asarray(changes)
+    if values.ndim != 2 or values.shape[1] != mesh.num_cells or not len(values):
+        raise ValueError(f"changes has shape {values.shape}; give (frames, {mesh.num_cells}), one value for each cell.")
+    said = [f"frame {number}" for number in range(len(values))] if titles is None else list(titles)
+    if len(said) != len(values):
+        raise ValueError(f"titles are {len(said)}, and the frames {len(values)}; give one each.")
+    fitted, chosen = fit_scale(values, mesh, scale), chosen_frames(len(values), most)
+    columns = min(len(chosen), 4)
+    rows = -(-len(chosen) // columns)
+    figure = Figure(figsize=(2.3 * columns + 1.1, 2.5 * rows + 0.3), layout="constrained")
+    places = figure.add_gridspec(rows, columns + 1, width_ratios=[1] * columns + [0.05])
+    pictures = []
+    for place, frame in enumerate(chosen):
+        ax = figure.add_subplot(places[place // columns, place % columns])
+        pictures.append(FramePicture(ax, mesh, electrodes, fitted, number=False, bar=place == 0))
+        pictures[-1].show(values[frame], said[frame])
+    if scale.bar:
+        where = figure.add_subplot(places[:, -1])
+        draw_colour_bar(where, pictures[0].drawn, fitted.label, signed=scale.difference, place=where)
+    if count is None:
+        refused = [title for title, row in zip(said, values, strict=True) if not np.isfinite(row).all()]
+        count = FrameCount(len(values), len(refused), refused)
+    text = _count_text(count, len(chosen), mesh)
+    if text:
+        figure.supxlabel(text, fontsize=9, color=SOFT)
+    return figure
+
+
+def _count_text(count: FrameCount, chosen: int, mesh: Mesh) -> str:
+    """Text about frames that the sheet does not show, and about refused ones."""
+    parts = [] if chosen == count.number else [f"{chosen} of {count.number} frames"]
+    if count.refused:
+        some = ", ".join(count.names[:_NAMED]) + (" …" if count.refused > _NAMED else "")
+        parts.append(f"{count.refused} of {count.number} refused: {some}")
+    return "; ".join([*parts, *filter(None, [slice_text(mesh, what="slices")])])
+
 
 # Share of the largest amplitude below which no phase is drawn; and times its noise.
 _SHARE, _NOISE = 0.15, 3.0
-_PIXELS = 160
 # Frames that a spectrum takes, as `jeit.image.oscillation`.
 _FEWEST = 5
 

@@ -14,12 +14,10 @@ from jeit.electrodes.electrode_shapes import Draped, shapes_of
 from jeit.layout import SurfaceLayout
 from jeit.mesh import measures
 from jeit.mesh.geodesic import Triangles
-from jeit.plot.axes import INK, SERIES_COLOURS, axes_or_new
-from jeit.plot.colour_scale import CHANGE, ColourScale, check_scale
+from jeit.plot.axes import CHANGE, INK, SERIES_COLOURS, ColourScale, axes_or_new, check_scale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
-from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
-from jeit.plot.solid.scene import Scene, bare_in_space
+from jeit.plot.solid.scene import FROM_THE_CORNER, Camera, Scene, bare_in_space
 from jeit.plot.solid.shaded_surface import BODY, checked_values, colours_of, mappable
 
 # Distance by which marks count as nearer than the surface that they are on, over the skin's size.

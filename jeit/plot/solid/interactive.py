@@ -17,8 +17,7 @@ from jeit.arguments.extras import how_to_install, optional
 from jeit.electrodes import AbstractElectrodes, ElectrodeShapes, shapes_of
 from jeit.image import Inclusion
 from jeit.mesh import Mesh
-from jeit.plot.axes import INK
-from jeit.plot.colour_scale import CHANGE, ColourScale
+from jeit.plot.axes import CHANGE, INK, ColourScale
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.isosurfaces import HALF, OUTER, check_drawn, level_surfaces
 from jeit.plot.solid.scene import BODY

@@ -14,11 +14,10 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane
 from jeit.image.plane import AXES
 from jeit.mesh import Mesh, centroids
-from jeit.plot.axes import INK, draw_colour_bar
-from jeit.plot.colour_scale import CHANGE, ColourScale
+from jeit.plot.axes import CHANGE, INK, ColourScale, draw_colour_bar
 from jeit.plot.solid.body import size_of
-from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
 from jeit.plot.solid.isosurfaces import HALF, check_drawn, draw_in_space
+from jeit.plot.solid.scene import FROM_THE_CORNER, Camera
 from jeit.plot.solid.shaded_surface import mappable
 from jeit.plot.solid.slices import cell_values, draw_slice, dress_slice
 

@@ -12,11 +12,9 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
 from jeit.electrodes.electrode_shapes import ElectrodeShapes
-from jeit.plot.axes import axes_or_new
-from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale, check_scale
+from jeit.plot.axes import CHANGE, ColourScale, FittedScale, axes_or_new, check_scale
 from jeit.plot.solid.body import add_electrodes, number_electrodes
-from jeit.plot.solid.camera import FROM_THE_CORNER, Camera
-from jeit.plot.solid.scene import BODY, Scene, bare_in_space
+from jeit.plot.solid.scene import BODY, FROM_THE_CORNER, Camera, Scene, bare_in_space
 
 
 def plot_surface(

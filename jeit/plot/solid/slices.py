@@ -17,12 +17,10 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, cut_by_plane
 from jeit.image.plane import AXES, passed_edges
 from jeit.mesh import Mesh
-from jeit.plot.axes import INK, axes_or_new, draw_colour_bar, draw_scale_bar
-from jeit.plot.colour_scale import CHANGE, ColourScale, FittedScale
+from jeit.plot.axes import CHANGE, INK, ColourScale, FittedScale, axes_or_new, draw_colour_bar, draw_scale_bar
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
-from jeit.plot.solid.isosurfaces import check_drawn
-from jeit.plot.solid.outlines import draw_cut
+from jeit.plot.solid.isosurfaces import check_drawn, draw_cut
 from jeit.plot.solid.scene import draw_axes_cross, draw_number
 
 MOST_SLICES = 64

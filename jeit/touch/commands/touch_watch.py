@@ -50,7 +50,7 @@ def gestures(
     from jeit.cli.console import Steps, pairs, plain_console, say_written
     from jeit.data import GestureSet, load_description
     from jeit.touch import learn_gestures
-    from jeit.touch.reports.gestures import GESTURE_FILES, write_gestures
+    from jeit.touch.reports.touch_watch import GESTURE_FILES, write_gestures
 
     need_extra("learn", "learning gestures")
     make_folder(output, GESTURE_FILES)

@@ -1,6 +1,5 @@
 from .cell_finder import CellFinder
-from .contact import Contact
-from .finder import find_contacts
+from .finder import Contact, find_contacts
 from .image_noise import ImageNoise
 from .load_calibration import Load, LoadCalibration
 from .raster_finder import RasterFinder, RasterStages

@@ -1,19 +1,70 @@
-"""Find contacts on the cells of a mesh: a watershed separates the peaks, a share of each peak bounds its region."""
+"""Detect contacts on a mesh: smoothed images, regions of cells above a level, and their outlines."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
+from scipy.spatial import KDTree
 
+from jeit.arguments import describe, is_number
 from jeit.image.segmentation import basins, shared_facets
 from jeit.mesh import Mesh, centroids, measures
 from jeit.mesh.geodesic import Triangles
-from jeit.touch.contacts.cell_outline import outline_of_cells
-from jeit.touch.contacts.contact import Contact
-from jeit.touch.contacts.finder import AbstractFinder, check_finder, check_share
+from jeit.touch.contacts.finder import AbstractFinder, Contact, check_finder, check_share
 from jeit.touch.contacts.image_noise import ImageNoise
-from jeit.touch.contacts.smoothing import gaussian_means
+
+# Standard deviations beyond which a Gaussian is taken as zero.
+_REACH = 3.0
+# Default length, as a share of the root of the mesh's area.
+_SHARE = 0.03
+
+
+def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
+    """Matrix (m, m) that takes an image to means over the cells round each, by area and a Gaussian.
+
+    `length` is its standard deviation, metres: 3 % of the root of the mesh's area if None; 0 changes nothing. Raises
+    `ValueError` for a length that is none, or as wide as the mesh.
+    """
+    centres, areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
+    widest = float(np.sqrt(areas.sum()))
+    length = _SHARE * widest if length is None else length
+    if not (is_number(length) and 0 <= length < widest):
+        raise ValueError(
+            f"smoothing must be metres, zero or more and less than the skin is wide ({widest:.3g} m); it is "
+            f"{describe(length)}."
+        )
+    if not length:
+        return sparse.csr_array(sparse.diags_array(np.ones(len(areas))))
+    tree = KDTree(centres)
+    near = tree.sparse_distance_matrix(tree, _REACH * length, output_type="coo_matrix")
+    weight = np.exp(-((near.data / length) ** 2) / 2) * areas[near.col]
+    means = sparse.csr_array((weight, (near.row, near.col)), shape=near.shape)
+    return sparse.csr_array(sparse.diags_array(1 / means.sum(axis=1)) @ means)
+
+
+def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c 3"]) -> Float[np.ndarray, "k d"]:
+    """Outline of a set of cells: vertices (k, d), in metres, of the longest loop of its boundary edges.
+
+    Boundary edges belong to one of the `cells` (c, 3) only. Cells have the same orientation, and so have their edges,
+    so that the boundary edges follow one another; where the set touches itself in a node, the loop takes either way.
+    """
+    edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
+    _, which, number = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    onward: dict[int, list[int]] = {}
+    for start, end in edges[number[which] == 1].tolist():
+        onward.setdefault(start, []).append(end)
+    longest: list[int] = []
+    while onward:
+        loop = [next(iter(onward))]
+        while loop[-1] in onward:
+            ends = onward[loop[-1]]
+            last = loop[-1]
+            loop.append(ends.pop())
+            if not ends:
+                del onward[last]
+        longest = max(longest, loop[:-1], key=len)
+    return points[longest]
 
 
 class CellFinder(AbstractFinder):

@@ -1,4 +1,4 @@
-"""The common interface of contact finders, and checks of their arguments."""
+"""Find contacts in images."""
 
 from abc import abstractmethod
 
@@ -9,8 +9,25 @@ from scipy import sparse
 
 from jeit.arguments import check_kind, describe, is_number
 from jeit.mesh import Mesh, check_flat
-from jeit.touch.contacts.contact import Contact
 from jeit.touch.contacts.image_noise import ImageNoise
+
+
+class Contact(eqx.Module):
+    """A contact in an image.
+
+    **Fields**: `centroid` (x, y), metres, on a surface in space (x, y, z); `area`, m², of the region; `peak`, the
+    strongest change in it, in the unit of the image and with its sign; `integral` of the change over the region, that
+    unit times m²; `contour` (k, d), metres, the region's outline, open (the last point is not the first again);
+    `deviation`, metres: the root mean square distance by which noise of the image moves the centroid, to first order
+    (`ImageNoise` describes the noise). It includes neither the blur of the image nor its errors without noise.
+    """
+
+    centroid: Float[np.ndarray, " d"]
+    area: float
+    peak: float
+    integral: float
+    contour: Float[np.ndarray, "k d"]
+    deviation: float
 
 
 class AbstractFinder(eqx.Module):

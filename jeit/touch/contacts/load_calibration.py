@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from jeit.arguments import check_kind, check_metres, describe, real_array
-from jeit.touch.contacts.contact import Contact
+from jeit.touch.contacts.finder import Contact
 
 # Parameters s, b, c and F½, and some degrees of freedom to estimate the goodness of fit.
 _FEWEST = 8

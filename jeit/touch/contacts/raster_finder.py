@@ -19,10 +19,9 @@ from jeit.arguments import describe, is_number
 from jeit.arguments.extras import optional
 from jeit.image import Raster
 from jeit.mesh import Mesh
-from jeit.touch.contacts.contact import Contact
-from jeit.touch.contacts.finder import AbstractFinder, check_finder, checked_image, checked_noise, turned
+from jeit.touch.contacts.cell_finder import gaussian_means
+from jeit.touch.contacts.finder import AbstractFinder, Contact, check_finder, checked_image, checked_noise, turned
 from jeit.touch.contacts.image_noise import ImageNoise
-from jeit.touch.contacts.smoothing import gaussian_means
 
 # Width in pixels of the band along a contact's edge in which cells may join or leave it.
 _EDGE = 15

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from jeit.arguments import check_kind, check_metres, describe, is_number, real_array
-from jeit.touch.contacts.contact import Contact
+from jeit.touch.contacts.finder import Contact
 
 # The share of a contact's prediction error that is added to the velocity: half, which averages the noise of two frames.
 _BELIEVED = 0.5

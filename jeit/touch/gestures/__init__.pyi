@@ -1,7 +1,6 @@
-from .change_course import ChangeCourse, TouchLevel
 from .features import COURSE_FEATURES, FEATURES, TouchFeatures, course_features, touch_features
 from .gesture_model import GestureModel, Gestures
-from .segmentation import StreamTouch, TouchStream, find_touches
+from .segmentation import ChangeCourse, StreamTouch, TouchLevel, TouchStream, find_touches
 
 __all__ = [
     "COURSE_FEATURES",

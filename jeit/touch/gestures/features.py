@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import check_kind
-from jeit.touch.gestures.change_course import ChangeCourse
-from jeit.touch.gestures.segmentation import StreamTouch
+from jeit.touch.gestures.segmentation import ChangeCourse, StreamTouch
 
 # Names and units; "image" stands for that of the images of change: siemens (a sheet's) or S/m.
 FEATURES = {

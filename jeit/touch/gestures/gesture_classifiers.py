@@ -16,9 +16,9 @@ from jeit.touch.gestures.features import (
     sequence_features,
     touch_features,
 )
-from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds
+from jeit.touch.learnt.array_models import Forest
 from jeit.touch.learnt.extras import over_folds
-from jeit.touch.learnt.forest import Forest
+from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 

@@ -13,8 +13,7 @@ from jeit.arguments import check_kind, check_name, counted
 from jeit.data import GestureSet
 from jeit.data.description import Description
 from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, find_touches
-from jeit.touch.gestures.gesture_model import METHODS, check_labels
-from jeit.touch.gestures.reading import Reading
+from jeit.touch.gestures.gesture_model import METHODS, Reading, check_labels
 from jeit.touch.gestures.touch_images import TouchImages
 
 # The greatest number of recordings from which the sign of touches is determined.

@@ -1,4 +1,4 @@
-"""`GestureModel`: predicts the gesture of a touch, its probability, and whether it is unlike the training set."""
+"""A model of gestures: the frames it reads, its features and its classifier."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, check_name
+from jeit.arguments import check_kind, check_name, describe, is_number
 from jeit.arguments.extras import need_extra
 from jeit.touch.gestures.features import course_features
 from jeit.touch.gestures.gesture_classifiers import (
@@ -23,12 +23,62 @@ from jeit.touch.gestures.gesture_classifiers import (
     person_folds,
     random_folds,
 )
-from jeit.touch.gestures.reading import Reading
 from jeit.touch.gestures.segmentation import StreamTouch
 from jeit.touch.learnt.answers import Standing
-from jeit.touch.learnt.classifiers import log_odds, probabilities, sharpness_of
 from jeit.touch.learnt.extras import in_parts
 from jeit.touch.learnt.file import read_plain, write_plain
+from jeit.touch.learnt.methods import log_odds, probabilities, sharpness_of
+
+# A conductivity that differs by this factor is of another skin, or in another unit.
+_OTHER_SKIN = 5.0
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a skin was read.
+
+    **Fields**: the `level` that a touch exceeds, and the `background`, the untouched skin's conductivity, both S;
+    `sign`, 1 where a touch raises conductivity, -1 where it lowers it; the frame `rate`, frames/s; `num_channels`, and
+    the `protocol`'s name.
+    """
+
+    level: float
+    background: float
+    sign: int
+    rate: float
+    num_channels: int
+    protocol: str
+
+    def __post_init__(self):
+        """Raises `ValueError` for levels and rates that are not positive, and what is no sign or number."""
+        for name in ("level", "background", "rate"):
+            if not (is_number(getattr(self, name)) and getattr(self, name) > 0):
+                raise ValueError(f"{name} must be positive; it is {describe(getattr(self, name))}.")
+        if self.sign not in (-1, 1):
+            raise ValueError(f"sign must be 1 or -1; it is {describe(self.sign)}.")
+        if not (isinstance(self.num_channels, int) and self.num_channels > 0):
+            raise ValueError(f"num_channels must be a positive number; it is {describe(self.num_channels)}.")
+
+    def check_same_skin(self, num_channels: int, protocol: str, background: float) -> None:
+        """Raise `ValueError` for frames of another number of channels, by another protocol, or of a skin of another
+        `background`, S."""
+        if num_channels != self.num_channels:
+            raise ValueError(
+                f"gestures were learnt from frames of {self.num_channels} channels, and this skin has {num_channels}: "
+                "learn them on this skin."
+            )
+        if protocol != self.protocol:
+            raise ValueError(
+                f"gestures were learnt from a skin driven by '{self.protocol}', and this one is by '{protocol}': learn "
+                "them on this skin."
+            )
+        ratio = background / self.background
+        if not 1 / _OTHER_SKIN < ratio < _OTHER_SKIN:
+            raise ValueError(
+                f"the untouched skin has {ratio:.3g} times the conductivity of that which gestures were learnt on: is "
+                "it the same, and are voltages in the unit and at the current that its description says?"
+            )
+
 
 METHODS = ("auto", *GESTURE_CLASSIFIERS)
 # The greatest number of folds by which the method is chosen; and the share of touches like those learnt that are

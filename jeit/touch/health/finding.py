@@ -1,4 +1,4 @@
-"""Classify a lasting change: an electrode's fault, a cut, a change unlike a touch, or one that a touch may make too."""
+"""Find what has changed in a skin: faults of electrodes, cuts, or a touch that is held."""
 
 from __future__ import annotations
 
@@ -8,10 +8,71 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.touch.health.cut_path import FittedLoss
-from jeit.touch.health.electrode_faults import faulty_electrodes, kind_of_fault
 from jeit.touch.health.event import EventKind
 from jeit.touch.health.healthy import Healthy
 from jeit.touch.health.imaged_skin import ImagedSkin
+
+# The greatest share of a change's energy, relative to the reference, that the electrodes leave unexplained; the least
+# share of an electrode's channels that have changed, and by what share of their reading; the greatest share of
+# electrodes that may fail at once.
+_LEFT, _OWN, _RELATIVE, _AT_ONCE = 0.1, 0.75, 0.12, 0.25
+# A torn wire reads less than this share of its reference; a loose contact has at least so many times the noise.
+_NOTHING, _WANDERS = 0.2, 5.0
+# Standard deviation of a normal variable over the median magnitude of the difference of two.
+_DEVIATION = 1.0484
+# Relative changes are clipped at this multiple of the reading.
+_MOST = 10.0
+
+
+def faulty_electrodes(
+    change: Float[np.ndarray, " M"], reference: Float[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+) -> list[int]:
+    """Find the electrodes that account for a change from the reference, volts, by themselves.
+
+    Returns their numbers; none if a change of the skin is needed too. `touching` (L, M): the channels that each
+    electrode takes part in.
+    """
+    size = np.sqrt(np.mean(reference[np.isfinite(reference)] ** 2))
+    relative = np.abs(np.nan_to_num(change)) / np.maximum(np.abs(reference), 0.1 * size)
+    relative = np.minimum(relative, _MOST)
+    # A channel with a weak reading does not count as a larger change.
+    energy = np.minimum(np.abs(np.nan_to_num(change)) / size, relative) ** 2
+    total, left, found = energy.sum(), np.ones(len(energy), bool), []
+    while total > 0 and energy[left].sum() > _LEFT * total and len(found) < max(1, _AT_ONCE * len(touching)):
+        own = np.array([energy[left & one].sum() / max(1, (left & one).sum()) ** 0.5 for one in touching])
+        best = int(own.argmax())
+        mine = touching[best] & left
+        if not mine.any() or np.mean(relative[mine] > _RELATIVE) < _OWN:
+            return []
+        found.append(best)
+        left &= ~touching[best]
+    return found if total > 0 and energy[left].sum() <= _LEFT * total else []
+
+
+def kind_of_fault(
+    frames: Float[np.ndarray, "n M"],
+    reference: Float[np.ndarray, " M"],
+    noise: Float[np.ndarray, " M"],
+    own: Bool[np.ndarray, " M"],
+) -> EventKind:
+    """Classify the fault of an electrode with channels `own` (M,) from its latest `frames` (n, M)."""
+    now = frames[:, own]
+    middle = np.nanmedian(now, axis=0)
+    size = np.sqrt(np.mean(reference[own] ** 2))
+    constant = len(middle) > 1 and np.ptp(middle) <= 0.02 * np.abs(middle).max() and np.ptp(reference[own]) > 0.1 * size
+    if constant or np.median(np.abs(middle)) < _NOTHING * np.median(np.abs(reference[own])):
+        return EventKind.TORN
+    # Differences from frame to frame, so that touches do not count.
+    steps = np.diff(now, axis=0)
+    some = np.isfinite(steps).any(axis=0)
+    wander = np.zeros(len(middle))
+    if some.any():
+        wander[some] = _DEVIATION * np.nanmedian(np.abs(steps[:, some]), axis=0)
+    wander /= np.minimum(noise[own], size)
+    if np.median(wander) > _WANDERS and np.median(np.abs(middle)) < _MOST * np.median(np.abs(reference[own])):
+        return EventKind.LOOSE
+    return EventKind.DEAD
+
 
 # The greatest share of a change in an electrode's channels that a cut beside it leaves; a contact leaves more.
 _CUT_BESIDE = 0.1

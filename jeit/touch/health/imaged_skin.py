@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.forward import ForwardModel
-from jeit.forward.assembly import check_conductivity
+from jeit.forward.system import check_conductivity
 from jeit.inverse import one_step
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.mesh import centroids, measures

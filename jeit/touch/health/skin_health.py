@@ -14,11 +14,19 @@ from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit.protocol import Protocol
-from jeit.touch.health.event import EventKind, EventStatus, HealthEvent
+from jeit.touch.health.event import (
+    EventKind,
+    EventStatus,
+    HealthEvent,
+    Step,
+    is_distinct,
+    lasting_step,
+    median,
+    size_of,
+)
 from jeit.touch.health.finding import Change, Finding, findings
 from jeit.touch.health.healthy import Healthy, averaged
 from jeit.touch.health.imaged_skin import ImagedSkin
-from jeit.touch.health.lasting import Step, is_distinct, lasting_step, median, size_of
 
 # Seconds that no touch is held for; the number of windows, where frames have no times.
 PATIENCE, _PATIENCE_WINDOWS = 30.0, 3

@@ -1,9 +1,7 @@
-from .drawing import drawn_map
 from .map_file import read_map, write_map
-from .placed_map import PlacedMap
-from .quality import MapQuality, map_quality
+from .placed_map import PlacedMap, drawn_map
+from .quality import MapQuality, learning_curves, map_quality, time_constant
 from .self_organising_map import SelfOrganisingMap, fit_maps
-from .settling import learning_curves, time_constant
 from .several_touches import MapTouch, neuron_shares, touches_reported
 from .training import Schedule
 

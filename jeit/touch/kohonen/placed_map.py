@@ -1,4 +1,4 @@
-"""`PlacedMap`: a self-organising map whose neurons have places, from which places of frames are estimated."""
+"""A map whose neurons have places or other values, drawn on a skin."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import lsqr
 from scipy.spatial import KDTree
 
-from jeit.arguments import check_kind, real_array
+from jeit.arguments import check_key, check_kind, real_array
+from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
 # The number of neurons that a place is estimated from: those nearest to the frame, or 5 by 5 on the grid about the
@@ -183,3 +184,42 @@ def _combined(own: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"],
     found = np.linalg.solve(gram, apart @ change[..., None])
     left = change - (np.swapaxes(found, 1, 2) @ apart)[:, 0]
     return found[..., 0] + (1 - found.sum(axis=1)) / count, left
+
+
+# Steps of the springs, and the distance of neighbours, relative to the usual one, below which springs grow no stronger.
+_STEPS, _LEAST = 60, 1e-2
+
+
+def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2"]:
+    """Places (R, C, 2) of a map's neurons on paper, from -1 to 1, by Fruchterman and Reingold's springs (1991).
+
+    Each neuron is tied to its four neighbours on the grid, the stronger the nearer its frame is to theirs; all repel
+    each other. They start from their places on the grid, moved a little at random by `key`: which way round the drawing
+    comes out says nothing. Raises `ValueError` for what is no map, and no key.
+    """
+    networkx = optional("networkx", "a map drawn as a graph")
+    import jax
+
+    check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
+    check_key(key)
+    rows, columns = learnt.shape
+    first, second = neighbours(learnt.shape)
+    flat = learnt.weights.reshape(rows * columns, -1)
+    distance = np.linalg.norm(flat[first] - flat[second], axis=1)
+    usual = float(np.median(distance)) or 1.0
+    strength = usual / np.maximum(distance, _LEAST * usual)
+    graph = networkx.Graph()
+    graph.add_nodes_from(range(rows * columns))
+    graph.add_weighted_edges_from(zip(first.tolist(), second.tolist(), strength.tolist(), strict=True))
+    grid = np.stack(np.unravel_index(np.arange(rows * columns), learnt.shape), axis=1) / max(rows, columns)
+    grid = grid + 1e-3 * np.asarray(jax.random.normal(key, grid.shape))
+    start = dict(enumerate(grid))
+    drawn = networkx.spring_layout(graph, pos=start, iterations=_STEPS, method="force", seed=0)
+    return np.array([drawn[one] for one in range(rows * columns)]).reshape(rows, columns, 2)
+
+
+def neighbours(shape: tuple[int, int]) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
+    """Numbers of the neurons, row by row, at both ends of every edge of a grid of this shape."""
+    number = np.arange(shape[0] * shape[1]).reshape(shape)
+    first = np.concatenate([number[:-1].ravel(), number[:, :-1].ravel()])
+    return first, np.concatenate([number[1:].ravel(), number[:, 1:].ravel()])

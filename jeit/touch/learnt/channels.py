@@ -1,4 +1,10 @@
-"""Model the joint variation of channels, to detect dead channels and to predict what they would have read.
+"""Channels of a learnt skin: noise, missing channels filled in, and how unlike all presses a frame is.
+
+Measure how far a frame is from all presses of the training set.
+
+Two touches at once, or one of the opposite sign, are made of the same patterns, but are unlike any recorded press.
+
+Model the joint variation of channels, to detect dead channels and to predict what they would have read.
 
 Changes of a skin's M channels are modelled by the scores of a few patterns and noise, d = s (V z + n), with z and n
 normal. The scores of a frame with missing channels are the most likely ones; a channel is dead if it differs from the
@@ -12,9 +18,47 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
-from jeit.touch.learnt.neighbourhood import Neighbourhood
+# The number of scores used, the greatest number of presses kept, and the share of the usual size that is added to the
+# size that distances are relative to.
+_SCORES, _MOST_KEPT, _SMALL = 8, 4000, 0.5
+_USUAL_QUANTILE = 0.99
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Leading `scores` (N, k) of presses, their usual `size`, and the `usual` distance between neighbours.
+
+    Distances are relative to the size; all but a hundredth of the presses are nearer to their neighbour than `usual`.
+    """
+
+    scores: Float[np.ndarray, "N k"]
+    size: float
+    usual: float
+
+    @classmethod
+    def learn(cls, scores: Float[np.ndarray, "N K"]) -> "Neighbourhood":
+        """Learn from scores of presses (N, K)."""
+        kept = scores[:: -(-len(scores) // _MOST_KEPT), :_SCORES]
+        size = float(np.median(np.linalg.norm(kept, axis=1))) or 1.0
+        found = cls(kept, size, 1.0)
+        apart = found._relative(kept, second=True)
+        return cls(kept, size, max(float(np.quantile(apart, _USUAL_QUANTILE)), 1e-6))
+
+    def __call__(self, scores: Float[np.ndarray, "n K"]) -> Float[np.ndarray, " n"]:
+        """Relative distances (n,) of frames with these scores, 1 at the `usual` distance."""
+        return self._relative(scores[:, :_SCORES]) / self.usual
+
+    def _relative(self, scores: np.ndarray, *, second: bool = False) -> np.ndarray:
+        distance = np.asarray(self._tree.query(scores, 2)[0])[:, int(second)]
+        return distance / (np.linalg.norm(scores, axis=1) + _SMALL * self.size)
+
+    @cached_property
+    def _tree(self) -> KDTree:
+        return KDTree(self.scores)
+
 
 # Share of the variance that patterns leave to noise; the greatest number of patterns; presses required for each.
 _LEFT, _MOST, _PRESSES_EACH = 1e-3, 60, 4
@@ -251,3 +295,30 @@ def _novelty(scores, residual, alive, spread) -> np.ndarray:
     """The greater of the root mean squares of residuals and of scores, each in its own deviations."""
     left = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(alive.sum(axis=1), 1))
     return np.maximum(left, np.sqrt(np.mean((scores / spread) ** 2, axis=1)))
+
+
+def choose_channels(
+    scaled: Float[np.ndarray, "N m"], answers: Float[np.ndarray, "N q"], number: int
+) -> Int[np.ndarray, " n"]:
+    """Select channels by simultaneous orthogonal matching pursuit (Tropp et al. 2006), the most informative first.
+
+    Each explains most of what the previous channels leave unexplained of the answers, by least squares. Products of the
+    answers with one another are explained too, since places are not linear in voltages.
+    """
+    products = [answers[:, i] * answers[:, j] for i in range(answers.shape[1]) for j in range(i + 1)]
+    left = np.column_stack([answers, *(one - one.mean() for one in products[:20])])
+    left = left - left.mean(axis=0)
+    candidates = scaled - scaled.mean(axis=0)
+    first = np.sum(candidates**2, axis=0)
+    chosen: list[int] = []
+    for _ in range(min(number, scaled.shape[1])):
+        size = np.sum(candidates**2, axis=0)
+        gain = np.sum((candidates.T @ left) ** 2, axis=1) / np.where(size > 1e-8 * first, size, np.inf)
+        gain[chosen] = -1
+        best = int(gain.argmax())
+        chosen.append(best)
+        if size[best] > 1e-8 * first[best]:
+            direction = candidates[:, best] / np.sqrt(size[best])
+            left = left - np.outer(direction, direction @ left)
+            candidates = candidates - np.outer(direction, direction @ candidates)
+    return np.array(chosen)

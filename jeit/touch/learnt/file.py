@@ -1,35 +1,77 @@
-"""Read and write learnt skins: arrays and scikit-learn's estimators in skops' format, never a pickle."""
+"""Read and write learnt skins: arrays and estimators of scikit-learn in the format of skops, never a pickle.
+
+Archives of scikit-learn's estimators in skops' format: the same bytes for the same content, and a checksum.
+
+skops numbers objects by their address in memory, and dates its members; here they are numbered in their order, without
+dates. The seal, a checksum, distinguishes a file that was changed from one that jeit wrote; it is no secret.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import re
+import zipfile
 from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from jeit.arguments import describe, listed
 from jeit.arguments.extras import need_extra
 from jeit.files import check_archive, reason, written_whole
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
-from jeit.touch.learnt.channels import Channels
-from jeit.touch.learnt.classifiers import LinearEnsemble, QuadraticDiscriminant
-from jeit.touch.learnt.features import Features
-from jeit.touch.learnt.forest import Forest
-from jeit.touch.learnt.gaussian_process import GaussianProcess
+from jeit.touch.learnt.array_models import Forest, Machine, Nearest
+from jeit.touch.learnt.channels import Channels, Neighbourhood
+from jeit.touch.learnt.features import Features, Whitened
 from jeit.touch.learnt.imaged import Contacts, Imaged, Images
-from jeit.touch.learnt.keys import LearntKeys, Standardised
-from jeit.touch.learnt.labels import LearntLabels
+from jeit.touch.learnt.labels import LearntKeys, LearntLabels, Standardised
 from jeit.touch.learnt.learnt_skin import LearntSkin
-from jeit.touch.learnt.machine import Machine
-from jeit.touch.learnt.nearest import Nearest
-from jeit.touch.learnt.neighbourhood import Neighbourhood
+from jeit.touch.learnt.methods import GaussianProcess, LinearEnsemble, QuadraticDiscriminant
 from jeit.touch.learnt.network import Network
-from jeit.touch.learnt.numbers import LearntNumbers
-from jeit.touch.learnt.sealed_archive import check_seal, write_sealed
-from jeit.touch.learnt.spread import Spread
+from jeit.touch.learnt.numbers import LearntNumbers, Spread
 from jeit.touch.learnt.temporal_network import TemporalNetwork
-from jeit.touch.learnt.whitening import Whitened
+
+_SCHEMA = "schema.json"
+# The number of an object, or the file that is named after it.
+_NUMBER = re.compile(r'("__id__": |"file": ")(\d+)')
+
+
+def write_sealed(content: Any, file: BinaryIO) -> None:
+    """Write arrays, estimators, and lists and dictionaries of them."""
+    from skops.io import dumps
+
+    with zipfile.ZipFile(io.BytesIO(dumps(content))) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    numbers: dict[str, str] = {}
+
+    def numbered(found: re.Match[str]) -> str:
+        return found[1] + numbers.setdefault(found[2], str(len(numbers)))
+
+    schema = _NUMBER.sub(numbered, members.pop(_SCHEMA).decode())
+    named = {f"{numbers[Path(name).stem]}.npy": values for name, values in members.items()}
+    named = {_SCHEMA: schema.encode(), **dict(sorted(named.items()))}
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, values in named.items():
+            archive.writestr(zipfile.ZipInfo(name), values)
+        archive.comment = _seal(named)
+
+
+def check_seal(path: Path) -> None:
+    """Raise `ValueError` for an archive that is not as it was written."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+        if archive.comment != _seal(members):
+            raise ValueError("it was changed since it was written, or an earlier jeit wrote it")
+
+
+def _seal(members: dict[str, bytes]) -> bytes:
+    digest = hashlib.sha256()
+    for name in sorted(members):
+        digest.update(f"{name} {len(members[name])}\n".encode() + members[name])
+    return b"jeit " + digest.hexdigest().encode()
+
 
 _KIND, _VERSION = "a jeit learnt skin", 2
 # Names that fields have in files of version 0.2.

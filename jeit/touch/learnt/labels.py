@@ -1,4 +1,4 @@
-"""Learn labels of frames, by the classifier most accurate on held-out presses."""
+"""Learnt labels and keys."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds, probabilities, sharpness_of, shrinkage_of
+from jeit.touch.learnt.array_models import Forest
 from jeit.touch.learnt.extras import over_folds
-from jeit.touch.learnt.features import Features, Forms
+from jeit.touch.learnt.features import FORMS, Features, Forms, standardisation
 from jeit.touch.learnt.imaged import Imaged
+from jeit.touch.learnt.methods import CLASSIFIERS, log_odds, probabilities, sharpness_of, shrinkage_of
 
 METHODS = ("auto", *CLASSIFIERS)
 _QUICK = "linear-discriminant"
@@ -109,3 +110,176 @@ def _hold_out(method, form, forms: Forms, changes, reference, right, folds) -> T
     over_folds(predict, folds.max() + 1)
     held_out = odds.argmax(axis=1)
     return TriedLabels(method, form, held_out, odds, float(np.mean(held_out != right)))
+
+
+_STRENGTHS = (1e-3, 1e-2, 1e-1, 1.0)
+_FORMS = ("differences", "compressed")
+# The number of channels that best separate one key from the others, for methods that use few; the number of trees.
+_FEW, _TREES = 200, 150
+_TREE: dict[str, Any] = {"max_features": 0.3, "min_samples_leaf": 2, "random_state": 0}
+
+
+@dataclass(frozen=True)
+class Standardised:
+    """Standardised features of one `form`: all of them, or those numbered `chosen`."""
+
+    form: str
+    unit: Float[np.ndarray, " m"]
+    mean: Float[np.ndarray, " p"]
+    deviation: Float[np.ndarray, " p"]
+    chosen: np.ndarray | None = None
+
+    @classmethod
+    def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "Standardised":
+        """Learn from changes (N, m) and their reference."""
+        unit, _, mean, deviation = standardisation(form, changes, reference)
+        return cls(form, unit, mean, deviation)
+
+    def __call__(self, changes: np.ndarray, reference: np.ndarray) -> np.ndarray:
+        """Compute the features (n, p) of changes (n, m)."""
+        values = (FORMS[self.form](changes, reference, self.unit) - self.mean) / self.deviation
+        return values if self.chosen is None else values[:, self.chosen]
+
+
+@dataclass(frozen=True)
+class LearntKeys:
+    """For each of K keys: features, a classifier, and the sharpness of its probability."""
+
+    members: list[tuple[Standardised, Any, float]]
+
+    def predict(self, changes, reference) -> tuple[Bool[np.ndarray, "n K"], Float[np.ndarray, "n K"]]:
+        """Predict which keys are pressed, and the probability of each."""
+        odds = [log_odds(model, features(changes, reference)) for features, model, _ in self.members]
+        said = [probabilities(one, sharp)[:, 1] for one, (_, _, sharp) in zip(odds, self.members, strict=True)]
+        probability = np.column_stack(said)
+        return probability > 0.5, probability
+
+
+@dataclass(frozen=True)
+class TriedKeys:
+    """Methods, one for each key, and their predictions for held-out presses (N, K)."""
+
+    methods: list[str]
+    held_out: Bool[np.ndarray, "N K"]
+    errors: Float[np.ndarray, " K"]
+
+
+def learn_keys(
+    changes: Float[np.ndarray, "N m"],
+    reference: Float[np.ndarray, "N m"] | None,
+    touched: Bool[np.ndarray, "N K"],
+    folds: np.ndarray,
+    *,
+    progress: Callable[[str], None] = lambda said: None,
+) -> tuple[LearntKeys, TriedKeys]:
+    """Learn to classify which of K keys are pressed from changes (N, m); each by the method with the least error on
+    `folds`."""
+    reference = np.zeros_like(changes) if reference is None else reference
+    number, keys = touched.shape
+    odds = {name: np.empty((number, keys)) for name in _candidates()}
+
+    def predict(fold: int) -> None:
+        out = folds == fold
+        for form in _FORMS:
+            features = Standardised.learn(form, changes[~out], reference[~out])
+            learnt, asked = features(changes[~out], reference[~out]), features(changes[out], reference[out])
+            rotation = np.linalg.svd(learnt, full_matrices=False)[2].T  # loses nothing linear, and saves much time
+            linear = learnt @ rotation, asked @ rotation
+            for key in range(keys):
+                answers = touched[~out, key].astype(int)
+                if answers.min() == answers.max():  # all presses of the key, or all without it, are held out
+                    for name in odds:
+                        odds[name][out, key] = 2.0 * answers[0] - 1
+                    continue
+                for name, (needs, strength) in _candidates().items():
+                    if name.partition(" on ")[2] != form:
+                        continue
+                    if needs == "linear":
+                        model = _logistic(linear[0], answers, strength)
+                        odds[name][out, key] = model.decision_function(linear[1])
+                    else:
+                        few = _discriminative(learnt, answers)
+                        model = _METHODS[needs](learnt[:, few], answers)
+                        said = log_odds(model, asked[:, few])
+                        odds[name][out, key] = said[:, 1] - said[:, 0]
+        progress(f"keys, fold {fold + 1} of {folds.max() + 1}")
+
+    over_folds(predict, folds.max() + 1)
+    members, methods, held_out = [], [], np.empty((number, keys), bool)
+    for key in range(keys):
+        right = touched[:, key]
+        # The method with the greatest likelihood, not the fewest errors, of which many have the same number.
+        name = min(odds, key=lambda name: _loss(odds[name][:, key], right))
+        methods.append(name)
+        held_out[:, key] = odds[name][:, key] > 0
+        members.append(_member(name, changes, reference, right.astype(int), odds[name][:, key]))
+        progress(f"key {key + 1} of {keys}")
+    return LearntKeys(members), TriedKeys(methods, held_out, np.mean(held_out != touched, axis=0))
+
+
+def _candidates() -> dict[str, tuple[str, float]]:
+    """Candidate methods by name: their kind, and the strength of the fit."""
+    found = {}
+    for form in _FORMS:
+        found |= {f"logistic, C = {strength:g} on {form}": ("linear", strength) for strength in _STRENGTHS}
+        found |= {f"discriminant of {_FEW} channels on {form}": ("discriminant", 0.0)}
+        found |= {f"trees of {_FEW} channels on {form}": ("trees", 0.0)}
+    return found
+
+
+def _member(name: str, changes, reference, answers, odds) -> tuple[Standardised, Any, float]:
+    needs, strength = _candidates()[name]
+    features = Standardised.learn(name.partition(" on ")[2], changes, reference)
+    values = features(changes, reference)
+    sharp = sharpness_of(np.column_stack([np.zeros(len(odds)), odds]), answers)
+    if needs == "linear":
+        return features, _unrotated(values, answers, strength), sharp
+    few = _discriminative(values, answers)
+    chosen = Standardised(features.form, features.unit, features.mean, features.deviation, few)
+    return chosen, _METHODS[needs](values[:, few], answers), sharp
+
+
+def _unrotated(values, answers, strength):
+    """Fit logistic regression to rotated features, and convert its coefficients to the given features."""
+    rotation = np.linalg.svd(values, full_matrices=False)[2].T
+    model = _logistic(values @ rotation, answers, strength)
+    model.coef_ = model.coef_ @ rotation.T
+    model.n_features_in_ = values.shape[1]
+    return model
+
+
+def _logistic(values, answers, strength):
+    from sklearn.linear_model import LogisticRegression
+
+    return LogisticRegression(C=strength, max_iter=500).fit(values, answers)
+
+
+def _discriminant(values, answers):
+    from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
+
+    return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(values, answers)
+
+
+def _trees(values, answers):
+    from sklearn.ensemble import ExtraTreesClassifier
+
+    found = ExtraTreesClassifier(_TREES, **_TREE).fit(values, answers)
+    return Forest.of_trees(found.estimators_, np.full(_TREES, 1 / _TREES), found.classes_, votes=False)
+
+
+_METHODS = {"discriminant": _discriminant, "trees": _trees}
+
+
+def _discriminative(values: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Select the features that differ most between the two answers, relative to their spread within each."""
+    one, other = values[answers == 1], values[answers == 0]
+    within = np.sqrt((one.var(axis=0) * len(one) + other.var(axis=0) * len(other)) / len(values))
+    return np.sort(np.argsort(-np.abs(one.mean(axis=0) - other.mean(axis=0)) / np.maximum(within, 1e-12))[:_FEW])
+
+
+def _loss(odds: np.ndarray, right: np.ndarray) -> float:
+    """Error rate, plus a small multiple of the negative log-likelihood of the answers at the best sharpness."""
+    columns = np.column_stack([np.zeros(len(odds)), odds])
+    sharp = sharpness_of(columns, right.astype(int))
+    likely = probabilities(columns, sharp)[np.arange(len(right)), right.astype(int)]
+    return float(np.mean((odds > 0) != right) - 0.1 * np.mean(np.log(np.maximum(likely, 1e-9))))

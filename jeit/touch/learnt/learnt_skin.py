@@ -16,17 +16,24 @@ from jeit.forward import ForwardModel
 from jeit.touch.learnt import labels as label_methods
 from jeit.touch.learnt import numbers as number_methods
 from jeit.touch.learnt.answers import METHODS, Standing, learn_answers, places_and_folds
-from jeit.touch.learnt.changes import changes_of, mean_reference, reference_used, standardised
-from jeit.touch.learnt.channel_choice import choose_channels
-from jeit.touch.learnt.channels import Channels
+from jeit.touch.learnt.channels import Channels, choose_channels
 from jeit.touch.learnt.extras import one_thread, over_threads
 from jeit.touch.learnt.imaged import Imaged, check_imaged
-from jeit.touch.learnt.keys import LearntKeys
-from jeit.touch.learnt.labels import LearntLabels
-from jeit.touch.learnt.lag import lag_of, shifted
+from jeit.touch.learnt.labels import LearntKeys, LearntLabels
 from jeit.touch.learnt.numbers import LearntNumbers
-from jeit.touch.learnt.presses import NO_TOUCH, Presses, check_frames, check_reference
-from jeit.touch.learnt.touches import Touches
+from jeit.touch.learnt.presses import (
+    NO_TOUCH,
+    Presses,
+    Touches,
+    changes_of,
+    check_frames,
+    check_reference,
+    lag_of,
+    mean_reference,
+    reference_used,
+    shifted,
+    standardised,
+)
 
 # A frame is unlike the training set beyond this novelty, 1 for the farthest frame in it; or if a smaller share of its
 # channels is alive.

@@ -1,4 +1,4 @@
-"""Recorded presses: frames of a skin, and what touched it in each; validated, and read from NPZ files."""
+"""Recorded presses: frames with known places and forces, changes from rest, and the lag between the two."""
 
 from __future__ import annotations
 
@@ -10,9 +10,58 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from jeit.arguments import readings
 from jeit.files import need, npz_arrays
+from jeit.touch.learnt.features import Features
+
+# The least number of frames of a session that can be standardised by itself.
+_SESSION = 20
+
+
+def changes_of(frames: Float[np.ndarray, "n M"], reference: np.ndarray | None) -> Float[np.ndarray, "n M"]:
+    """Subtract the reference from frames, if there is one."""
+    return frames if reference is None else frames - reference
+
+
+def standardised(changes: np.ndarray, group) -> np.ndarray:
+    """Standardise changes (n, M): subtract their session's median, and divide by their session's deviation.
+
+    All are one session unless `group` (n,) is given. Raises `ValueError` for sessions of fewer than 20 frames.
+    """
+    group = np.zeros(len(changes), int) if group is None else np.asarray(group)
+    if group.shape != (len(changes),):
+        raise ValueError(f"group has shape {group.shape}; give ({len(changes)},), the session of each frame.")
+    result = np.empty_like(changes)
+    for session in np.unique(group):
+        own = changes[group == session]
+        if len(own) < _SESSION:
+            raise ValueError(
+                f"group: session {session} has {len(own)} frames; {_SESSION} are needed to standardise one."
+            )
+        deviation = np.nanstd(own, axis=0)
+        result[group == session] = (own - np.nanmedian(own, axis=0)) / np.where(deviation > 0, deviation, np.inf)
+    return result
+
+
+def mean_reference(reference: np.ndarray) -> np.ndarray:
+    """Mean reference of every channel; 0 where it has no reading at all."""
+    there = np.isfinite(reference)
+    return np.where(there, reference, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+
+
+def reference_used(
+    reference: np.ndarray | None, mean: np.ndarray | None, used: Bool[np.ndarray, " M"], number: int
+) -> Float[np.ndarray, "n m"]:
+    """Reference (n, M) of the channels `used`; zeros if there is none.
+
+    Where it has no reading, the `mean` (M,) of the training set is used.
+    """
+    if reference is None or mean is None:
+        return np.zeros((number, int(used.sum())))
+    return np.where(np.isnan(reference), mean, reference)[:, used]
+
 
 # No known skin is longer: its coordinates would be in millimetres.
 _LONGEST = 5.0  # m
@@ -264,3 +313,74 @@ def _one_dimensional(name: str, given: ArrayLike) -> np.ndarray:
     if values.ndim != 1 or values.dtype.kind == "O":
         raise ValueError(f"{name} is {values.dtype} of shape {values.shape}; give one plain value for each press.")
     return values
+
+
+_MOST, _NEIGHBOURS, _COMPONENTS = 2, 8, 12
+# A lag is found if the error of places estimated without one is at least this share of that of a guess, that with the
+# lag is less, and that with any other lag is greater by this many standard errors.
+_GUESS, _STANDARD_ERRORS = 0.95, 4.0
+
+
+def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tuple[int, float, float]:
+    """Estimate by how many rows frames come after their presses, 0 unless there is clear evidence.
+
+    Also returns the mean error of places estimated from the nearest frames without a lag and with it, metres.
+    """
+    features = Features.learn("normalised", changes, np.zeros_like(changes))
+    scores = features(changes, np.zeros_like(changes))[:, :_COMPONENTS]
+    errors = {lag: _errors(scores, positions, folds, lag) for lag in range(-_MOST, _MOST + 1)}
+    guess = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
+    means = {lag: float(off.mean()) for lag, off in errors.items()}
+    best, second = sorted(means, key=lambda lag: means[lag])[:2]
+    enough = _STANDARD_ERRORS * float(errors[best].std()) / np.sqrt(len(positions))
+    plain = means[0] > _GUESS * guess > means[best] and means[second] - means[best] > enough
+    best = best if plain else 0
+    return best, means[0], means[best]
+
+
+def shifted(number: int, lag: int) -> tuple[slice, slice]:
+    """Rows of frames, and of their presses, among `number` rows that were recorded with a lag."""
+    return slice(max(lag, 0), number + min(lag, 0)), slice(max(-lag, 0), number - max(lag, 0))
+
+
+def _errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: int) -> np.ndarray:
+    frames, presses = shifted(len(scores), lag)
+    scores, positions, folds = scores[frames], positions[presses], folds[presses]
+    off = np.empty(len(scores))
+    for fold in np.unique(folds):
+        out = folds == fold
+        learnt = positions[~out]
+        near = KDTree(scores[~out]).query(scores[out], min(_NEIGHBOURS, len(learnt)))[1].reshape(out.sum(), -1)
+        off[out] = np.linalg.norm(learnt[near].mean(axis=1) - positions[out], axis=1)
+    return off
+
+
+@dataclass(frozen=True)
+class Touches:
+    """Predictions for n frames; what was not learnt is None.
+
+    **Fields**
+
+    - `position` (n, 2 or 3) metres with standard deviations `position_std`; `force` (n,) N with `force_std`; `label`
+      (n,) text with `probability`; `touched` (n, K), which keys are pressed, with `key_probability`. NaN, "" and false
+      where nothing touches, and in frames that are unlike the training set.
+    - `unlike` (n,): frames unlike the training set, by their `novelty` (n,), 1 for the farthest frame in it.
+    - `alive` (n, M): channels that were used.
+    - `notes`: what was corrected.
+    """
+
+    position: Float[np.ndarray, "n d"] | None
+    position_std: Float[np.ndarray, "n d"] | None
+    force: Float[np.ndarray, " n"] | None
+    force_std: Float[np.ndarray, " n"] | None
+    label: np.ndarray | None
+    probability: Float[np.ndarray, " n"] | None
+    touched: Bool[np.ndarray, "n K"] | None
+    key_probability: Float[np.ndarray, "n K"] | None
+    unlike: Bool[np.ndarray, " n"]
+    novelty: Float[np.ndarray, " n"]
+    alive: Bool[np.ndarray, "n M"]
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.unlike)

@@ -1,10 +1,9 @@
 from .feature_images import SoundImages, sound_images
 from .labelled_clips import LabelledClips, read_clips
-from .levels import Levels
 from .listener import Listener
 from .modality_network import ModalityNetwork, train_network
 from .sound_labels import Event, SoundLabels
-from .window_features import sound_features
+from .window_features import Levels, sound_features
 
 __all__ = [
     "Event",

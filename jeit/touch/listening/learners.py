@@ -15,13 +15,12 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.touch.learnt.classifiers import CLASSIFIERS
+from jeit.touch.learnt.array_models import Forest
 from jeit.touch.learnt.extras import one_thread
-from jeit.touch.learnt.forest import Forest
+from jeit.touch.learnt.methods import CLASSIFIERS
 from jeit.touch.listening.feature_images import SoundImages
-from jeit.touch.listening.levels import Levels
 from jeit.touch.listening.modality_network import ModalityNetwork, NetworkAnswers, paper_plan, plan_of, train_network
-from jeit.touch.listening.window_features import sound_features, spectrum_features
+from jeit.touch.listening.window_features import Levels, sound_features, spectrum_features
 from jeit.touch.training import Plan
 
 # Rounds of boosting, leaves of a tree, and the least number of windows in a leaf, for sets that are large enough.

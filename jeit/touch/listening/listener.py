@@ -16,13 +16,12 @@ from jeit.arguments import check_key, check_kind, check_name, counted
 from jeit.arguments.extras import need_extra
 from jeit.files import reason
 from jeit.touch.learnt.answers import Standing
-from jeit.touch.learnt.classifiers import probabilities, sharpness_of
+from jeit.touch.learnt.methods import probabilities, sharpness_of
 from jeit.touch.listening.feature_images import BANDS, EVERY, image_blocks
-from jeit.touch.listening.folds import held_out_folds
 from jeit.touch.listening.labelled_clips import LabelledClips, mixed
 from jeit.touch.listening.learners import BATCHES, LEARNERS
 from jeit.touch.listening.sound_labels import SoundLabels
-from jeit.touch.listening.windows import LOUD, Windows
+from jeit.touch.listening.windows import LOUD, Windows, held_out_folds
 from jeit.touch.training import read_model, write_model
 
 METHODS = ("auto", *LEARNERS)

@@ -1,4 +1,4 @@
-"""Windows of labelled clips with their clips and classes, and the classification of whole clips from their windows.
+"""Windows of clips, with labels and folds of held-out groups.
 
 A long recording, such as many taps one after the other, counts as many clips: it is cut into pieces where it is quiet.
 """
@@ -10,12 +10,43 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jeit.arguments import counted
 from jeit.touch.listening.feature_images import LENGTH, SoundImages, sound_images
 from jeit.touch.listening.labelled_clips import LabelledClips
 from jeit.touch.listening.learners import Lesson
+
+
+def held_out_folds(right: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], most: int) -> Int[np.ndarray, " N"]:
+    """Assign each of N clips to the fold (N,) in which it is held out, together with all of its group.
+
+    The fold is -1 for clips that are always in the training set, since their class has no other group. Groups are
+    assigned in turn, class by class, the largest first, to at most `most` folds, so that every class is in the training
+    set of each.
+    """
+    fold = np.full(len(right), -1)
+    of_group: dict[int, int] = {}
+    counts = np.zeros(most, int)
+    classes = [np.unique(groups[right == one]) for one in np.unique(right)]
+    for own in sorted(classes, key=len):
+        if len(own) < 2:
+            continue
+        for group in sorted(own.tolist(), key=lambda one: -int((groups == one).sum())):
+            if group not in of_group:
+                taken = [sum(of_group.get(other) == number for other in own.tolist()) for number in range(most)]
+                of_group[group] = min(range(most), key=lambda number: (taken[number], counts[number], number))
+                counts[of_group[group]] += int((groups == group).sum())
+    for group, number in of_group.items():
+        fold[groups == group] = number
+    # A class all of whose groups are in one fold would be tested where it was never learnt.
+    for one in np.unique(right):
+        own = right == one
+        if len(np.unique(fold[own])) < 2:
+            fold[own] = -1
+    used = np.unique(fold[fold >= 0])
+    return np.where(fold >= 0, np.searchsorted(used, fold), -1)
+
 
 LOUD = 0.01
 """Least loudness of a window that is used, as a share of the power of the recording's loudest frame."""

@@ -1,5 +1,4 @@
-"""Response of a skin's channels to a depth map by the forward model, linear in a function of depth; and the effects of
-misplaced electrodes and drifting contacts."""
+"""Touches that networks are trained on: their depth maps, places and voltage changes."""
 
 from __future__ import annotations
 
@@ -10,13 +9,91 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from jeit.design import Skin
+from jeit.design import Bell, Skin, touches_away_from_the_edge
 from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import select_channels
-from jeit.touch.networks.touches import DEPTHS
+from jeit.touch.simulate import Bar, Disc, Indent, IndentDraws, Joined, Placed, Revolved, Ring, ball, material
 from jeit.touch.simulate.contact.indent_sets import image_places
-from jeit.touch.simulate.contact.indents import relative_to
+from jeit.touch.simulate.contact.indenters import AbstractIndenter
+from jeit.touch.simulate.contact.indents import relative_changes, relative_to
 from jeit.touch.simulate.contact.samples import lattice
+
+# Share of a map's greatest depth below which a pixel is not part of a touch.
+_PART = 0.5
+
+
+def peaks(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
+    """Places (n, 2) of the deepest pixels, metres; `places` of the pixels."""
+    deepest = maps.reshape(len(maps), -1).argmax(axis=1)
+    return places.reshape(-1, 2)[deepest]
+
+
+def centroids_of(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
+    """Centroids (n, 2) of the pixels deeper than half of the deepest, weighted by depth, metres."""
+    flat = maps.reshape(len(maps), -1)
+    most = flat.max(axis=1, keepdims=True)
+    weight = np.where(flat > _PART * most, np.maximum(flat, 0), 0)
+    # For a map without any depth: the middle of the skin.
+    weight = np.where(most > 0, weight, 1.0)
+    return weight @ places.reshape(-1, 2) / weight.sum(axis=1, keepdims=True)
+
+
+def errors(found: Float[np.ndarray, "n 2"], right: Float[np.ndarray, "n 2"]) -> dict[str, float]:
+    """Mean, standard deviation and root mean square of the distance of estimated from true places, metres."""
+    off = np.linalg.norm(found - right, axis=1)
+    return {"mean": float(off.mean()), "sd": float(off.std()), "rms": float(np.sqrt(np.mean(off**2)))}
+
+
+# Least and greatest depth of a touch, as shares of the skin's thickness; in Park et al., 1 and 8 mm of 10 mm.
+DEPTHS = (0.1, 0.8)
+# The greatest number of bodies that touch at once.
+_AT_ONCE = 3
+# The paper's limit of detection, of a ball 15 mm across, in deviations of the noise; the number of places along a side
+# at which its reading is computed.
+_LIMIT, _DEVIATIONS, _PLACES = 0.7, 3.0, 15
+# Least distance of a touch's centre from the skin's edge, as a share of its shorter side.
+_MARGIN = 0.04
+
+
+def wrench() -> Joined:
+    """An open-ended wrench laid flat, 100 mm long."""
+    jaw = Placed(Ring(0.030, 0.014), (0.040, 0.0))
+    return Joined(Placed(Bar(0.070, 0.010), (-0.010, 0.0)), jaw)
+
+
+def bodies() -> list[AbstractIndenter]:
+    """Bodies that are pressed in: bells, balls, discs, bars, and a wrench."""
+    return [
+        *(Revolved(Bell(0.02, deviation)) for deviation in (5e-3, 7.5e-3, 10e-3)),
+        *(ball(diameter) for diameter in (0.015, 0.020, 0.030)),
+        *(Disc(diameter) for diameter in (0.010, 0.020, 0.030)),
+        *(Bar(length, width) for length, width in ((0.040, 0.008), (0.030, 0.015), (0.060, 0.010))),
+        wrench(),
+    ]
+
+
+def touch_draws(skin: Skin) -> IndentDraws:
+    """Touches of one to three of these bodies, anywhere on a skin, turned by any angle."""
+    thickness = float(skin.thickness)
+    low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
+    depth = (DEPTHS[0] * thickness, DEPTHS[1] * thickness)
+    margin = _MARGIN * min(high_x - low_x, high_y - low_y)
+    return IndentDraws(bodies(), skin.flat_outline, depth, margin=margin, at_once=_AT_ONCE)
+
+
+def detection_noise(skin: Skin, limit: float = _LIMIT) -> float:
+    """Relative noise of a channel with which a ball 15 mm across under `limit` newtons is just detected.
+
+    It is a third of the greatest relative change of any channel, in the median of places all over the skin. Park et al.
+    2022 detect 0.7 N; a hydrogel of 100 kPa is then indented by 1.7 mm.
+    """
+    tip = ball(0.015)
+    depth = material("hydrogel").support.pressure(tip, limit).approach
+    grid = touches_away_from_the_edge(skin.flat_outline, 0.0075, _PLACES, _PLACES)
+    change = relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places])
+    # Rounded to four digits, which do not depend on the order of sums.
+    return float(f"{np.median(np.abs(change).max(axis=1)) / _DEVIATIONS:.4g}")
+
 
 # Points in each cell, along a side: pixels are smaller than cells.
 _LATTICE = 6

@@ -1,4 +1,4 @@
-"""The network of Park et al. 2022 (Science Robotics 7, eabm7187): two autoencoders, and a projection between them.
+"""A network of three stages, after Park et al., and its layers.
 
 What the paper does not print is chosen: hidden layers of 256 between 94 channels and 84 latent values, convolutions of
 16, 32 and 64 channels.
@@ -6,14 +6,112 @@ What the paper does not print is chosen: hidden layers of 256 between 94 channel
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.touch.networks.layers import Chain, Convolution, Dense
+
+class Dense(eqx.Module):
+    """x W + b, of x (b, i)."""
+
+    weight: Float[Array, "i o"]
+    bias: Float[Array, " o"]
+
+    def __init__(self, inputs: int, outputs: int, *, key: Array):
+        """Weights of He et al. 2015, as of every layer here; no bias."""
+        self.weight = _start(key, (inputs, outputs), inputs)
+        self.bias = jnp.zeros(outputs, jnp.float32)
+
+    def __call__(self, values: Float[Array, "b i"]) -> Float[Array, "b o"]:
+        """Apply the layer to a batch."""
+        return values @ self.weight + self.bias
+
+
+class Convolution(eqx.Module):
+    """3 × 3, padded with zeros, of every `stride`-th pixel."""
+
+    weight: Float[Array, "3 3 i o"]
+    bias: Float[Array, " o"]
+    stride: int = eqx.field(static=True)
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1, *, key: Array):
+        """Create the layer for images with `inputs` channels."""
+        self.weight = _start(key, (3, 3, inputs, outputs), 9 * inputs)
+        self.bias = jnp.zeros(outputs, jnp.float32)
+        self.stride = stride
+
+    def __call__(self, image: Float[Array, "b r c i"]) -> Float[Array, "b p q o"]:
+        """Apply the layer to a batch."""
+        layout = ("NHWC", "HWIO", "NHWC")
+        steps = (self.stride, self.stride)
+        return jax.lax.conv_general_dilated(image, self.weight, steps, "SAME", dimension_numbers=layout) + self.bias
+
+    def of_doubled(self, image: Float[Array, "b r c i"]) -> Float[Array, "b s d o"]:
+        """Apply the layer to the image `doubled`, in four ninths of the products.
+
+        Of the three rows, and columns, that a pixel weighs, two are equal, and their weights are added first.
+        """
+        number, rows, columns, _ = image.shape
+        tall = jnp.stack([self.weight.at[1].add(self.weight[2])[:2], self.weight.at[1].add(self.weight[0])[1:]])
+        wide = [tall.at[:, :, 1].add(tall[:, :, 2])[:, :, :2], tall.at[:, :, 1].add(tall[:, :, 0])[:, :, 1:]]
+        both = jnp.moveaxis(jnp.stack(wide, axis=1), (0, 1), (3, 4)).reshape(2, 2, image.shape[-1], -1)
+        # Padded in advance: XLA takes twenty times as long for the derivatives of a padded convolution of even size.
+        framed = jnp.pad(image, ((0, 0), (1, 1), (1, 1), (0, 0)))
+        layout = ("NHWC", "HWIO", "NHWC")
+        parts = jax.lax.conv_general_dilated(framed, both, (1, 1), "VALID", dimension_numbers=layout)
+        parts = parts.reshape(number, rows + 1, columns + 1, 2, 2, -1)
+        lines = [[parts[:, a : a + rows, b : b + columns, a, b] for b in (0, 1)] for a in (0, 1)]
+        whole = jnp.stack([jnp.stack(line, axis=3) for line in lines], axis=2)
+        return whole.reshape(number, 2 * rows, 2 * columns, -1) + self.bias
+
+
+class Chain(eqx.Module):
+    """Layers one after the other, exponential linear units between them; dropout of a share before each but the first
+    where a key is given."""
+
+    layers: tuple[eqx.Module, ...]
+    dropout: float = eqx.field(static=True)
+
+    @classmethod
+    def dense(cls, widths: Sequence[int], *, key: Array, dropout: float = 0.0) -> "Chain":
+        """Dense layers from each of the `widths` to the next."""
+        keys = jax.random.split(key, len(widths) - 1)
+        return cls(tuple(Dense(i, o, key=one) for (i, o), one in zip(pairwise(widths), keys, strict=True)), dropout)
+
+    def __call__(self, values: Array, key: Array | None = None) -> Array:
+        """Apply the layers to a batch; there is no unit after the last."""
+        for number, layer in enumerate(self.layers):
+            if number:
+                values = jax.nn.elu(values)
+                if key is not None and self.dropout:
+                    kept = jax.random.bernoulli(jax.random.fold_in(key, number), 1 - self.dropout, values.shape)
+                    values = jnp.where(kept, values / (1 - self.dropout), 0.0)
+            values = layer(values)  # pyright: ignore[reportCallIssue]
+        return values
+
+
+def doubled(image: Float[Array, "b r c i"]) -> Float[Array, "b s d i"]:
+    """Every pixel as 2 × 2."""
+    number, rows, columns, channels = image.shape
+    wide = jnp.broadcast_to(image[:, :, None, :, None], (number, rows, 2, columns, 2, channels))
+    return wide.reshape(number, 2 * rows, 2 * columns, channels)
+
+
+def unfolded(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:
+    """Four channels of each pixel as 2 × 2 of one."""
+    number, rows, columns, _ = image.shape
+    parts = image.reshape(number, rows, columns, 2, 2)
+    return jnp.moveaxis(parts, 3, 2).reshape(number, 2 * rows, 2 * columns)
+
+
+def _start(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
+    return jax.random.normal(key, shape, jnp.float32) * np.float32(np.sqrt(2 / inputs))
+
 
 _HIDDEN, _LATENT, _DROPOUT = 256, 84, 0.03
 _CHANNELS, _CODE = (16, 32, 64), 128

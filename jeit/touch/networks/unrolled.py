@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.touch.networks.layers import Convolution, doubled, unfolded
 from jeit.touch.networks.sensed import Sensed, depth_of, rounded, strength
+from jeit.touch.networks.three_stages import Convolution, doubled, unfolded
 
 _WIDE, _NARROW = 24, 16
 # The prior: deviation of a pixel's strength, and length of its correlation over the skin's longer side; the multiples

@@ -1,13 +1,9 @@
-from .contact_stages import plot_contact_stages
-from .contacts import plot_contacts
-from .depth_map import plot_depth_map, plot_losses
-from .health import plot_health
-from .health_course import plot_health_course
+from .contacts import plot_contact_stages, plot_contacts
+from .health import plot_health, plot_health_course
 from .kohonen_map import plot_map
 from .learning import plot_confusion, plot_force_errors, plot_key_errors, plot_place_errors, plot_tried
-from .sound_labels import plot_sound_labels
-from .timeline import plot_changes, plot_timeline, plot_touch_paths
-from .touches import plot_answers, plot_places
+from .timeline import plot_changes, plot_sound_labels, plot_timeline, plot_touch_paths
+from .touches import plot_answers, plot_depth_map, plot_losses, plot_places
 
 __all__ = [
     "plot_answers",

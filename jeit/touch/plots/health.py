@@ -1,4 +1,4 @@
-"""Plot the damage of a skin: cuts as lines, failed electrodes as crosses, over an image or the bare skin."""
+"""Draw damage of a skin on its sheet, and its course in time."""
 
 from __future__ import annotations
 
@@ -8,12 +8,22 @@ from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
-from jeit.plot.axes import SERIES_COLOURS, axes_or_new, bare, draw_scale_bar, extent_of
-from jeit.plot.colour_scale import CHANGE, ColourScale
+from jeit.plot.axes import (
+    CHANGE,
+    INK,
+    SERIES_COLOURS,
+    SOFT,
+    ColourScale,
+    axes_or_new,
+    bare,
+    draw_scale_bar,
+    extent_of,
+    soften_axes,
+)
 from jeit.plot.imaging.electrodes import draw_electrodes
-from jeit.plot.imaging.image import plot_image
-from jeit.plot.imaging.mesh import draw_outline
-from jeit.touch.health import EventStatus, HealthEvent, SkinHealth
+from jeit.plot.imaging.image import draw_outline, plot_image
+from jeit.touch.health import EventKind, EventStatus, HealthEvent, SkinHealth
+from jeit.touch.health.event import size_of
 
 _HALO = [withStroke(linewidth=4, foreground="white")]
 _CUT, _MENDED = SERIES_COLOURS[1], SERIES_COLOURS[2]
@@ -84,3 +94,52 @@ def _draw_cut(ax: Axes, event: HealthEvent) -> None:
         zorder=7,
         path_effects=_HALO,
     )
+
+
+# The greatest number of events that are labelled; and the least height of the axes, as a multiple of the limit.
+_WRITTEN, _LEAST = 12, 1.5
+
+
+def plot_health_course(
+    health: SkinHealth, times: ArrayLike, frames: ArrayLike, *, title: str | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw the change of frames (F, M) at `times` (F,) from the healthy skin, and a line at the time of every event.
+
+    The change is in multiples of the limit that a lasting change exceeds. Touches stand out as far as damage may, but
+    come back; damage stays. Raises `ValueError` for shapes that disagree.
+    """
+    check_kind("health", health, SkinHealth, "a SkinHealth, as of watch(health, frames)")
+    when, read = np.asarray(times, float), np.asarray(frames, float)
+    if read.shape != (len(when), health.reference.size):
+        raise ValueError(f"frames have shape {read.shape}; give ({len(when)}, {health.reference.size}).")
+    healthy = health.healthy
+    there = healthy.used & np.isfinite(read)
+    off = np.where(there, (read - healthy.reference) / np.where(healthy.used, healthy.scale, np.inf), np.nan)
+    size = np.where(there.any(axis=1), size_of(off) / healthy.limit, np.nan)
+    ax = axes_or_new(ax, (9.0, 3.2))
+    ax.plot(when, size, color=INK, linewidth=0.8)
+    ax.axhline(1.0, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
+    ax.text(1, 1.0, " limit", color=SOFT, fontsize=8, va="center", transform=ax.get_yaxis_transform())
+    for event in health.events:
+        colour = SERIES_COLOURS[2] if event.kind == EventKind.REPAIRED else SERIES_COLOURS[1]
+        ax.axvline(event.time, color=colour, linewidth=1.4)
+        if len(health.events) <= _WRITTEN:
+            own = "" if event.electrode is None else f" {event.electrode + 1}"
+            ax.annotate(
+                f"{event.kind}{own}",
+                (event.time, 1),
+                (3, -3 - 11 * (event.number % 3)),
+                xycoords=("data", "axes fraction"),
+                textcoords="offset points",
+                va="top",
+                color=colour,
+                fontsize=8,
+            )
+    ax.set_yscale("symlog", linthresh=1.0)
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    ax.set_ylim(0, max(_LEAST, 1.6 * float(np.nanmax(size, initial=1.0))))
+    ax.set_ylabel("Change, times the limit", color=INK)
+    soften_axes(ax)
+    if title is not None:
+        ax.set_title(title)
+    return ax

@@ -1,4 +1,4 @@
-"""Plot named touches over time, in a lane for each gesture beneath the change that they made, and their paths."""
+"""Draw what happens over time: names of touches, and labels of sounds."""
 
 from __future__ import annotations
 
@@ -18,14 +18,17 @@ from jeit.plot.axes import (
     SOFT,
     axes_or_new,
     bare,
+    draw_colour_bar,
     draw_scale_bar,
     extent_of,
     prefixed,
     soften_axes,
 )
 from jeit.plot.imaging.electrodes import draw_electrodes
-from jeit.plot.imaging.mesh import draw_outline
+from jeit.plot.imaging.image import draw_outline
 from jeit.touch.gestures.touch_watch import NamedTouch
+from jeit.touch.listening import SoundLabels
+from jeit.touch.listening.feature_images import EVERY
 
 # A curve is interrupted where no frame came for this multiple of the usual interval; the greatest number of points of a
 # curve; the shortest bar, as a share of the whole time; the greatest number of touches that are numbered.
@@ -172,3 +175,34 @@ def _thinned(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     filled = np.where(np.isfinite(values), values, 0.0)
     rows = np.unique([part[at] for part in parts for at in (filled[part].argmin(), filled[part].argmax())])
     return when[rows], values[rows]
+
+
+def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes | None = None) -> Axes:
+    """Draw the probabilities of all names over time, a row each, with a bar under the chosen name; quiet is blank."""
+    ax = axes_or_new(ax, (8.0, 3.2))
+    names, times = labels.names, labels.times
+    shown = np.where((labels.named != "")[:, None], labels.probabilities, np.nan).T
+    extent = (float(times[0]) - EVERY / 2, float(times[-1]) + EVERY / 2, -0.5, len(names) - 0.5)
+    drawn = ax.imshow(
+        100 * shown,
+        aspect="auto",
+        origin="lower",
+        extent=extent,
+        cmap="Blues",
+        vmin=0,
+        vmax=100,
+        interpolation="nearest",
+    )
+    draw_colour_bar(ax, drawn, "Probability (%)")
+    for event in labels.events:
+        if event.name:
+            row, span = names.index(event.name) - 0.42, [event.start, event.end]
+            ax.plot(span, [row, row], color=SERIES_COLOURS[1], linewidth=2.5, solid_capstyle="butt")
+    ax.set_yticks(range(len(names)), names)
+    ax.set_xlim(0, extent[1])
+    ax.set_xlabel("Time (s)", color=INK)
+    quiet = int((labels.named == "").sum())
+    said = f"{labels.name}: sounds in red" + (f"; blank, {quiet} of {len(labels)} windows quiet" if quiet else "")
+    ax.set_title(said if title is None else title)
+    soften_axes(ax)
+    return ax

@@ -1,9 +1,8 @@
-from .gestures import report_gestures, write_gestures
 from .image_network import report_learnt_images, write_depths, write_learnt_images
 from .learnt_skin import report_learnt_skin, write_learnt_skin, write_touches
 from .listener import draw_sound_labels, report_listener, report_sound_labels, write_listener, write_sound_labels
 from .skin_health import draw_health, report_health, write_health
-from .touch_watch import draw_watch, report_watch, write_watch
+from .touch_watch import draw_watch, report_gestures, report_watch, write_gestures, write_watch
 
 __all__ = [
     "draw_health",

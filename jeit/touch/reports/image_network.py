@@ -17,7 +17,7 @@ from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_i
 from jeit.report.stream import PICTURES
 from jeit.touch.networks import ImageNetwork, LearntImages
 from jeit.touch.networks.measured import FrameDepth
-from jeit.touch.networks.places import centroids_of
+from jeit.touch.networks.sensed import centroids_of
 from jeit.touch.simulate.contact.indent_sets import pixel_places
 
 LEARNT_FILES = ("network.jeit", "report.json", "learning.png")

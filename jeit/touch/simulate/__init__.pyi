@@ -1,18 +1,14 @@
-from .contact.foundation import Foundation
 from .contact.half_space import HalfSpace
 from .contact.indent_sets import IndentSet
 from .contact.indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
-from .contact.indents import Indent, IndentDraws, depth_maps, indented_cells, relative_changes
-from .contact.joined import Joined, Placed
-from .contact.materials import Material, material
+from .contact.indents import Indent, IndentDraws, PressDraws, depth_maps, indented_cells, relative_changes
+from .contact.joined import Joined, Placed, TwoSheets
+from .contact.materials import Foundation, Material, material
 from .contact.press import MovingPress, Press
-from .contact.press_draws import PressDraws
 from .contact.press_sets import PressSet, open_presses, simulate_presses
 from .contact.pressed_skin import PressedSkin
-from .contact.two_sheets import TwoSheets
-from .people.gesture_stream import GestureStream, simulate_gesture_stream
 from .people.person import Person
-from .people.simulated_gestures import simulate_gestures
+from .people.simulated_gestures import GestureStream, simulate_gesture_stream, simulate_gestures
 
 __all__ = [
     "Bar",

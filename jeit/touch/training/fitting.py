@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from jeit.arguments import check_key, check_kind, describe, is_number
 from jeit.arguments.extras import need_extra
 from jeit.touch.training.batches import ArrayRows, Order
-from jeit.touch.training.checkpoint import Checkpoint, Course, State
+from jeit.touch.training.model_file import Checkpoint, Course, State
 
 # The number of batches between two chances to write a checkpoint; the greatest number of held-out rows that are
 # evaluated at once.

@@ -1,4 +1,10 @@
-"""Descent along minima of local quadratic models, with a line search, behind optimistix's interface.
+"""Minimisation by descent, free or between bounds, and how it ended.
+
+Minimisation between bounds, and how a minimisation ended.
+
+jaxopt is not developed further. It is imported here and nowhere else, so that what replaces it has one place to go.
+
+Descent along minima of local quadratic models, with a line search, behind optimistix's interface.
 
 A Gauss-Newton or Levenberg-Marquardt step is the minimum of a quadratic model of the cost; what that minimum costs to
 find depends on the problem's structure, which the caller knows and a general least-squares solver does not.
@@ -6,7 +12,9 @@ find depends on the problem's structure, which the caller knows and a general le
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
+from enum import StrEnum
 from typing import Any
 
 import equinox as eqx
@@ -14,9 +22,145 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+import scipy
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
-from jeit_solvers.engines import namespace, replace_at
+from jeit_solvers.engines import has_values, namespace, replace_at
+
+
+class Status(StrEnum):
+    """How a minimisation ended. Each is equal to its word, so `status == "converged"` may be written; details such as
+    the number of steps belong in a sentence beside it."""
+
+    CONVERGED = "converged"
+    """The next step would change nothing that matters."""
+    STEP_LIMIT = "step limit"
+    """It took all the steps that it was given."""
+    STALLED = "stalled"
+    """No shorter step lowered the objective."""
+    FAILED = "failed"
+    """What came out is not finite, or the solver broke down."""
+    INFEASIBLE = "infeasible"
+    """Nothing that was found satisfies the constraints."""
+
+    @property
+    def number(self) -> int:
+        """Index of the status, which stands for it in compiled code, where there are no words."""
+        return list(Status).index(self)
+
+    @classmethod
+    def of_number(cls, number: Any) -> "Status":
+        """The one in that place. Raises `ValueError` inside `jax.jit`, where that is not known yet, and for a batch."""
+        if not has_values(number) or np.shape(number) != ():
+            raise ValueError(
+                "status: how a minimisation inside jax.jit or jax.vmap ends is known outside only, one by one; look at "
+                "`outcome`, an array of Status.number, instead."
+            )
+        return list(Status)[int(number)]
+
+
+def ended(result: optx.RESULTS) -> Status:
+    """The status that a result of optimistix stands for; seen outside `jax.jit`, where it has a value."""
+    return Status.of_number(ended_number(result))
+
+
+def ended_number(result: optx.RESULTS) -> Int[Array, ""]:
+    """`Status.number` of what a result of optimistix stands for, inside `jax.jit` too."""
+    limit = result == optx.RESULTS.nonlinear_max_steps_reached
+    other = jnp.where(limit, Status.STEP_LIMIT.number, Status.STALLED.number)
+    return jnp.where(result == optx.RESULTS.successful, Status.CONVERGED.number, other)
+
+
+Objective = Callable[[Float[Array, " n"]], Float[Array, ""]]
+
+
+class BoundedMinimum(eqx.Module):
+    """Result of a minimisation between bounds: `x` (n,), the number of `steps`, and whether it `converged`: a step
+    along the projected gradient would have changed no coordinate by more than the tolerance."""
+
+    x: Float[Array, " n"]
+    steps: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def _jaxopt() -> Any:
+    """jaxopt, imported when it is needed: it warns on import that it is not developed further."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import jaxopt
+    return jaxopt
+
+
+def lbfgsb(
+    objective: Objective,
+    start: Float[Array, " n"],
+    lower: ArrayLike,
+    upper: ArrayLike,
+    *,
+    max_steps: int,
+    tolerance: float,
+) -> BoundedMinimum:
+    """The least value between two bounds (n,) by L-BFGS-B, inside `jax.jit`; coordinates should be of one size."""
+    solver = _jaxopt().LBFGSB(objective, maxiter=max_steps, tol=tolerance, history_size=20)
+    solution = solver.run(start, bounds=(lower, upper))
+    return BoundedMinimum(solution.params, solution.state.iter_num, solution.state.error <= tolerance)
+
+
+def projected_gradient(
+    objective: Objective,
+    start: Float[Array, " n"],
+    lower: ArrayLike,
+    upper: ArrayLike,
+    *,
+    max_steps: int,
+    tolerance: float,
+) -> BoundedMinimum:
+    """The least value between two bounds (n,) by accelerated projected gradients: more steps, each of them cheaper."""
+    jaxopt = _jaxopt()
+    solver = jaxopt.ProjectedGradient(
+        objective, jaxopt.projection.projection_box, maxiter=max_steps, tol=tolerance, acceleration=True
+    )
+    solution = solver.run(start, hyperparams_proj=(lower, upper))
+    return BoundedMinimum(solution.params, solution.state.iter_num, solution.state.error <= tolerance)
+
+
+def scipy_lbfgsb(
+    value_and_gradient: Callable[[Array], tuple[Array, Array]],
+    start: Float[Array, "*shape"],
+    lower: ArrayLike,
+    upper: ArrayLike,
+    *,
+    tolerance: float,
+    max_steps: int = 500,
+    callback: Callable[[Array], None] | None = None,
+) -> tuple[Float[np.ndarray, "*shape"], float, Status]:
+    """The least value between two bounds by SciPy's L-BFGS-B: where, the value there, and how it ended.
+
+    `value_and_gradient`: compiled by the caller, of an array of `start`'s shape. `callback`: is given every accepted
+    point.
+    Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16 (1995) 1190-1208.
+    """
+    shape = np.shape(start)
+    ends = [np.broadcast_to(np.asarray(end, float), shape).ravel() for end in (lower, upper)]
+
+    def of_vector(vector):
+        value, gradient = value_and_gradient(jnp.asarray(vector).reshape(shape))
+        return np.asarray(value, float), np.asarray(gradient, float).ravel()
+
+    found = scipy.optimize.minimize(
+        of_vector,
+        np.asarray(start, float).ravel(),
+        jac=True,
+        tol=tolerance,
+        bounds=np.stack(ends, axis=1),
+        method="L-BFGS-B",
+        callback=None if callback is None else lambda vector: callback(jnp.asarray(vector).reshape(shape)),
+        options={"maxiter": max_steps},
+    )
+    status = Status.CONVERGED if found.success else Status.STEP_LIMIT if found.status == 1 else Status.STALLED
+    return found.x.reshape(shape), float(found.fun), status
+
 
 _LEAST_SCALE = 2.0**-20
 _SUFFICIENT = 1e-4

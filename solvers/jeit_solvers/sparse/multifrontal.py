@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Inexact, Int
 
-from jeit_solvers.batching import differentiable_batches, in_turn, one_by_one
 from jeit_solvers.cores import on_cores, parts_for_cores
-from jeit_solvers.dense.cholesky import inverse_cholesky
-from jeit_solvers.engines import gather_or_zero, has_values, namespace
+from jeit_solvers.dense import inverse_cholesky
+from jeit_solvers.engines import differentiable_batches, gather_or_zero, has_values, in_turn, namespace, one_by_one
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.plan import FactorisationPlan, Stage
 

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Inexact, Int
 from scipy.sparse import csr_array
 
-from jeit_solvers.dense.cholesky import symmetric_inverse
+from jeit_solvers.dense import symmetric_inverse
 from jeit_solvers.sparse.operator import SparseSymmetric
 from jeit_solvers.sparse.pattern import SparsityPattern
 

@@ -13,7 +13,7 @@ from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Rectangle, centroids, disk, layer, measures
 from jeit.protocol import adjacent
 from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts
-from jeit.touch.contacts.cell_outline import outline_of_cells
+from jeit.touch.contacts.cell_finder import outline_of_cells
 from jeit.touch.simulate import Disc, Press, PressedSkin, material
 
 FINDERS = [CellFinder, RasterFinder]

@@ -167,8 +167,8 @@ def test_how_sure_a_support_vector_machine_is_differs():
     """Votes of pairs are the same for nearly all touches; distances from borders are not, and err less."""
     from sklearn.svm import SVC
 
-    from jeit.touch.learnt.classifiers import log_odds
-    from jeit.touch.learnt.machine import Machine
+    from jeit.touch.learnt.array_models import Machine
+    from jeit.touch.learnt.methods import log_odds
 
     rng = np.random.default_rng(0)
     right = rng.integers(0, 4, 600)

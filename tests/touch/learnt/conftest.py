@@ -8,7 +8,7 @@ from made_skins import record
 from thread_limits import libraries_found_once
 
 from jeit.touch import LearntSkin, Presses
-from jeit.touch.learnt import regressors
+from jeit.touch.learnt import methods
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -38,8 +38,8 @@ def few_seconds():
     """Methods that take seconds say the mean, and trees are few; `test_methods` has those methods themselves."""
     with libraries_found_once(), pytest.MonkeyPatch.context() as patch:
         for slow in ("trees", "network", "som"):
-            patch.setitem(regressors.REGRESSORS, slow, Mean)
-        patch.setattr(regressors, "_TREES", 10)
+            patch.setitem(methods.REGRESSORS, slow, Mean)
+        patch.setattr(methods, "_TREES", 10)
         yield
 
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.touch.learnt.channel_choice import choose_channels
-from jeit.touch.learnt.channels import _DIAGONALS, Channels, _missed, _variances
+from jeit.touch.learnt.channels import _DIAGONALS, Channels, _missed, _variances, choose_channels
 
 
 def changes(number, seed, *, noise=0.01):

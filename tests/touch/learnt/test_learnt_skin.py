@@ -8,8 +8,8 @@ import pytest
 from made_skins import CHANNELS, off, record
 
 from jeit.touch import LearntSkin, Presses
-from jeit.touch.learnt import keys
-from jeit.touch.learnt.regressors import REGRESSORS
+from jeit.touch.learnt import labels
+from jeit.touch.learnt.methods import REGRESSORS
 
 FRESH = record(120, seed=1)
 ASK = {key: FRESH[key] for key in ("frames", "reference")}
@@ -219,7 +219,7 @@ def test_labels_and_no_touch():
 @pytest.fixture
 def few_trees(monkeypatch):
     """Fifteen a key, where a hundred and fifty take ten times as long."""
-    monkeypatch.setattr(keys, "_TREES", 15)
+    monkeypatch.setattr(labels, "_TREES", 15)
 
 
 @pytest.mark.usefixtures("few_trees")

@@ -3,10 +3,16 @@
 import numpy as np
 import pytest
 
-from jeit.touch.learnt.classifiers import CLASSIFIERS, log_odds, probabilities, sharpness_of
-from jeit.touch.learnt.gaussian_process import GaussianProcess, _tuned
-from jeit.touch.learnt.nearest import Nearest
-from jeit.touch.learnt.regressors import REGRESSORS
+from jeit.touch.learnt.array_models import Nearest
+from jeit.touch.learnt.methods import (
+    CLASSIFIERS,
+    REGRESSORS,
+    GaussianProcess,
+    _tuned,
+    log_odds,
+    probabilities,
+    sharpness_of,
+)
 
 RNG = np.random.default_rng(0)
 FEATURES = RNG.normal(size=(220, 6)) * np.linspace(2, 0.5, 6)
@@ -17,7 +23,7 @@ ASKED = RNG.normal(size=(50, 6)) * np.linspace(2, 0.5, 6)
 
 @pytest.mark.parametrize("name", sorted(REGRESSORS))
 def test_numbers_are_learnt(name, monkeypatch):
-    monkeypatch.setattr("jeit.touch.learnt.regressors._SHOWN", 20)  # a map of few presses, each shown so often
+    monkeypatch.setattr("jeit.touch.learnt.methods._SHOWN", 20)  # a map of few presses, each shown so often
     said = np.asarray(REGRESSORS[name](FEATURES, TARGETS).predict(ASKED))
     right = np.stack([np.tanh(ASKED[:, 0]), np.sin(ASKED[:, 1])], axis=1)
     guess = np.abs(right - right.mean(axis=0)).mean()
@@ -110,7 +116,7 @@ def test_the_gaussian_process_is_scikit_learns():
 
 def test_few_centres_tell_nearly_what_all_do(monkeypatch):
     whole = GaussianProcess.fit(FEATURES, TARGETS).predict(ASKED)
-    monkeypatch.setattr("jeit.touch.learnt.gaussian_process._CENTRES", 150)
+    monkeypatch.setattr("jeit.touch.learnt.methods._CENTRES", 150)
     few = GaussianProcess.fit(FEATURES, TARGETS)
     assert len(few.centres) == 150
     assert np.abs(few.predict(ASKED) - whole).mean() < 0.05

@@ -9,9 +9,9 @@ import pytest
 from made_skins import record
 
 from jeit.touch import LearntSkin, PlacedMap, Presses, SelfOrganisingMap, read_skin, write_skin
-from jeit.touch.learnt.forest import Forest
+from jeit.touch.learnt.array_models import Forest
+from jeit.touch.learnt.methods import REGRESSORS
 from jeit.touch.learnt.network import Network
-from jeit.touch.learnt.regressors import REGRESSORS
 
 FRESH = record(30, seed=1)
 

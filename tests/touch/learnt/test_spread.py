@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jeit.touch.learnt.spread import Spread
+from jeit.touch.learnt.numbers import Spread
 
 
 def test_deviations_hold_for_errors_of_which_few_are_large():

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jeit.touch import LearntSkin, Presses
-from jeit.touch.learnt.whitening import Whitened, are_repeated
+from jeit.touch.learnt.features import Whitened, are_repeated
 
 
 def record(number, seed):

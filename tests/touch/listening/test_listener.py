@@ -8,12 +8,11 @@ import pytest
 from made_clips import MATERIALS, struck
 
 from jeit.acoustic import Recording
-from jeit.touch.learnt.classifiers import CLASSIFIERS
+from jeit.touch.learnt.methods import CLASSIFIERS
 from jeit.touch.listening import LabelledClips, Listener
 from jeit.touch.listening.feature_images import LENGTH, SoundImages
-from jeit.touch.listening.folds import held_out_folds
 from jeit.touch.listening.learners import LEARNERS, Lesson, LinearLearner, stopping_rows
-from jeit.touch.listening.windows import _pieces
+from jeit.touch.listening.windows import _pieces, held_out_folds
 
 KEY = jax.random.key(0)
 QUICK = tuple(method for method in LEARNERS if "network" not in method)

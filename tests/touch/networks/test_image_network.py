@@ -25,8 +25,7 @@ from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.protocol import adjacent
 from jeit.touch.networks import Preset, learn_images, read_network, write_network
-from jeit.touch.networks.examples import Examples
-from jeit.touch.networks.learn import stand
+from jeit.touch.networks.learn import Examples, stand
 from jeit.touch.simulate import Disc, Indent, relative_changes
 from jeit.touch.training import Plan
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeit.touch.networks.layers import Convolution, doubled
+from jeit.touch.networks.three_stages import Convolution, doubled
 
 
 def test_a_convolution_of_a_doubled_image():

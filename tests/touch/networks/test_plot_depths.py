@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from jeit.touch.plots import plot_depth_map, plot_losses
 from jeit.touch.training import Trained
-from jeit.touch.training.checkpoint import Course
+from jeit.touch.training.model_file import Course
 
 EXTENT = (-0.05, 0.05, -0.04, 0.04)
 

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.touch.networks.sensed import Sensed, depth_of, strength
-from jeit.touch.networks.touches import bodies
+from jeit.touch.networks.sensed import Sensed, bodies, depth_of, strength
 from jeit.touch.simulate import Disc, Indent, depth_maps, indented_cells, relative_changes
 from jeit.touch.simulate.contact.indent_sets import image_places
 

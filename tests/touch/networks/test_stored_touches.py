@@ -10,12 +10,11 @@ import pytest
 from small_networks import bits
 
 from jeit.touch.networks import ImageNetwork
-from jeit.touch.networks.examples import Examples, StoredTouches
-from jeit.touch.networks.touches import touch_draws
-from jeit.touch.networks.training import Runs, mean_and_deviation, shuffled, train_three_stages
+from jeit.touch.networks.learn import Examples, Runs, StoredTouches, mean_and_deviation, shuffled, train_three_stages
+from jeit.touch.networks.sensed import touch_draws
 from jeit.touch.simulate import IndentSet, simulate_presses
 from jeit.touch.training import MappedRows, Plan, Trained
-from jeit.touch.training.checkpoint import Course
+from jeit.touch.training.model_file import Course
 
 PLAN = Plan(rate=2e-3, batch=20, epochs=3, seconds=0.0)
 
@@ -133,7 +132,7 @@ def test_what_the_three_stages_are_taught(stored, other, small_skin, monkeypatch
     """Untrained, the first misses all that it is to redraw; the last leads from the first's ends, which stay."""
     random = np.random.default_rng(0)
     monkeypatch.setattr(
-        "jeit.touch.networks.layers._start",
+        "jeit.touch.networks.three_stages._start",
         lambda key, shape, inputs: jnp.asarray(random.normal(size=shape) * np.sqrt(2 / inputs), jnp.float32),
     )
     indents, path, _ = stored

@@ -1,15 +1,12 @@
-from .foundation import Foundation
 from .half_space import HalfSpace
 from .indent_sets import IndentSet
 from .indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
-from .indents import Indent, IndentDraws, depth_maps, indented_cells, relative_changes
-from .joined import Joined, Placed
-from .materials import Material, material
+from .indents import Indent, IndentDraws, PressDraws, depth_maps, indented_cells, relative_changes
+from .joined import Joined, Placed, TwoSheets
+from .materials import Foundation, Material, material
 from .press import MovingPress, Press
-from .press_draws import PressDraws
 from .press_sets import PressSet, open_presses, simulate_presses
 from .pressed_skin import PressedSkin
-from .two_sheets import TwoSheets
 
 __all__ = [
     "Bar",

@@ -13,8 +13,7 @@ from scipy.spatial import KDTree
 from jeit.design.skin.reached_cells import said
 from jeit.design.skin.touched_cells import padded
 from jeit.touch.simulate.contact.indenters import Disc
-from jeit.touch.simulate.contact.press import Press
-from jeit.touch.simulate.contact.pressure import AbstractSupport
+from jeit.touch.simulate.contact.press import AbstractSupport, Press
 from jeit.touch.simulate.contact.samples import Samples
 
 # A finer lattice is used for contacts on few samples; it resolves all that is as wide as this share of a cell.

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jeit.arguments import describe, is_number
-from jeit.touch.simulate.contact.foundation import check_modulus
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
-from jeit.touch.simulate.contact.pressure import (
+from jeit.touch.simulate.contact.materials import check_modulus
+from jeit.touch.simulate.contact.press import (
     AbstractSupport,
     PressureRaster,
     check_load,

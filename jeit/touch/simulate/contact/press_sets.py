@@ -17,13 +17,12 @@ import numpy as np
 
 from jeit.arguments import check_kind, describe
 from jeit.arguments.extras import need_extra
-from jeit.design.study.cluster import over_cluster
 from jeit.design.study.contents import Contents
-from jeit.design.study.progress import Progress, ProgressReporter
+from jeit.design.study.run import Progress, ProgressReporter, over_cluster
 from jeit.design.study.store import Store, writing
 from jeit.touch.simulate.contact.indent_sets import IndentSet
+from jeit.touch.simulate.contact.indents import PressDraws
 from jeit.touch.simulate.contact.press import Press
-from jeit.touch.simulate.contact.press_draws import PressDraws
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin, check_seconds
 
 # Increased when the simulation of the same set changes.

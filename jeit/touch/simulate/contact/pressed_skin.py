@@ -1,9 +1,24 @@
-"""`PressedSkin`: a skin of some material, and its readings while it is pressed."""
+"""A pressed skin: from loads to conductivity to voltages, with drift and the response of the material.
+
+Effective pressure of a material as a function of the pressure over time: hysteresis, then creep.
+
+**Hysteresis** is a generalised play (Visintin, Differential Models of Hysteresis, 1994, section III.2) between the
+curves w = p, on which load rises, and w = p / (1 − H), on which it falls: w stays as it is between them. It is
+rate-independent; both curves end at zero, and their greatest difference after a load of p is H p.
+
+**Creep** is that of a standard linear solid with several branches: a share a_k of w is delayed,
+
+q = (1 − Σ a_k) w + Σ a_k y_k, τ_k dy_k/dt = w − y_k,
+
+solved exactly for w that is linear between two times.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,17 +31,84 @@ from jeit.design.skin.reached_cells import is_curved
 from jeit.design.skin.touched_cells import TouchedCells, padded
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
-from jeit.forward.assembly import check_conductivity
 from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
+from jeit.forward.system import check_conductivity
 from jeit.mesh import Mesh, centroids, measures
 from jeit.touch.simulate.contact.cell_pressure import pressed_cells
-from jeit.touch.simulate.contact.drift import gains, walk, white_noise
 from jeit.touch.simulate.contact.materials import Material
 from jeit.touch.simulate.contact.press import MovingPress, Press, motions_of, touches_of
-from jeit.touch.simulate.contact.response import advance, held_pressure, unstrained
 from jeit.touch.simulate.contact.samples import Samples
 from jeit_solvers.engines import as_array
+
+
+def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """Draw from `jax.random.normal`: the first of a power of two of draws.
+
+    Fewer programs are then compiled than there are records of different length.
+    """
+    number = math.prod(shape)
+    return np.asarray(jax.random.normal(key, (1 << max(number - 1, 0).bit_length(),)))[:number].reshape(shape)
+
+
+def walk(
+    key: Array, seconds: Float[np.ndarray, " T"], trend: float, deviation: float, number: int
+) -> Float[np.ndarray, "T k"]:
+    """Logarithms (T, k) of k quantities that drift from 0 at time 0: `trend` per second, the same for all, and a random
+    walk of `deviation` per root of a second for each; `seconds` (T,) do not fall."""
+    steps = np.diff(seconds, prepend=0.0)
+    normal = standard_normal(key, (len(steps), number))
+    return trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(np.sqrt(steps)[:, None] * normal, axis=0)
+
+
+def gains(key: Array, spread: float, number: int) -> Float[np.ndarray, " M"]:
+    """Gains of `number` channels: log-normal about 1, `spread` the deviation of the logarithm."""
+    return np.exp(spread * standard_normal(key, (number,)))
+
+
+def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+    """Independent normal noise, volts."""
+    return deviation * standard_normal(key, shape)
+
+
+class Strain(NamedTuple):
+    """State of a material at m places: `held` w (m,) and the `late` branches y (k, m), pascals."""
+
+    held: Float[np.ndarray, " m"]
+    late: Float[np.ndarray, "k m"]
+
+
+def unstrained(material: Material, number: int) -> Strain:
+    """State of `number` places without earlier load."""
+    return Strain(np.zeros(number), np.zeros((len(material.creep), number)))
+
+
+def advance(
+    material: Material, strain: Strain, pressure: Float[np.ndarray, " m"], seconds: float
+) -> tuple[Strain, Float[np.ndarray, " m"]]:
+    """Return the state and the effective pressure (m,), pascals, `seconds` after `strain`, under `pressure` (m,)."""
+    held = np.maximum(pressure, np.minimum(strain.held, pressure / (1 - material.hysteresis)))
+    shares, times = _branches(material)
+    late = strain.late
+    if seconds > 0:
+        passed = seconds / times
+        kept = np.exp(-passed)
+        slope = 1 + np.expm1(-passed) / passed
+        late = kept * late + (1 - kept) * strain.held + slope * (held - strain.held)
+    return Strain(held, late), (1 - shares.sum()) * held + np.sum(shares * late, axis=0)
+
+
+def held_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
+    """Effective pressure (…) of a first load that came at once and has stayed for `seconds`; pascals."""
+    shares, times = _branches(material)
+    return np.asarray(pressure) * (1 - np.sum(shares * np.exp(-seconds / times)))
+
+
+def _branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
+    """Shares and time constants, seconds, of the branches (k, 1)."""
+    pairs = np.array(material.creep, float).reshape(-1, 2)
+    return pairs[:, :1], pairs[:, 1:]
+
 
 # The number of touches processed at once; the numbers of cells by which they are grouped; and the ratio of their extent
 # to the root of their area, above which their contacts are apart.

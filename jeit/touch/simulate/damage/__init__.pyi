@@ -1,7 +1,5 @@
-from .cut import Cut, draw_cut
-from .electrode_fault import FAULTS, ElectrodeFault
-from .recording import Mishap, record_mishaps
-from .repair import mended
+from .cut import Cut, draw_cut, mended
+from .recording import FAULTS, ElectrodeFault, Mishap, record_mishaps
 
 __all__ = [
     "FAULTS",

@@ -1,7 +1,5 @@
-from .gesture_stream import GestureStream, simulate_gesture_stream
-from .manners import GESTURES, MANNERS, TRAITS, Manner
-from .person import Person
-from .simulated_gestures import simulate_gestures
+from .person import GESTURES, MANNERS, TRAITS, Manner, Person
+from .simulated_gestures import GestureStream, simulate_gesture_stream, simulate_gestures
 
 __all__ = [
     "GESTURES",

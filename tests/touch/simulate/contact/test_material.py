@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 
 from jeit.touch.simulate.contact import Foundation, Material, material
-from jeit.touch.simulate.contact.drift import gains, standard_normal, walk, white_noise
 from jeit.touch.simulate.contact.materials import MATERIALS
-from jeit.touch.simulate.contact.response import advance, held_pressure, unstrained
+from jeit.touch.simulate.contact.pressed_skin import (
+    advance,
+    gains,
+    held_pressure,
+    standard_normal,
+    unstrained,
+    walk,
+    white_noise,
+)
 
 PLAIN = Material(0.2, 1e-4, Foundation(1e6, 2e-3), saturation=1.5, half_pressure=20e3)
 HYSTERETIC = dataclasses.replace(PLAIN, hysteresis=0.2)

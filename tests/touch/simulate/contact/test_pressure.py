@@ -6,7 +6,7 @@ import pytest
 from jeit.touch.simulate.contact import Bar, DepthMap, Disc, Foundation, HalfSpace, Joined, Placed, Prism, Ring, ball
 from jeit.touch.simulate.contact.half_space import sinking
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
-from jeit.touch.simulate.contact.pressure import raster
+from jeit.touch.simulate.contact.press import raster
 
 RADIUS, LOAD = 0.01, 0.05
 MIDDLE = np.zeros((1, 2))

@@ -1,0 +1,263 @@
+"""Draw maps over the skin: the loss of a touch, and the receptive fields of microphones."""
+
+from __future__ import annotations
+
+import textwrap
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
+from numpy.typing import ArrayLike
+
+from jeit.acoustic.calibration.calibrate import CalibrationFit
+from jeit.acoustic.plots.surface_view import (
+    FOUND,
+    HALO,
+    MICROPHONE,
+    AnySurface,
+    View,
+    draw_ellipse,
+    draw_legend,
+    draw_surface,
+    outline_of,
+    view_of,
+)
+from jeit.arguments import check_kind, check_name
+from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar, soften_axes
+from jeit_solvers.engines import on_host
+
+# Range in decibels over which the size of a microphone's circle shows the received intensity.
+_RANGE = 30.0
+# Range of a map above its minimum, in standard deviations or decibels.
+_MOST = {"likelihood": 15.0, "consistency": 40.0}
+_MAP_LABELS = {
+    "likelihood": "Standard deviations worse than the best place",
+    "consistency": "Loss above the least (dB)",
+}
+
+
+class Marks(NamedTuple):
+    """Positions marked on a map: the `truth` (d,) and an `estimate` (d,), metres, whose `covariance` (d, d), m², is
+    drawn as its 95 % ellipse."""
+
+    truth: ArrayLike | None = None
+    estimate: ArrayLike | None = None
+    covariance: ArrayLike | None = None
+
+
+def plot_loss_map(
+    values: ArrayLike,
+    surface: AnySurface,
+    *,
+    microphones: ArrayLike | None = None,
+    received: ArrayLike | None = None,
+    marks: Marks | None = None,
+    method: str = "likelihood",
+    title: str | None = None,
+    colour_bar: bool = True,
+    ax: Axes | None = None,
+) -> Axes:
+    """Plot the map of one frame from `Localiser.with_maps`; it is brightest where the touch most probably is.
+
+    `values` (rows, columns), bottom row first, over the box of the outline, NaN outside it. `surface`: a `Calibration`,
+    `MicrophoneArray`, a surface, or an outline. `microphones` (M, d): metres, those of the array unless given; the size
+    of their circles increases with the intensities `received` (M,). `marks`: the truth and an estimate to mark.
+    `method`: "likelihood" maps are drawn as √(2 (map − least)), the number of standard deviations by which a position
+    is worse than the best; the paper's loss, "consistency", in decibels above its minimum. Raises `ValueError` for
+    other methods and shapes, and for marks that are none.
+    """
+    if marks is not None:
+        check_kind("marks", marks, Marks, "Marks, such as Marks(truth=(0.02, 0.01))")
+    pixels = np.asarray(values, float)
+    if pixels.ndim != 2 or not np.isfinite(pixels).any():
+        raise ValueError(f"values has shape {pixels.shape}; give (rows, columns) with at least one finite value.")
+    check_name("method", method, _MAP_LABELS)
+    view = view_of(surface, microphones)
+    number = len(view.microphones)
+    level = None if received is None else np.asarray(received, float)
+    if level is not None and level.shape != (number,):
+        raise ValueError(f"received has shape {level.shape}; give one for each of the {number} microphones.")
+    ax = axes_or_new(ax)
+    shown = _above_least(pixels, method)
+    most = min(float(np.nanmax(shown)), _MOST[method]) or 1.0
+    colours = colormaps[SEQUENTIAL + "_r"].copy()
+    colours.colorbar_extend = "max" if np.nanmax(shown) > most else "neither"  # pyright: ignore[reportAttributeAccessIssue]
+    drawn = ax.imshow(shown, extent=view.extent, origin="lower", interpolation="nearest", cmap=colours, clim=(0, most))
+    drawn.set_clip_path(outline_of(view), ax.transData)
+    handles = draw_surface(ax, view, microphones=level is None and number > 0)
+    if level is not None:
+        handles.append(_draw_levels(ax, view.microphones, level))
+    if marks is not None:
+        handles += _draw_marks(ax, view, marks)
+    draw_legend(ax, handles)
+    ax.set_title(title or "")
+    if colour_bar:
+        draw_colour_bar(ax, drawn, _MAP_LABELS[method])
+    return ax
+
+
+def _draw_marks(ax: Axes, view: View, marks: Marks) -> list[Line2D]:
+    """Draw the marks and return their legend entries. Raises `ValueError` for shapes that do not match the surface."""
+    if marks.covariance is not None and marks.estimate is None:
+        raise ValueError("covariance needs an estimate: the place that it is the covariance of.")
+    handles = []
+    style: dict[str, Any] = {"linestyle": "none", "zorder": 5, "path_effects": HALO}
+    if marks.truth is not None:
+        cross: dict[str, Any] = {"marker": "+", "color": INK, "markersize": 13, "markeredgewidth": 1.8}
+        handles += ax.plot(*view.chart_point(marks.truth, "truth"), label="truth", **cross, **style)
+    if marks.estimate is not None:
+        found, label = view.chart_point(marks.estimate, "estimate"), "estimate"
+        if marks.covariance is not None:
+            draw_ellipse(ax, found, view.chart_covariance(marks.covariance, marks.estimate))
+            label = "estimate, 95 %"
+        handles += ax.plot(*found, marker="o", color=FOUND, markersize=5.5, label=label, **style)
+    return handles
+
+
+def _above_least(pixels: np.ndarray, method: str) -> np.ndarray:
+    least = np.nanmin(pixels)
+    if method == "likelihood":
+        return np.sqrt(2 * (pixels - least))
+    # The loss may vanish in the noiseless case: it is clipped at 120 dB below its maximum.
+    bottom = max(least, 1e-12 * np.nanmax(pixels), np.finfo(float).tiny)
+    return 10 * np.log10(np.maximum(pixels, bottom) / bottom)
+
+
+def _draw_levels(ax: Axes, place: np.ndarray, received: np.ndarray) -> Line2D:
+    """Draw the microphones as circles with areas proportional to their levels in decibels above the least shown."""
+    positive = np.isfinite(received) & (received > 0)
+    loudest = received[positive].max(initial=1e-300)
+    level = 10 * np.log10(np.where(positive, received, 1e-300) / loudest)
+    area = 8 + 150 * np.clip(1 + level / _RANGE, 0, 1)
+    ax.scatter(*place.T, s=area, facecolor="white", edgecolor=MICROPHONE, linewidth=1.2, alpha=0.9, zorder=3)
+    return Line2D(
+        [],
+        [],
+        marker="o",
+        linestyle="none",
+        markersize=8,
+        markerfacecolor="white",
+        markeredgecolor=MICROPHONE,
+        label="microphone, by level",
+    )
+
+
+_TAP = "#8fb4d9"
+
+
+def plot_receptive_fields(
+    fit: CalibrationFit, *, microphones: ArrayLike | None = None, title: str | None = None, ax: Axes | None = None
+) -> Axes:
+    """Plot the intensity at each microphone, relative to the strength of the tap, against distance, with the fitted
+    curve.
+
+    `microphones`: indices of those to draw, all unless given; they are numbered from 0, as in the calibration's
+    messages. Red circles are taps excluded from the fit; the panel of an unusable microphone states the reason. The
+    dashed line is the noise, one standard deviation, relative to a tap of median strength; the number beside the index
+    is the distance at which a microphone receives half the intensity of a tap directly above it. The panels are insets
+    of the returned axes. Raises `ValueError` for microphones that do not exist, and for what is no `CalibrationFit`.
+    """
+    check_kind("fit", fit, CalibrationFit, "a CalibrationFit, as of calibrate_microphones")
+    number = fit.power.shape[1]
+    chosen = np.arange(number) if microphones is None else np.atleast_1d(np.asarray(microphones))
+    if chosen.ndim != 1 or chosen.dtype.kind not in "iu" or not chosen.size:
+        raise ValueError(f"microphones: give indices of microphones, whole numbers; got shape {chosen.shape}.")
+    if chosen.min() < 0 or chosen.max() >= number:
+        raise ValueError(f"microphones must be from 0 to {number - 1}; they are {chosen.min()} to {chosen.max()}.")
+    columns = chosen.size if chosen.size <= 3 else int(np.ceil(np.sqrt(chosen.size)))
+    rows = -(-chosen.size // columns)
+    ax = axes_or_new(ax, (max(4.8, min(11.0, 2.2 * columns)), max(3.6, min(9.0, 1.75 * rows))))
+    ax.set_axis_off()
+    # The height is fixed: matplotlib would search all panels for it.
+    ax.set_title(title or "", loc="left", y=1.0, pad=26)
+    distance = np.linspace(0, float(fit.distance.max()), 200)
+    decay = on_host(fit.calibration.microphone_array.decay)
+    curve = np.asarray(decay.response(np.broadcast_to(distance**2, (number, distance.size))))
+    relative = fit.power / _strengths(fit)[:, None]
+    noise = np.asarray(fit.calibration.microphone_array.noise.deviation) / np.nanmedian(fit.strength)
+    seen = relative[:, chosen][np.isfinite(relative[:, chosen]) & (relative[:, chosen] > 0)]
+    usable = fit.calibration.usable[chosen]
+    curves = curve[chosen][usable] if usable.any() else curve[chosen]
+    low = min(curves.min(), np.quantile(seen, 0.02) if seen.size else np.inf) / 1.5
+    high = max(curves.max(), np.quantile(seen, 0.999) if seen.size else 0.0) * 1.8
+    wide, tall = 1 / columns, 1 / rows
+    for place, index in enumerate(chosen):
+        row, column = divmod(place, columns)
+        panel = ax.inset_axes((column * wide, 1 - (row + 1) * tall, 0.93 * wide, 0.9 * tall))
+        panel.set_in_layout(False)  # their labels extend beyond the axes
+        _draw_field(panel, fit, int(index), relative[:, index], (distance, curve[index], noise[index]), columns)
+        panel.set_xlim(0, 1e3 * distance[-1])
+        panel.set_ylim(low, high)
+        panel.tick_params(labelleft=column == 0, labelbottom=place + columns >= chosen.size)
+    _label(ax, fit, noise_shown=bool(noise[chosen].max() > low))
+    return ax
+
+
+def _label(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
+    """Draw the axis labels shared by all panels, and the legend above them."""
+    label: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": INK}
+    label["annotation_clip"] = False
+    ax.annotate("Distance (mm)", (0.5, 0), (0, -22), ha="center", va="top", **label)
+    ax.annotate("Intensity / strength of the tap", (0, 0.5), (-34, 0), ha="right", va="center", rotation=90, **label)
+    handles = [
+        Line2D([], [], marker="o", linestyle="none", color=_TAP, markersize=4, label="tap"),
+        Line2D([], [], color=INK, linewidth=1.6, label=f"fit, {type(fit.calibration.microphone_array.decay).name}"),
+    ]
+    if noise_shown:
+        handles.append(Line2D([], [], color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), label="noise, 1 σ"))
+    if fit.outlier.any():
+        ring: dict[str, Any] = {"marker": "o", "linestyle": "none", "fillstyle": "none", "markersize": 4}
+        handles.append(Line2D([], [], color=FOUND, label="left out", **ring))
+    place: dict[str, Any] = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": 4}
+    ax.legend(handles=handles, frameon=False, fontsize=9.5, borderpad=0, **place)
+
+
+def _strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
+    """Strength of every tap. Taps excluded from the fit get the median of the strengths estimated from the
+    microphones."""
+    response = np.asarray(on_host(fit.calibration.microphone_array.decay).response(fit.distance.T**2)).T
+    strength = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
+    received = np.isfinite(strength).any(axis=1)
+    median = np.full(len(strength), np.nan)
+    median[received] = np.nanmedian(strength[received], axis=1)
+    return np.where(np.isfinite(fit.strength), fit.strength, median)
+
+
+def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, columns: int) -> None:
+    """Draw one panel: taps, curve and noise of a microphone; `lines`: distances (m), the curve there, and the noise."""
+    distance, curve, noise = lines
+    reason = fit.calibration.reasons[index]
+    shown = np.isfinite(relative) & (relative > 0)
+    panel.set_yscale("log")
+    for which, style in (
+        (shown & ~fit.outlier, {"color": SOFT if reason else _TAP, "alpha": 0.6, "linewidths": 0}),
+        (shown & fit.outlier, {"facecolors": "none", "edgecolors": FOUND, "linewidths": 0.7, "zorder": 2.5}),
+    ):
+        size = 9 if columns <= 2 else 5
+        panel.scatter(1e3 * fit.distance[which, index], relative[which], s=size, rasterized=True, **style)
+    style = {"color": SOFT, "linewidth": 1.2, "linestyle": (0, (1, 1))} if reason else {"color": INK, "linewidth": 1.6}
+    # No curve is drawn for a microphone without readings.
+    near = (distance <= fit.distance[:, index].max()) & shown.any()
+    panel.plot(1e3 * distance[near], curve[near], zorder=3, **style)
+    if noise > 0:
+        panel.axhline(noise, color=SOFT, linewidth=1.0, linestyle=(0, (4, 3)), zorder=1)
+    fontsize = 8.5 if columns <= 5 else 7
+    text: dict[str, Any] = {"transform": panel.transAxes, "va": "top", "path_effects": HALO, "zorder": 4}
+    panel.text(0.05, 0.97, str(index), ha="left", fontsize=fontsize, fontweight="bold", color=INK, **text)
+    if reason:
+        short = textwrap.shorten(reason.split(" (")[0], 60, placeholder=" …")
+        wrapped = textwrap.fill(short, 24 if columns <= 5 else 18)
+        panel.text(0.97, 0.97, wrapped, ha="right", fontsize=fontsize - 1, color=FOUND, **text)
+    elif columns <= 6:
+        half = distance[np.argmin(np.abs(curve / curve[0] - 0.5))]
+        panel.text(0.97, 0.97, f"½ at {1e3 * half:.0f} mm", ha="right", fontsize=fontsize - 1, color=INK, **text)
+    soften_axes(panel)
+    panel.tick_params(length=2.5, labelsize=fontsize - 0.5, which="both")
+    panel.xaxis.set_major_locator(MaxNLocator(4 if columns <= 5 else 3, steps=[1, 2, 5, 10], prune="upper"))
+    panel.yaxis.set_major_locator(LogLocator(numticks=4))
+    panel.yaxis.set_minor_locator(NullLocator())
+    panel.yaxis.set_minor_formatter(NullFormatter())

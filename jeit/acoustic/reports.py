@@ -1,0 +1,204 @@
+"""Reports, tables and plots of acoustic localisation, written to a folder."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jeit.acoustic import Localiser, LocatedTouches
+from jeit.acoustic.calibration.calibrate import CalibrationFit
+from jeit.acoustic.localisation.locate import microphones_in_use
+from jeit.acoustic.localisation.locations import Locations, LocationStatus
+from jeit.acoustic.localisation.pixels import brightness, fade
+from jeit.acoustic.tracking import Track
+from jeit.report.folder import plain, results, version_of, write_json, write_rows
+
+
+def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
+    """Write the calibration to `path` (JSON, for `Calibration.load`) and a plot of it to the same path with suffix
+    `.png`; the folder is created if needed. Raises `ValueError` for a path that is a folder, in no folder, or that of
+    the plot."""
+    path, picture = calibration_files(path)
+    with results(path.parent, (path.name, picture.name)) as made:
+        fit.calibration.save(made / path.name)
+        draw_calibration(fit).savefig(made / picture.name, dpi=130)
+
+
+def calibration_files(path: str | Path) -> tuple[Path, Path]:
+    """Paths of the calibration file and the plot that `write_calibration` writes for `path`. Raises `ValueError` as it
+    does."""
+    path = Path(path)
+    if path.is_dir():
+        raise ValueError(f"path {path} is a folder; give a file, such as {path / 'calibration.json'}.")
+    picture = path.with_suffix(".png")
+    if picture == path:
+        raise ValueError(f"path {path}: the calibration is JSON; give another name, such as {path.stem}.json.")
+    return path, picture
+
+
+def draw_calibration(fit: CalibrationFit):
+    """Plot the receptive fields of all microphones, as a matplotlib `Figure` that needs no display."""
+    from matplotlib.figure import Figure
+
+    from jeit.acoustic.plots import plot_receptive_fields
+
+    figure = Figure(figsize=(9.6, 8.4), layout="constrained")
+    plot_receptive_fields(fit, title=fit.calibration.name, ax=figure.subplots())
+    return figure
+
+
+_PACKAGES = ("jeit", "jax", "numpy", "scipy")
+# Pixels along a side of the maps; frames processed at once.
+_PIXELS, _FRAMES = 100, 256
+
+
+def write_track(found: LocatedTouches, folder: str | Path) -> None:
+    """Write `track.csv`, `report.json` and `track.png` of a result of `locate_touches` into `folder`, created if
+    needed.
+
+    The table has a row for every frame: `time_s`; the estimated position `x_m`, `y_m`, its standard deviations
+    `std_x_m`, `std_y_m` and `covariance` (m², of x and y); `strength`, in units of intensity; `status`; then the
+    smoothed position, `track_x_m`, `track_y_m`, `track_std_x_m`, `track_std_y_m`, and the number of the `touch` from 1.
+    In space, columns for z follow. Missing values are empty. Raises `ValueError` for what cannot be a folder.
+    """
+    with results(folder, ("track.csv", "report.json", "track.png")) as made:
+        columns = _columns(found.locations.position.shape[1])
+        write_rows(made / "track.csv", columns, _rows(found.locations, found.track))
+        write_json(report_track(found), made / "report.json")
+        draw_track(found).savefig(made / "track.png", dpi=150)
+
+
+def report_track(found: LocatedTouches) -> dict[str, Any]:
+    """Report of a result as plain numbers, strings, lists and dictionaries; None for unknown values."""
+    locations, track, calibration = found.locations, found.track, found.calibration
+    touches = []
+    for number, touch in enumerate(track.touches, 1):
+        frames = slice(touch.first, touch.last + 1)
+        strength = locations.strength[frames]
+        kinds = [str(kind) for kind in locations.status[frames] if kind != LocationStatus.NO_TOUCH]
+        touches.append(
+            {
+                "touch": number,
+                "onset_s": touch.onset,
+                "offset_s": touch.offset,
+                "path_length_m": touch.length,
+                "mean_position_m": np.nanmean(track.position[frames], axis=0),
+                "status": {kind: kinds.count(kind) for kind in dict.fromkeys(kinds)},
+                "greatest_strength": np.nanmax(strength),
+            }
+        )
+    second = np.flatnonzero(locations.status == LocationStatus.TWO_TOUCHES)
+    microphones = []
+    for number, (fault, used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
+        share = float(used.mean())
+        microphones.append({"microphone": number, "used_share": share, "fault": fault or None})
+    return plain(
+        {
+            "recording": locations.name,
+            "calibration": calibration.name,
+            "method": found.method,
+            "decay": calibration.microphone_array.decay.name,
+            "frames": len(locations.times),
+            "duration_s": locations.times[-1] - locations.times[0],
+            "status": locations.counts(),
+            "touches": touches,
+            "rejected_frames": int(track.rejected.sum()),
+            "median_standard_deviation_m": _median_deviation(locations),
+            "two_touches": [
+                {
+                    "time_s": float(locations.times[frame]),
+                    "positions_m": [locations.position[frame], locations.second[frame]],
+                    "strengths": [locations.strength[frame], locations.second_strength[frame]],
+                }
+                for frame in second
+            ],
+            "microphones": microphones,
+            "notes": list(locations.notes),
+            "units": {
+                "length": "m",
+                "time": "s",
+                "strength": "intensity of a typical microphone right under the source",
+            },
+            "versions": {name: version_of(name) for name in _PACKAGES},
+        }
+    )
+
+
+def draw_track(found: LocatedTouches):
+    """Plot the track, as a matplotlib `Figure` that needs no display."""
+    from matplotlib.figure import Figure
+
+    from jeit.acoustic.plots import plot_track
+
+    figure = Figure(figsize=(6.6, 5.8), layout="constrained")
+    title = found.locations.name
+    plot_track(
+        found.track, found.locations, found.calibration, overlay=_overlay(found), title=title, ax=figure.subplots()
+    )
+    return figure
+
+
+def _overlay(found: LocatedTouches) -> np.ndarray | None:
+    """Overlay of the maps of all located frames (rows, columns), older frames fainter; None without a touch."""
+    locations, intensities = found.locations, found.intensities
+    located = np.flatnonzero(locations.located & (locations.status != LocationStatus.TWO_TOUCHES))
+    if not located.size:
+        return None
+    microphone_array, use, _ = microphones_in_use(intensities, found.calibration)
+    localiser = Localiser.create(microphone_array, method=found.method, map_shape=(_PIXELS, _PIXELS), compiled=False)
+    times = locations.times[located]
+    time_constant = max(0.3, 0.5 * float(times[-1] - times[0]))
+    image = np.zeros((_PIXELS, _PIXELS))
+    for start in range(0, located.size, _FRAMES):
+        some = located[start : start + _FRAMES]
+        bright = brightness(localiser.maps(intensities.power[some], use[some]), method=found.method)
+        image = np.maximum(image, fade(bright, locations.times[some], at=times[-1], time_constant=time_constant))
+    return image
+
+
+def _columns(d: int) -> list[str]:
+    names = ["time_s", "x_m", "y_m", "std_x_m", "std_y_m", "covariance", "strength", "status"]
+    names += ["track_x_m", "track_y_m", "track_std_x_m", "track_std_y_m", "touch"]
+    if d == 3:
+        names += ["z_m", "std_z_m", "covariance_xz", "covariance_yz", "track_z_m", "track_std_z_m"]
+    return names
+
+
+def _rows(locations: Locations, track: Track):
+    d = locations.position.shape[1]
+    number = np.zeros(len(locations.times), int)
+    for index, touch in enumerate(track.touches, 1):
+        number[touch.first : touch.last + 1] = index
+    raw, smooth = (np.sqrt(np.diagonal(each.covariance, axis1=1, axis2=2)) for each in (locations, track))
+    for k, time in enumerate(locations.times):
+        place, spread = locations.position[k], locations.covariance[k]
+        row = [
+            f"{time:.6f}",
+            *_texts(place[:2]),
+            *_texts(raw[k, :2]),
+            _text(spread[0, 1]),
+            _text(locations.strength[k]),
+        ]
+        row += [locations.status[k], *_texts(track.position[k, :2]), *_texts(smooth[k, :2]), number[k] or ""]
+        if d == 3:
+            row += [_text(place[2]), _text(raw[k, 2]), _text(spread[0, 2]), _text(spread[1, 2])]
+            row += [_text(track.position[k, 2]), _text(smooth[k, 2])]
+        yield row
+
+
+def _median_deviation(locations: Locations) -> float:
+    """Median standard deviation along the longest axis of the located frames' ellipses."""
+    if not locations.located.any():
+        return math.nan
+    return float(np.median(np.sqrt(np.linalg.eigvalsh(locations.covariance[locations.located])[:, -1])))
+
+
+def _text(value) -> str:
+    return f"{value:.9g}" if np.isfinite(value) else ""
+
+
+def _texts(values) -> list[str]:
+    return [_text(value) for value in values]

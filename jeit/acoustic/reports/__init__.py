@@ -1,7 +1,0 @@
-"""Reports, tables and plots of acoustic localisation, written to a folder."""
-
-from __future__ import annotations
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

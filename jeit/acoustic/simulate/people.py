@@ -1,0 +1,258 @@
+"""Simulated people who pat, tickle, stroke and blow on a skin with microphones, with individual traits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from jeit.acoustic.simulate.checks import check_positive
+from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, quiet, record
+from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
+from jeit.acoustic.simulate.synthesis import ONSET, Burst, microphone_noise, sample_times
+from jeit.acoustic.simulate.touches import NOMINAL_SPEED
+from jeit.acoustic.simulate.wind_sound import TURBULENCE, room_sound, wind
+from jeit.arguments import check_key, check_kind, check_name, describe
+
+# From clip to clip of one person, the deviation of the logarithm of every trait; and of `slope`, which is no size, the
+# deviation itself, half of that among people.
+WITHIN, SLOPE_AMONG = 0.25, 0.3
+
+
+@dataclass(frozen=True)
+class Trait:
+    """The `median` of a trait among people, in SI units, and the `spread` of its logarithm from person to person."""
+
+    median: float
+    spread: float
+
+
+SOUND_MANNERS: dict[str, dict[str, Trait]] = {
+    "pat": {
+        "strength": Trait(2.0, 0.4),
+        "length": Trait(0.08, 0.25),
+        "interval": Trait(0.3, 0.3),
+        "slope": Trait(1.5, SLOPE_AMONG),
+    },
+    "tickle": {
+        "strength": Trait(0.7, 0.4),
+        "length": Trait(0.04, 0.25),
+        "interval": Trait(1 / 15, 0.3),
+        "radius": Trait(0.01, 0.3),
+        "slope": Trait(1.0, SLOPE_AMONG),
+    },
+    "stroke": {
+        "strength": Trait(1.0, 0.4),
+        "speed": Trait(0.1, 0.35),
+        "path": Trait(0.12, 0.35),
+        "slope": Trait(0.7, SLOPE_AMONG),
+    },
+    "wind": {
+        "strength": Trait(1.0, 0.4),
+        "radius": Trait(0.03, 0.3),
+        "gusts": Trait(0.15, 0.4),
+        "slope": Trait(TURBULENCE, SLOPE_AMONG),
+    },
+    "none": {},
+}
+"""Of each modality its traits; nobody touches the skin in "none"."""
+
+MODALITIES = tuple(SOUND_MANNERS)
+"""Their names, in the paper's order."""
+
+
+# From tap to tap of one clip, deviations of the logarithms of strength and rhythm; and metres by which a hand that pats
+# lands elsewhere.
+_STRENGTH, _RHYTHM, _ELSEWHERE = 0.25, 0.12, 4e-3
+# Least distance of a touch's centre from the edge, metres; least speed of a hand at a turn, relative to its mean.
+_MARGIN, _SLOWEST = 0.02, 0.1
+# Least length of a burst in samples, whatever trait is drawn.
+_SHORTEST = 0.01
+
+
+class SoundingPerson(eqx.Module):
+    """Traits of one person: `medians`, for each modality its traits by name, in SI units."""
+
+    medians: Mapping[str, Mapping[str, float]] = eqx.field(static=True)
+
+    def __check_init__(self):
+        """Raises `ValueError` for modalities and traits other than those of `SOUND_MANNERS`, and what is no size."""
+        check_kind("medians", self.medians, Mapping, "traits by modality, such as of SoundingPerson.draw(key)")
+        for name, traits in SOUND_MANNERS.items():
+            if set(self.medians.get(name, {})) != set(traits):
+                raise ValueError(f"medians['{name}'] must have {', '.join(traits) or 'no traits'}.")
+            for trait, value in self.medians[name].items():
+                check_positive(f"medians['{name}']['{trait}']", value)
+
+    @classmethod
+    def draw(cls, key: Array) -> "SoundingPerson":
+        """Draw a person: traits log-normal about the population medians, `slope` normal. Raises `ValueError` for no
+        key."""
+        check_key(key)
+        rng = _generator(key)
+        own = {}
+        for name, traits in SOUND_MANNERS.items():
+            own[name] = {}
+            for trait, usual in traits.items():
+                normal = rng.normal()
+                if trait == "slope":
+                    own[name][trait] = max(usual.median + usual.spread * normal, 0.1)
+                else:
+                    own[name][trait] = float(usual.median * np.exp(usual.spread * normal))
+        return cls(own)
+
+    def touch(self, key: Array, modality: str, skin: SoundingSkin, *, duration: float = 2.9) -> SimulatedSound:
+        """Simulate `duration` seconds of one modality at a random position of the skin, without noise.
+
+        Traits are log-normal about the person's own with a deviation of 0.25. Raises `ValueError` for what is no key,
+        skin, modality or duration.
+        """
+        check_skin_and_key(skin, key)
+        check_name("modality", modality, MODALITIES)
+        check_positive("duration", duration)
+        drawn, rest = jax.random.split(key)
+        rng = _generator(drawn)
+        if modality == "none":
+            return _silent(skin, duration)
+        traits = {}
+        for name, own in self.medians[modality].items():
+            if name == "slope":
+                traits[name] = max(own + SLOPE_AMONG / 2 * rng.normal(), 0.1)
+            else:
+                traits[name] = float(own * np.exp(WITHIN * rng.normal()))
+        # The touch has its own spectral slope; the microphones' noise, which depends on the skin's, is not added here.
+        toned = eqx.tree_at(lambda one: one.spectral_slope, skin, traits.pop("slope"))
+        return _MAKES[modality](rng, toned, rest, traits, duration)
+
+
+def _taps(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
+    """Simulate pats and tickles: taps of random strength and rhythm, at positions within `radius`."""
+    burst = Burst(traits["strength"], max(traits["length"], _SHORTEST))
+    interval, radius = traits["interval"], traits.get("radius", _ELSEWHERE)
+    count = int(np.ceil(2 * duration / interval)) + 2
+    gaps = interval * np.exp(_RHYTHM * rng.normal(size=count))
+    # The recording begins at any moment of the rhythm.
+    onsets = ONSET - rng.uniform(0, interval) + np.cumsum(gaps) - gaps[0]
+    onsets = onsets[(onsets > -burst.length) & (onsets < duration)]
+    strengths = burst.strength * np.exp(_STRENGTH * rng.normal(size=len(onsets)))
+    times = sample_times(skin, duration)
+    spread = radius * np.sqrt(rng.uniform(size=len(onsets)))
+    angle = rng.uniform(0, 2 * np.pi, len(onsets))
+    landed = _within(skin, _somewhere(rng, skin) + np.stack([spread * np.cos(angle), spread * np.sin(angle)], axis=-1))
+    blocks = np.maximum(np.searchsorted(onsets, block_times(skin, len(times)) + HOP, side="right") - 1, 0)
+    return record(skin, key, landed[blocks], burst.envelope(times, onsets, strengths), False)
+
+
+def _stroke(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
+    """Simulate a stroke to and fro along a straight path, slower at the turns."""
+    angle, phase = rng.uniform(0, 2 * np.pi, 2)
+    half = traits["path"] / 2 * np.array([np.cos(angle), np.sin(angle)])
+    room = np.array([skin.layer.width, skin.layer.height]) / 2 - _MARGIN
+    half = half * min(1.0, float(np.min(room / np.maximum(np.abs(half), 1e-9))))
+    length = 2 * float(np.linalg.norm(half))
+    middle = np.clip(_somewhere(rng, skin), -(room - np.abs(half)), room - np.abs(half))
+    times = sample_times(skin, duration)
+    # The mean speed of a sine of amplitude L/2 and angular frequency w is L w / π.
+    turning = np.pi * traits["speed"] / length
+    speed = np.maximum(length / 2 * turning * np.abs(np.cos(turning * times + phase)), _SLOWEST * traits["speed"])
+    centres = block_times(skin, len(times))
+    places = _within(skin, middle + np.sin(turning * centres + phase)[:, None] * half)
+    return record(skin, key, places, traits["strength"] * np.sqrt(speed / NOMINAL_SPEED), False)
+
+
+def _wind(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
+    """Simulate an air jet held over one position."""
+    return wind(skin, key, _somewhere(rng, skin), slope=skin.spectral_slope, duration=duration, noise=False, **traits)
+
+
+_MAKES: dict[str, Callable[..., SimulatedSound]] = {"pat": _taps, "tickle": _taps, "stroke": _stroke, "wind": _wind}
+
+
+def _silent(skin: SoundingSkin, duration: float) -> SimulatedSound:
+    """Simulate silence, with nobody there."""
+    silence = quiet(skin, jax.random.key(0), duration=duration)
+    return SimulatedSound(
+        np.zeros_like(silence.samples), skin.rate, np.zeros((0, 2)), np.zeros(0), silence.active, False
+    )
+
+
+def _somewhere(rng: np.random.Generator, skin: SoundingSkin) -> np.ndarray:
+    half = np.array([skin.layer.width, skin.layer.height]) / 2
+    return rng.uniform(-1, 1, 2) * np.maximum(half - _MARGIN, half / 2)
+
+
+def _within(skin: SoundingSkin, places: np.ndarray) -> np.ndarray:
+    half = np.array([skin.layer.width, skin.layer.height]) / 2
+    return np.clip(places, -half, half)
+
+
+def _generator(key: Array) -> np.random.Generator:
+    return np.random.default_rng(np.asarray(jax.random.bits(key, (4,))).tolist())
+
+
+# Decibels: level of the room's sound relative to the microphones' own noise, and its deviation between clips.
+_ROOM, _ROOM_SPREAD = -6.0, 4.0
+
+
+@dataclass(frozen=True)
+class SoundClip:
+    """One clip: the `touch` with its truth, and the `noise` (M, S) added to it; its `modality`, and `person`, a number.
+    The recorded sound is `samples`."""
+
+    touch: SimulatedSound
+    noise: Float[np.ndarray, "M S"]
+    modality: str
+    person: int
+
+    @property
+    def samples(self) -> Float[np.ndarray, "M S"]:
+        """Sum of touch and noise."""
+        return self.touch.samples + self.noise
+
+    def noisier(self, decibels: float) -> Float[np.ndarray, "M S"]:
+        """Samples of the touch with the noise raised by a number of decibels."""
+        return self.touch.samples + 10 ** (decibels / 20) * self.noise
+
+
+def sound_clips(
+    key: Array,
+    skin: SoundingSkin,
+    people: Sequence[SoundingPerson],
+    each: int,
+    *,
+    modalities: Sequence[str] = MODALITIES,
+    duration: float = 2.9,
+) -> Iterator[SoundClip]:
+    """Yield `each` clips of each modality by each person, in this order, one at a time: a set need not fit into memory.
+
+    Noise is the microphones' own and the room's, normal in decibels about -6 dB of that. Every clip has a key of its
+    own. Raises `ValueError` for what is no key, skin, person, modality or number, and no people.
+    """
+    check_skin_and_key(skin, key)
+    check_kind("people", people, (list, tuple), "a list of them, such as [SoundingPerson.draw(key)]")
+    for number, person in enumerate(people):
+        check_kind(f"people[{number}]", person, SoundingPerson, "a SoundingPerson, such as SoundingPerson.draw(key)")
+    if not people:
+        raise ValueError("people: give one at least, such as [SoundingPerson.draw(key)].")
+    check_kind("modalities", modalities, (list, tuple), "a list of names, such as ['pat', 'none']")
+    for number, modality in enumerate(modalities):
+        check_name(f"modalities[{number}]", modality, MODALITIES)
+    if not (isinstance(each, int) and each >= 1):
+        raise ValueError(f"each must be a number of clips, 1 or more; it is {describe(each)}.")
+    check_positive("duration", duration)
+    return _clips(key, skin, people, each, tuple(modalities), duration)
+
+
+def _clips(key, skin, people, each, modalities, duration) -> Iterator[SoundClip]:
+    count = len(sample_times(skin, duration))
+    rows = [(person, modality) for person in range(len(people)) for modality in modalities for _ in range(each)]
+    for number, (person, modality) in enumerate(rows):
+        touched, own, room, loud = jax.random.split(jax.random.fold_in(key, number), 4)
+        touch = people[person].touch(touched, modality, skin, duration=duration)
+        level = _ROOM + _ROOM_SPREAD * float(jax.random.normal(loud))
+        around = room_sound(skin, room, level_db=level, duration=duration).samples
+        yield SoundClip(touch, microphone_noise(skin, own, count) + around, modality, person)

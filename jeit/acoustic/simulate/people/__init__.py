@@ -1,7 +1,0 @@
-"""Simulated people who pat, tickle, stroke and blow on a skin with microphones, with individual traits."""
-
-from __future__ import annotations
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

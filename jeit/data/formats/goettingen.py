@@ -1,0 +1,65 @@
+"""Reader of Göttingen's MCEIT recordings (.get; Goe-MF II, Viasys, Carefusion, and Dräger's before 2007).
+
+Frames of 256 numbers of four bytes (little-endian), without a header, of which 208 are the adjacent voltages, then 16
+currents, 16 voltages of the drives and 16 auxiliary inputs. Dräger's put a text before them, which ends with two empty
+lines. A system that leaves out what reciprocity repeats writes zeros there. The record of a measurement, a text of the
+same name with the ending .prl, says the frame rate, as "Framerate = 13 per second".
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from jeit.data.formats.recording import (
+    CHANNELS,
+    adjacent_recording,
+    content_of,
+    cut_off,
+    description_of,
+    frame_at,
+    measurement_of,
+)
+from jeit.data.measurement import Measurement
+
+DESCRIPTION = "Göttingen MCEIT (.get): 208 adjacent voltages a frame"
+# Bytes of a frame; and how Dräger's text begins and ends, within how many bytes.
+_FRAME, _MARK, _END, _LONGEST = 1024, b"---Draeger EIT-Software", b"\r\n\r\n\r\n", 65536
+_NOTE = "neither unit nor gain of the voltages is known: trust relative changes, not volts."
+_NO_RATE = "the file says no rate, nor a record beside it (.prl); give it by [data] frame_rate."
+_RATE = re.compile(rb"Framerate\s*=\s*(\d+(?:\.\d+)?)\s*per second", re.IGNORECASE)
+
+
+def recognises(path: Path) -> bool:
+    """True for a .get file."""
+    return path.suffix.lower() == ".get"
+
+
+def read(path: Path, description: str | Path | None = None) -> Measurement:
+    """Read all frames. Raises `ValueError` for no whole frame, and where nothing in it is a voltage."""
+    content, start = content_of(path), 0
+    if content.startswith(_MARK):
+        end = content.find(_END, 0, _LONGEST)
+        if end < 0:
+            raise ValueError(f"{path.name}: its text does not end with two empty lines before the frames; is it whole?")
+        start = end + len(_END)
+    number, left = frame_at(content, start, _FRAME, path)
+    values = np.frombuffer(content, "<f4", number * _FRAME // 4, start).reshape(number, -1)[:, :CHANNELS]
+    described, rate = description_of(path, description), _recorded_rate(path)
+    no_rate = (_NO_RATE,) if rate is None and described.layout.frame_rate is None else ()
+    times = None if rate is None else np.arange(number) / rate
+    return measurement_of(path, adjacent_recording(values, times, (_NOTE, *no_rate, *cut_off(left))), described)
+
+
+def _recorded_rate(path: Path) -> float | None:
+    """Frames a second, from the record beside a file; None where there is none, or it does not say."""
+    for ending in (".prl", ".PRL"):
+        record = path.with_suffix(ending)
+        if record.is_file():
+            with record.open("rb") as file:
+                said = _RATE.search(file.read(_LONGEST))
+            if said and float(said[1]) > 0:
+                return float(said[1])
+    return None

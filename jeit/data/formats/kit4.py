@@ -1,0 +1,63 @@
+"""Reader of the KIT4 tank archive (University of Eastern Finland, doi 10.5281/zenodo.1203914)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jeit.data.formats import _matlab
+from jeit.data.measurement import Measurement
+from jeit.data.screening import screen
+from jeit.electrodes import BoundaryElectrodes
+from jeit.layout import ring
+from jeit.mesh import Disk
+from jeit.protocol import from_matrices
+
+DESCRIPTION = "KIT4 tank archive (.mat with Uel, CurrentPattern, MeasPattern)"
+RADIUS = 0.14
+ELECTRODE_WIDTH = 0.025
+# A starting value for calibration, ohm·m: the empty tank fits about 1e-4 m over 1.3 mS.
+CONTACT_IMPEDANCE = 0.08
+
+
+def recognises(path: Path) -> bool:
+    """True for a .mat file with the archive's three variables."""
+    names = {"Uel", "CurrentPattern", "MeasPattern"}
+    return path.suffix.lower() == ".mat" and names <= _matlab.variable_names(path)
+
+
+def read(path: Path) -> Measurement:
+    """Read one file of the archive: one frame of 79 drives × 16 cyclic differences = 1,264 channels.
+
+    Channels go drive by drive. The 16 differences of a drive sum to zero, so 15 are independent; all are kept, with
+    those that touch driven electrodes (`Measurement.without_driven_channels` masks these). The tank is 0.14 m in
+    radius, electrode 1 at 12 o'clock, then clockwise.
+
+    Raises `ValueError` for a file of another shape.
+    """
+    keys = "Uel", "CurrentPattern", "MeasPattern"
+    content = _matlab.load(path, *keys)
+    voltages, current, difference = (_matlab.numbers(content, key, path) for key in keys)
+    electrodes, drives = current.shape
+    if difference.shape[0] != electrodes or voltages.shape != (difference.shape[1], drives):
+        raise ValueError(
+            f"{path.name}: Uel {voltages.shape} should be (measurements, drives) = ({difference.shape[1]}, "
+            f"{drives}), as MeasPattern {difference.shape} and CurrentPattern {current.shape} say. Is the "
+            "file damaged?"
+        )
+    protocol = from_matrices(
+        1e-3 * current.T,
+        difference.T.astype(float),
+        name=f"KIT4, {drives} drives, {difference.shape[1]} adjacent differences",
+    )
+    return screen(
+        voltages.T.ravel(),
+        protocol,
+        electrodes=BoundaryElectrodes(ring(RADIUS, electrodes, clockwise=True), ELECTRODE_WIDTH, CONTACT_IMPEDANCE),
+        domain=Disk(RADIUS),
+        name=path.stem,
+        source=str(path),
+        notes=(
+            "currents are assumed to be in milliamperes (±1.41421 in the file, without a unit).",
+            f"electrodes are assumed to be {100 * ELECTRODE_WIDTH:.1f} cm wide, which fits the empty tank best.",
+        ),
+    )

@@ -1,0 +1,65 @@
+"""Reader of the Kuopio Tomography Challenge 2023 (doi 10.5281/zenodo.8252370)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from jeit.data.formats import _matlab
+from jeit.data.measurement import Measurement
+from jeit.data.screening import screen
+from jeit.electrodes import BoundaryElectrodes
+from jeit.layout import ring
+from jeit.mesh import Disk
+from jeit.protocol import from_matrices
+
+DESCRIPTION = "Kuopio Tomography Challenge 2023 (.mat with Mpat, and Inj and Uel or Injref and Uelref)"
+RADIUS = 0.115
+ELECTRODE_ANGLE = np.radians(5.625)
+# A starting value for calibration, ohm·m: the empty tank fits nearly none.
+CONTACT_IMPEDANCE = 0.01
+
+
+def recognises(path: Path) -> bool:
+    """True for a .mat file with the challenge's variables."""
+    if path.suffix.lower() != ".mat":
+        return False
+    names = _matlab.variable_names(path)
+    return "Mpat" in names and ({"Inj", "Uel"} <= names or {"Injref", "Uelref"} <= names)
+
+
+def read(path: Path) -> Measurement:
+    """Read one file: one frame of 76 drives × 31 neighbour differences = 2,356 channels, drive by drive.
+
+    NaN entries (missing electrodes of the harder levels) become the mask. The tank is 0.115 m in radius, 32
+    electrodes of 5.625°, electrode 1 at 12 o'clock, then counter-clockwise. Currents are the recorded
+    amplitudes, drive by drive.
+
+    Raises `ValueError` for a file of another shape.
+    """
+    suffix = "" if "Inj" in _matlab.variable_names(path) else "ref"
+    keys = f"Inj{suffix}", f"Uel{suffix}", "Mpat"
+    content = _matlab.load(path, *keys)
+    current, voltages, difference = (_matlab.numbers(content, key, path) for key in keys)
+    electrodes, drives = current.shape
+    channels = drives * difference.shape[1]
+    if difference.shape[0] != electrodes or voltages.size != channels:
+        raise ValueError(
+            f"{path.name}: {voltages.size} voltages, but {drives} drives and {difference.shape[1]} "
+            f"measurement patterns make {channels}. Is the file damaged?"
+        )
+    protocol = from_matrices(
+        1e-3 * current.T,
+        difference.T.astype(float),
+        name=f"KTC 2023, {drives} drives, {difference.shape[1]} adjacent differences",
+    )
+    return screen(
+        voltages.ravel(),
+        protocol,
+        electrodes=BoundaryElectrodes(ring(RADIUS, electrodes), RADIUS * ELECTRODE_ANGLE, CONTACT_IMPEDANCE),
+        domain=Disk(RADIUS),
+        name=path.stem,
+        source=str(path),
+        notes=("currents are assumed to be in milliamperes (about 1.4 in the file, without a unit).",),
+    )

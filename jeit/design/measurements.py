@@ -1,0 +1,374 @@
+"""Measurement selection: candidate measurements, and the choice of the most informative."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_key
+from jeit_solvers.dense import inverse_cholesky
+from jeit_solvers.engines import has_values
+
+
+class Candidates(eqx.Module):
+    """Sensitivity of each of M candidate measurements, whitened by its noise and by the prior.
+
+    **Fields**: `rows` (M, r), f_i of every candidate; `weight` (r, r), the matrix V that sums up a covariance.
+    """
+
+    rows: Float[Array, "M r"]
+    weight: Float[Array, "r r"]
+
+    @classmethod
+    def create(
+        cls, jacobian: ArrayLike, product: ArrayLike, noise: ArrayLike, *, weights: ArrayLike | None = None
+    ) -> "Candidates":
+        """Candidates with these `jacobian` and `noise` under a prior with covariance Γ.
+
+        - `jacobian`: J (M, m) of all candidate measurements, as of `ForwardModel.jacobian`.
+        - `product`: ΓJᵀ (m, M), a prior's `covariance_product` times the variance of the conductivity.
+        - `noise`: standard deviation of each measurement, (M,) or one for all, in volts.
+        - `weights`: W (m,) of the cells in "A"; their areas make it an integral. All 1 unless given.
+
+        Exact for any prior, and meant for up to a few thousand candidates: it takes O(M³) operations. Works under
+        `jit` and `vmap`. Raises `ValueError` for shapes that do not fit, values that are not finite, noise that is
+        not positive and negative weights.
+        """
+        jacobian, product, noise, weights = _check(jacobian, product, noise, weights, ("cells", "measurements"))
+        if product.shape != jacobian.shape[::-1]:
+            raise ValueError(f"product has shape {product.shape}; ΓJᵀ has one column for each of {len(jacobian)} rows.")
+        return _from_product(jacobian, product, noise, weights)
+
+    @classmethod
+    def from_factor(
+        cls, jacobian: ArrayLike, factor: ArrayLike, noise: ArrayLike, *, weights: ArrayLike | None = None
+    ) -> "Candidates":
+        """Candidates under a prior with covariance SSᵀ, `factor` S (m, r); the rest as in `create`.
+
+        For any number of candidates, such as all drives with all measurements. Where S omits small parts of the
+        variance (a prior's `basis`), the information of precise measurements on these parts is omitted too, which
+        overrates the share of few measurements. Raises `ValueError` for shapes or values that do not go together.
+        """
+        jacobian, factor, noise, weights = _check(jacobian, factor, noise, weights, ("cells", "coefficients"))
+        return cls(jacobian @ factor / noise[:, None], factor.T @ (weights[:, None] * factor))
+
+    @property
+    def num_candidates(self) -> int:
+        """Number of candidates, M."""
+        return self.rows.shape[0]
+
+
+def _check(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Array, Array, Array, Array]:
+    """Check the arguments of `Candidates` and return them as arrays of matching shapes; `prior` has this `shape`."""
+    jacobian, prior = jnp.asarray(jacobian, float), jnp.asarray(prior, float)
+    noise = jnp.asarray(noise, float)
+    if jacobian.ndim != 2 or prior.ndim != 2 or jacobian.shape[1] != prior.shape[0]:
+        raise ValueError(
+            f"jacobian has shape {jacobian.shape} and the prior's matrix {prior.shape}; give (measurements, cells) and "
+            f"({', '.join(shape)})."
+        )
+    weights = jnp.ones(len(prior)) if weights is None else jnp.asarray(weights, float)
+    if noise.shape not in ((), jacobian.shape[:1]):
+        raise ValueError(f"noise has shape {noise.shape}; give one number, or one for each of {len(jacobian)} rows.")
+    if weights.shape != prior.shape[:1]:
+        raise ValueError(f"weights has shape {weights.shape}; give one for each of the {len(prior)} cells.")
+    named = {"jacobian": jacobian, "the prior's matrix": prior, "noise": noise, "weights": weights}
+    for name, values in named.items():
+        if not has_values(values):
+            continue
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} has NaN or infinite values; leave out measurements that have none.")
+        if name == "noise" and np.min(values) <= 0:
+            raise ValueError("noise must be positive: the standard deviation of each measurement, in volts.")
+        if name == "weights" and np.min(values) < 0:
+            raise ValueError("weights must not be negative.")
+    return jacobian, prior, jnp.broadcast_to(noise, jacobian.shape[:1]), weights
+
+
+@jax.jit
+def _from_product(jacobian, product, noise, weights) -> Candidates:
+    """Whitened rows from ΓJᵀ, in coefficients for which the data are independent: S = ΓJᵀ N^-½ U Λ^-½ where N^-½ JΓJᵀ
+    N^-½ = UΛUᵀ, N the noise.
+
+    SSᵀ is the part of Γ that the measurements depend on; they are independent of the rest.
+    """
+    kernel = jacobian @ product / (noise[:, None] * noise)
+    values, vectors = jnp.linalg.eigh((kernel + kernel.T) / 2)
+    seen = values > len(values) * jnp.finfo(values.dtype).eps * values[-1]
+    root = jnp.sqrt(jnp.where(seen, values, 1))
+    factor = product @ (vectors / noise[:, None] * jnp.where(seen, 1 / root, 0))
+    return Candidates(vectors * jnp.where(seen, root, 0), factor.T @ (weights[:, None] * factor))
+
+
+Criterion = Literal["D", "A"]
+# Least relative gain of information by a swap; below it rounding errors could cause endless swaps.
+_WORTH = 1e-9
+
+
+class Selection(eqx.Module):
+    """The chosen measurements, and their information relative to that of all candidates.
+
+    **Fields**
+
+    - `chosen`: (N,) indices of the candidates, the most informative first; `protocol.subset(chosen)` measures them.
+    - `gains`: (N,) information added by each greedy choice, before any exchange; non-increasing for "D".
+    - `information`: of the chosen ("D": nats, "A": variance removed), and `total`, of all candidates.
+    - `swaps`: number of swaps by the exchange; `settled`: whether no further swap increases the information.
+    """
+
+    chosen: Int[Array, " N"]
+    gains: Float[Array, " N"]
+    information: Float[Array, ""]
+    total: Float[Array, ""]
+    swaps: Int[Array, ""]
+    settled: Bool[Array, ""]
+
+    @property
+    def share(self) -> Float[Array, ""]:
+        """Information of the chosen over that of all candidates."""
+        return self.information / self.total
+
+
+def select_measurements(
+    candidates: Candidates,
+    number: int,
+    *,
+    criterion: Criterion = "D",
+    exchange: bool = True,
+    max_swaps: int | None = None,
+) -> Selection:
+    """Select `number` of the candidates so as to lose the least information.
+
+    The selection is greedy: each step adds the candidate with the largest gain. Then, with `exchange`, the best swap of
+    a chosen for another candidate is repeated until none helps (Fedorov's exchange) or `max_swaps` (default `number`)
+    are made. Deterministic. The greedy set has at least 1 - 1/e of the best possible "D" (the criterion is submodular);
+    `information_bound` bounds how much better any other set could be. A greedy choice costs O(M r) operations, a swap
+    O(N M r). Works under `jit` and `vmap`: one call for many layouts.
+
+    Raises `ValueError` for a number that is not from 1 to M, and another criterion.
+    """
+    _check_number(candidates, number, criterion)
+    limit = 0 if not exchange else number if max_swaps is None else max_swaps
+    if not isinstance(limit, int) or limit < 0:
+        raise ValueError(f"max_swaps must be a whole number from 0; it is {max_swaps!r}.")
+    return _select(candidates, number, criterion, limit)
+
+
+def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -> Float[Array, "..."]:
+    """Information of sets of candidates: (...,) for sets `chosen` (..., N), of N different candidates each.
+
+    Raises `ValueError` for numbers that are no candidates.
+    """
+    chosen = jnp.asarray(chosen)
+    if chosen.ndim == 0 or not jnp.issubdtype(chosen.dtype, jnp.integer):
+        raise ValueError(f"chosen has shape {chosen.shape} of {chosen.dtype}; give integers (..., N).")
+    _check_number(candidates, chosen.shape[-1], criterion)
+    if has_values(chosen) and not ((chosen >= 0) & (chosen < candidates.num_candidates)).all():
+        raise ValueError(f"chosen must be from 0 to {candidates.num_candidates - 1}.")
+    return _of_sets(candidates, chosen.reshape(-1, chosen.shape[-1]), criterion).reshape(chosen.shape[:-1])
+
+
+def information_bound(
+    candidates: Candidates, number: int, *, criterion: Criterion = "D", iterations: int = 50
+) -> Float[Array, ""]:
+    """Upper bound of the information of any `number` candidates.
+
+    If every candidate may be measured in part, 0 ≤ w_i ≤ 1 with Σw_i = N, the information is a concave function of w,
+    and each of its tangents bounds it. The least bound in the iterations of the Frank-Wolfe method towards the maximum
+    is returned; more `iterations` tighten it. The bound is tight where many candidates carry similar information, and
+    loose where the noise is so low that each candidate adds information, since fractions of all then exceed any few.
+
+    Boyd and Vandenberghe, Convex Optimization (2004), section 7.5. Raises `ValueError` for a `number` that is not from
+    1 to that of the candidates, or another criterion.
+    """
+    _check_number(candidates, number, criterion)
+    return _bound(candidates, number, criterion, iterations)
+
+
+def random_selections(key: Array, num_candidates: int, number: int, count: int) -> Int[Array, "count N"]:
+    """`count` sets of `number` different candidates each, all equally likely: (count, number).
+
+    Raises `ValueError` for a `number` that is not from 1 to that of the candidates.
+    """
+    if not 1 <= number <= num_candidates:
+        raise ValueError(f"number must be from 1 to the {num_candidates} candidates; it is {number}.")
+    check_key(key)
+    orders = jax.vmap(lambda one: jax.random.permutation(one, num_candidates))(jax.random.split(key, count))
+    return orders[:, :number]
+
+
+def nearest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
+    """The `number` shortest of all pairs of electrodes at `centres` (L, d): channels of `two_terminal(L)`.
+
+    `lengths` (L, L) between them, metres, in place of distances straight through space: `SurfaceLayout.lengths`. This
+    pattern measures every position from close by. Of pairs of the same length the first are taken. Raises `ValueError`
+    for a number that is not from 1 to L(L - 1)/2.
+    """
+    return _by_length(centres, number, 1, lengths)
+
+
+def farthest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
+    """The `number` longest pairs, as in `nearest_pairs`: a pattern that drives current through the whole skin.
+
+    Raises `ValueError` for a number that is not from 1 to L(L - 1)/2.
+    """
+    return _by_length(centres, number, -1, lengths)
+
+
+def _by_length(centres, number: int, sign: int, lengths) -> np.ndarray:
+    centres = np.asarray(centres, float)
+    first, second = np.triu_indices(len(centres), 1)
+    if not 1 <= number <= len(first):
+        raise ValueError(
+            f"number must be from 1 to the {len(first)} pairs of {len(centres)} electrodes; it is {number}."
+        )
+    # Rounded to a nanometre, so that pairs as long as each other are taken in their order.
+    if lengths is None:
+        lengths = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    elif np.shape(lengths) != (len(centres), len(centres)):
+        raise ValueError(
+            f"lengths has shape {np.shape(lengths)}; give one between any two of {len(centres)} electrodes."
+        )
+    length = np.asarray(lengths, float)[first, second].round(9)
+    return np.argsort(sign * length, kind="stable")[:number]
+
+
+def _check_number(candidates: Candidates, number: int, criterion: Criterion) -> None:
+    if criterion not in ("D", "A"):
+        raise ValueError(f"criterion must be 'D' or 'A'; it is {criterion!r}.")
+    if not isinstance(number, int) or not 1 <= number <= candidates.num_candidates:
+        raise ValueError(f"number must be a whole number from 1 to {candidates.num_candidates}; it is {number!r}.")
+
+
+@partial(jax.jit, static_argnames=("number", "criterion", "limit"))
+def _select(candidates: Candidates, number: int, criterion: Criterion, limit: int) -> Selection:
+    chosen, gains = _greedy(candidates, number, criterion)
+    total, _ = _tangent(candidates, jnp.ones(candidates.num_candidates), criterion)
+
+    def helps(state):
+        _, swaps, settled = state
+        return (swaps < limit) & ~settled
+
+    def swap(state):
+        chosen, swaps, _ = state
+        gain = _swap_gains(candidates, chosen, criterion)
+        leaves, enters = jnp.unravel_index(jnp.argmax(gain), gain.shape)
+        worth = gain[leaves, enters] > _WORTH * total
+        return jnp.where(worth, chosen.at[leaves].set(enters), chosen), swaps + worth, ~worth
+
+    chosen, swaps, settled = jax.lax.while_loop(helps, swap, (chosen, jnp.array(0), jnp.array(False)))
+    kept = _of_sets(candidates, chosen[None], criterion)[0]
+    return Selection(chosen, gains, kept, total, swaps, settled)
+
+
+def _greedy(candidates: Candidates, number: int, criterion: Criterion):
+    """Greedy choice (N,) and the gain of each: a Cholesky factorisation of I + FFᵀ with the best candidate as the next
+    pivot.
+
+    Choosing p turns C into C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p); the u found so far are the rows of `known`.
+    """
+    rows, weight = candidates.rows, candidates.weight
+
+    def covariance(known, vector):
+        return vector - known.T @ (known @ vector)
+
+    def step(state, turn):
+        known, left, removable, free = state
+        gain = jnp.log1p(left) if criterion == "D" else removable / (1 + left)
+        best = jnp.argmax(jnp.where(free, gain, -jnp.inf))
+        direction = covariance(known, rows[best]) / jnp.sqrt(1 + left[best])
+        seen = rows @ direction
+        if criterion == "A":
+            # f_jᵀCVC f_j with the new C; VC f_j and Cf_j change by multiples of `seen`.
+            pulled = weight @ direction
+            change = rows @ covariance(known, pulled)
+            removable = jnp.maximum(removable - 2 * seen * change + (direction @ pulled) * seen**2, 0)
+        state = known.at[turn].set(direction), jnp.maximum(left - seen**2, 0), removable, free.at[best].set(False)
+        return state, (best, gain[best])
+
+    left = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: the remaining variance of reading j
+    removable = jnp.sum((rows @ weight) * rows, axis=1)  # f_jᵀCVC f_j
+    known = jnp.zeros((number, rows.shape[1]))
+    start = (known, left, removable, jnp.ones(len(rows), bool))
+    return jax.lax.scan(step, start, jnp.arange(number))[1]
+
+
+def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[Array, "N M"]:
+    """Gain of the set by a swap of its i-th member for candidate j, (N, M); -inf where j is in the set.
+
+    With c_ij = f_iᵀC f_j and b_ij = f_iᵀCVC f_j, C of the present set, a swap multiplies det C⁻¹ by
+    q = (1 + c_jj)(1 - c_ii) + c_ij² and lowers tr VC by ((1 - c_ii) b_jj + 2 c_ij b_ij - (1 + c_jj) b_ii) / q.
+    """
+    rows, weight = candidates.rows, candidates.weight
+    picked = rows[chosen]
+    cross = picked @ rows.T
+    # C F_Tᵀ = F_Tᵀ (I + F_T F_Tᵀ)⁻¹: c_ij and 1 - c_ii come without a difference of large numbers.
+    root = _inverse_root(cross[:, chosen])
+    half = root @ cross
+    c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(half**2, axis=0), 0)
+    c_ij = root.T @ half
+    rest_i = jnp.sum(root**2, axis=0)[:, None]  # 1 - c_ii
+    ratio = (1 + c_j) * rest_i + c_ij**2
+    if criterion == "D":
+        gain = jnp.log(ratio)
+    else:
+        smoothed = rows - c_ij.T @ picked  # rows f_jᵀC
+        kept = root.T @ (root @ picked) @ weight  # rows f_iᵀCV
+        b_ij = kept @ smoothed.T
+        b_j = jnp.sum((smoothed @ weight) * smoothed, axis=1)
+        gain = (rest_i * b_j + 2 * c_ij * b_ij - (1 + c_j) * b_j[chosen][:, None]) / ratio
+    return gain.at[:, chosen].set(-jnp.inf)
+
+
+def _of_set(candidates: Candidates, weighted: Float[Array, "M r"], chosen, criterion: Criterion):
+    """Information of one set, from the N × N system I + F_T F_Tᵀ; `weighted` are the rows times V."""
+    picked = candidates.rows[chosen]
+    root = _inverse_root(picked @ picked.T)
+    if criterion == "D":
+        return -2 * jnp.sum(jnp.log(jnp.diag(root)))
+    return jnp.sum((root @ weighted[chosen]) * (root @ picked))
+
+
+@partial(jax.jit, static_argnames="criterion")
+def _of_sets(candidates: Candidates, sets, criterion: Criterion):
+    weighted = candidates.rows @ candidates.weight
+    return jax.lax.map(lambda chosen: _of_set(candidates, weighted, chosen, criterion), sets, batch_size=64)
+
+
+def _tangent(candidates: Candidates, parts: Float[Array, " M"], criterion: Criterion):
+    """Information where candidate i counts `parts[i]` times, and its derivative (M,), from the r × r system C⁻¹."""
+    rows, weight = candidates.rows, candidates.weight
+    root = _inverse_root(rows.T @ (parts[:, None] * rows))
+    half = root @ rows.T
+    if criterion == "D":
+        return -2 * jnp.sum(jnp.log(jnp.diag(root))), jnp.sum(half**2, axis=0)  # f_jᵀC f_j
+    smoothed = root.T @ half
+    value = jnp.trace(weight) - jnp.sum((root @ weight) * root)
+    return value, jnp.sum(smoothed * (weight @ smoothed), axis=0)  # f_jᵀCVC f_j
+
+
+def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
+    """L⁻¹ of the Cholesky factor of I + `matrix`: matrix products alone, which batch where LAPACK's solves may not."""
+    return inverse_cholesky(jnp.eye(len(matrix)) + matrix[None])[0]
+
+
+@partial(jax.jit, static_argnames=("number", "criterion", "iterations"))
+def _bound(candidates: Candidates, number: int, criterion: Criterion, iterations: int):
+    def step(turn, state):
+        parts, bound = state
+        value, slope = _tangent(candidates, parts, criterion)
+        _, best = jax.lax.top_k(slope, number)
+        target = jnp.zeros_like(parts).at[best].set(1.0)
+        bound = jnp.minimum(bound, value + slope @ (target - parts))
+        return parts + 2 / (turn + 2) * (target - parts), bound
+
+    start = jnp.full(candidates.num_candidates, number / candidates.num_candidates)
+    # From turn 2, half a step: the whole one of turn 0 would forget where it began.
+    return jax.lax.fori_loop(2, iterations + 2, step, (start, jnp.array(jnp.inf)))[1]

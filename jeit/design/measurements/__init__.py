@@ -1,1 +1,0 @@
-"""Measurement selection: candidate measurements, and the choice of the most informative."""

@@ -1,0 +1,173 @@
+"""Reports of layouts: two compared, and one improved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jeit.design.comparison import LayoutComparison
+from jeit.design.improvement import ImprovedLayout
+from jeit.design.scores import Scores
+from jeit.layout import write_layout
+from jeit.mesh import Disk, Domain, Rectangle
+from jeit.report.folder import describe_domain, plain, results, write_json
+
+# Most letters of a name in the plot.
+_LONGEST = 32
+
+
+def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> None:
+    """Write `comparison.png` and `report.json` into `folder`, created if needed.
+
+    Raises `ValueError` for what cannot be one.
+    """
+    with results(folder, ("comparison.png", "report.json")) as made:
+        write_json(report_layout_comparison(result), made / "report.json")
+        draw_layout_comparison(result).savefig(made / "comparison.png", dpi=130)
+
+
+def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
+    """Report of both "layouts", and the "options" of skins and touches, as plain numbers and strings."""
+    skin, response = result.skins[0], result.responses[0]
+    options = {
+        "thickness_mm": 1e3 * skin.thickness,
+        "conductivity_S_per_m": skin.conductivity,
+        "pairs": skin.model.protocol.num_measurements,
+        "taxels": len(response.taxels.areas),
+        "contrast": result.contrast,
+        "margin_mm": 1e3 * result.margin,
+        "places": result.places,
+        "cell_mm": None if skin.cell_size is None else 1e3 * skin.cell_size,
+        "seed": result.seed,
+    }
+    return plain({"layouts": result.figures, "options": options})
+
+
+def draw_layout_comparison(result: LayoutComparison):
+    """Plot the sensitivity and taxel maps of both layouts on one scale, and their histograms, as a matplotlib
+    `Figure`."""
+    from matplotlib.artist import Artist
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch, PathPatch
+
+    from jeit.design.plots import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
+    from jeit.design.plots.travel import outline_path
+    from jeit.layout.surface_layout import flat_layout
+    from jeit.plot.axes import INK, bare, draw_scale_bar
+
+    figure = Figure(figsize=(14.4, 8.8), layout="constrained")
+    figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12)
+    axes = figure.subplots(2, 3, width_ratios=(1.1, 1.1, 1))
+    both = result.responses
+    highest = max(float(one.sensitivity.values.max()) for one in both)
+    largest = max(float(one.taxels.max_area) for one in both)
+    names = distinct_names([_shortened(one.layout.name) for one in both])
+    for row, name, one in zip(axes, names, both, strict=True):
+        centres, outline = one.layout.centres, flat_layout(one.layout).known_outline
+        plot_sensitivity_map(
+            one.sensitivity, electrodes=centres, limit=highest, title=f"{name}: sensitivity", ax=row[0]
+        )
+        plot_taxels(one.taxels, electrodes=centres, limit=largest, title=f"{name}: taxels", ax=row[1])
+        # The colour bar, drawn last, is placed by the touched part; both maps show the whole skin.
+        for bar in (row[1].lines[-1], row[1].texts[-1]):
+            bar.remove()
+        draw_scale_bar(row[1], outline.extent)
+        for ax in row[:2]:
+            ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9))
+            bare(ax, outline.extent, numbered=False)
+    plot_sensitivity_histograms({name: one.sensitivity for name, one in zip(names, both, strict=True)}, ax=axes[0, 2])
+    plot_taxel_areas({name: one.taxels for name, one in zip(names, both, strict=True)}, ax=axes[1, 2])
+    disc: dict[str, Any] = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": INK}
+    handles: list[Artist] = [Line2D([], [], label="electrode", **disc)]
+    if result.margin > 0:
+        untouched = f"not touched: {1e3 * result.margin:.3g} mm wide"
+        handles.append(Patch(facecolor="white", edgecolor=INK, linewidth=0.9, label=untouched))
+    figure.legend(handles=handles, loc="outside lower left", ncols=2, frameon=False)
+    return figure
+
+
+def distinct_names(names: list[str]) -> list[str]:
+    """Two names, numbered if they are the same."""
+    return names if names[0] != names[1] else [f"{name} ({k})" for k, name in enumerate(names, 1)]
+
+
+def _shortened(name: str) -> str:
+    """A layout's name, shortened to fit above a map."""
+    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"
+
+
+def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
+    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into `folder`, created if needed.
+
+    Raises `ValueError` for what cannot be one.
+    """
+    with results(folder, ("layout.csv", "layout.svg", "travel.png", "report.json")) as made:
+        write_layout(result.layout, made / "layout.csv")
+        write_layout(result.layout, made / "layout.svg")
+        draw_improved_layout(result).savefig(made / "travel.png", dpi=150)
+        write_json(report_improved_layout(result), made / "report.json")
+
+
+def draw_improved_layout(result: ImprovedLayout):
+    """Plot the electrodes' paths, as a matplotlib `Figure`."""
+    from matplotlib.figure import Figure
+
+    from jeit.design.plots import plot_travel
+
+    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    found = result.optimisation
+    plot_travel(found, found.best or 0, keep_out=result.space.keep_out, ax=figure.subplots())
+    return figure
+
+
+def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
+    """Report of the optimisation, figures of the given layout ("start") and of the better one ("optimised"), both on
+    the finer mesh, and the options, as plain numbers and strings; None where there is no finite value."""
+    found, skin, space = result.optimisation, result.skin, result.space
+    content = {
+        "layout": result.start.name,
+        "status": found.status,
+        "reason": found.reason,
+        "start": _figures(result.before),
+        "optimised": _figures(result.after),
+        "starts": found.values,
+        "steps": found.history.shape[1] - 1,
+        "seed": result.seed,
+        "options": {
+            "thickness_mm": 1e3 * skin.thickness,
+            "conductivity_S_per_m": skin.conductivity,
+            "noise_V": result.noise,
+            "minimum_spacing_mm": 1e3 * space.minimum_spacing,
+            "keep_out_mm": [_region(domain) for domain in space.keep_out],
+            "symmetry": space.symmetry,
+            "sizes": space.sizes,
+            "num_points": result.num_points,
+        },
+    }
+    return plain(content)
+
+
+def _figures(scores: Scores) -> dict[str, Any]:
+    return {
+        "worst_sensitivity_V": scores.worst,
+        "mean_sensitivity_V": scores.mean,
+        "uniformity": scores.uniformity,
+        "mean_variance": scores.mean_variance,
+        "log_information_nats": scores.log_information,
+        "largest_variance": scores.largest_variance,
+        "mean_localisation_error_m": scores.localisation_error.mean(),
+    }
+
+
+def _region(domain: Domain) -> str | dict[str, Any]:
+    """Region in the format of the command: a disc "x,y,radius" or rectangle "x1,y1,x2,y2", millimetres; others in
+    words."""
+    if isinstance(domain, Disk):
+        numbers = (*domain.centre, domain.radius)
+    elif isinstance(domain, Rectangle):
+        low_x, high_x, low_y, high_y = domain.extent
+        numbers = (low_x, low_y, high_x, high_y)
+    else:
+        return describe_domain(domain)
+    return ",".join(f"{1e3 * number:.6g}" for number in numbers)

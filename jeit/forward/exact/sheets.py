@@ -1,0 +1,309 @@
+"""Exact voltages of homogeneous disks and of sheets with discs, flat or curved.
+
+Exact solutions of a disk fed through its rim: point electrodes, and the complete electrode model.
+
+A disk fed through its rim: the Neumann-to-Dirichlet kernel, and point electrodes.
+
+A current density j(φ) (A/m) leaving the rim of a disk of radius a and sheet conductivity σ inwards raises
+the rim's potential, up to a constant, to
+
+    u(θ) = ∫ N(θ − φ) j(φ) a dφ,    N(δ) = 1/(πσ) Σ_k λ_k cos(kδ)/k .
+
+For the homogeneous disk λ_k = 1 and the series is −log|2 sin(δ/2)|/(πσ) (u = r^k cos kθ has σ ∂u/∂r = σk/a
+times itself on the rim). With a concentric inclusion of radius ρa and conductivity σ_i, matching
+potential and current on r = ρa gives
+
+    λ_k = (1 − μ ρ^{2k}) / (1 + μ ρ^{2k}),    μ = (σ_i − σ)/(σ_i + σ),
+
+so that the inclusion adds the smooth series −2 Σ_k μρ^{2k}/(1 + μρ^{2k}) cos(kδ)/k to the logarithm
+(Isaacson 1986, "Distinguishability of conductivities by electric current computed tomography").
+
+The complete electrode model on the rim of a disk, to many digits.
+
+On electrode l, an arc of half-angle h_l about θ_l, the current density obeys the integral equation
+
+    z_l j(θ) + ∫ N(θ − φ) j(φ) a dφ = U_l − c,    a ∫ j dθ = I_l,
+
+of the second kind (N: the kernel of `jeit.forward.exact.sheets`). With z > 0 the density is bounded, and behaves like
+s log s at a distance s from an electrode's edge; Legendre polynomials of degree < p on each arc therefore
+give electrode potentials to O(p^-6). The logarithm on one and the same arc is integrated exactly:
+
+    ∫∫ P_m(x) P_n(y) log|x − y| dx dy = 8 / [(m+n)(m+n+2)((m−n)²−1)]   for m + n even and positive,
+
+0 for m + n odd and 4 log 2 − 6 for m = n = 0 (from ∫ P_n(x) log|y−x| dx = 2 (Q_{n+1} − Q_{n−1})(y)/(2n+1)
+and ∫ P_m Q_n = 2/((m−n)(m+n+1)) for m + n odd, DLMF 14.17). All else is smooth and left to Gauss-Legendre.
+
+Disc electrodes lying on a conducting sheet that is itself a disk with an insulated rim.
+
+Under a disc of radius b the contact takes current from the sheet everywhere, σ Δu = (u − U)/z, so that with
+the transfer length λ = √(σz) the potential there is U + Σ_n A_n I_n(r/λ) cos n(φ − φ_n); outside the discs u
+is harmonic.
+
+One disc in the middle, all current leaving through the rim, has only n = 0: a closed form. For several discs
+anywhere, the field about each disc is expanded in its own multipoles (b/r)^n and in the regular harmonics
+(r/b)^n that the other discs and the mirror images in the rim raise there; matching value and flux on r = b
+gives
+
+    multipole_n = regular_n (n − q_n)/(n + q_n),    q_n = (b/λ) I_n'(b/λ) / I_n(b/λ),
+
+a linear system whose truncation error falls geometrically with the number of multipoles. A harmonic function
+h satisfies the insulating condition on |w| = a when h(a²/w̄), its image, is added.
+
+Sheets that are curved, fed through points: a closed sphere, and a sleeve that is open at its ends.
+
+A current of one ampere fed into a sphere of sheet conductivity σ at a point, and taken out evenly all over it, raises
+
+    u = −1/(2πσ) log |chord|
+
+there: stereographic projection is conformal, and turns it into the plane's logarithm.
+
+Round a sleeve of radius R, u is a Fourier series in n φ. An endless one has, for n > 0 and s = |z − z'|/R,
+
+    1/(2πσ) Σ_n e^{−ns} cos(nφ) / n = −1/(4πσ) log(1 − 2 e^{−s} cos φ + e^{−2s}),
+
+and insulated ends at z = 0 and z = H mirror the source, again and again, to 2kH ± z'. What is left is n = 0, a rod with
+a source and an even sink: 1/(2πRσ) [(z² + z'²)/2H − max(z, z')].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ive
+
+
+@dataclass(frozen=True)
+class ConductingDisk:
+    """A disk: `radius` in metres, sheet `conductivity` in siemens, and perhaps a concentric inclusion
+    of `inclusion_ratio` times the radius and of `inclusion_conductivity`."""
+
+    radius: float = 1.0
+    conductivity: complex = 1.0
+    inclusion_ratio: float = 0.0
+    inclusion_conductivity: complex = 1.0
+
+    def inclusion_kernel(self, angle: np.ndarray) -> np.ndarray:
+        """Contribution of the inclusion to the kernel N at angular distance `angle`, in ohm."""
+        angle = np.asarray(angle, dtype=float)
+        if self.inclusion_ratio == 0.0:
+            return np.zeros_like(angle)
+        contrast = (self.inclusion_conductivity - self.conductivity) / (self.inclusion_conductivity + self.conductivity)
+        modes = np.arange(1, 3 + int(np.ceil(np.log(1e-18) / (2.0 * np.log(self.inclusion_ratio)))))
+        decay = contrast * self.inclusion_ratio ** (2.0 * modes)
+        series = np.polynomial.chebyshev.chebval(
+            np.cos(angle), np.concatenate([[0.0], -2.0 * decay / (1.0 + decay) / modes])
+        )
+        return series / (np.pi * self.conductivity)
+
+    def kernel(self, angle: np.ndarray) -> np.ndarray:
+        """The kernel N, in ohm, at angular distances that are not zero."""
+        logarithm = -np.log(np.abs(2.0 * np.sin(np.asarray(angle) / 2.0)))
+        return logarithm / (np.pi * self.conductivity) + self.inclusion_kernel(angle)
+
+
+def point_transfer_impedance(disk: ConductingDisk, angles: np.ndarray) -> np.ndarray:
+    """Rim potential (V) at each of `angles` (L,) for one ampere into each: (L, L), but for a constant.
+
+    A point that feeds a current has an infinite potential; the diagonal holds zero there, so use the matrix
+    only where the measured electrodes are not the driven ones.
+    """
+    distance = angles[:, None] - angles[None, :]
+    off_diagonal = ~np.eye(len(angles), dtype=bool)
+    impedance = np.zeros(distance.shape, dtype=np.result_type(disk.kernel(np.ones(1))))
+    impedance[off_diagonal] = disk.kernel(distance[off_diagonal])
+    return impedance
+
+
+def point_inclusion_effect(disk: ConductingDisk, angles: np.ndarray) -> np.ndarray:
+    """Contribution of the inclusion to `point_transfer_impedance`: (L, L), finite on the diagonal too."""
+    return disk.inclusion_kernel(angles[:, None] - angles[None, :])
+
+
+def point_potentials(disk: ConductingDisk, angles: np.ndarray, current: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Potential (V) at `points` (n, 2), no inclusion; `current` (L,) in all zero entering at `angles`."""
+    feet = disk.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    distance = np.linalg.norm(points[:, None, :] - feet[None, :, :], axis=-1)
+    return -np.log(distance) @ current / (np.pi * disk.conductivity)
+
+
+def logarithm_moments(order: int) -> np.ndarray:
+    """∫∫ P_m(x) P_n(y) log|x − y| over [−1, 1]², for m, n < `order`."""
+    m, n = np.meshgrid(np.arange(order), np.arange(order), indexing="ij")
+    with np.errstate(divide="ignore"):
+        moments = 8.0 / ((m + n) * (m + n + 2.0) * ((m - n) ** 2.0 - 1.0))
+    moments[(m + n) % 2 == 1] = 0.0
+    moments[0, 0] = 4.0 * np.log(2.0) - 6.0
+    return moments
+
+
+def arc_transfer_impedance(
+    disk: ConductingDisk,
+    angles: np.ndarray,
+    widths: np.ndarray,
+    contact_impedance: np.ndarray,
+    order: int = 48,
+) -> np.ndarray:
+    """Electrode potentials (V), of sum zero, for one ampere into each electrode and −1/L into all: (L, L).
+
+    `angles` (L,) are the arcs' centres in radians, `widths` (L,) their lengths in metres along the circle,
+    `contact_impedance` (L,) is in ohm·m. For drive patterns D and measurement patterns M, of sum zero, the
+    voltages are M Z Dᵀ.
+    """
+    num = len(angles)
+    half = np.broadcast_to(widths, (num,)) / (2.0 * disk.radius)
+    z = np.broadcast_to(contact_impedance, (num,))
+    nodes, weights = np.polynomial.legendre.leggauss(2 * order + 16)
+    basis = np.polynomial.legendre.legvander(nodes, order - 1)
+    weighted = weights[:, None] * basis
+
+    theta = angles[:, None] + half[:, None] * nodes
+    dtype = np.result_type(disk.kernel(np.ones(1)), z)
+    galerkin = np.zeros((num, order, num, order), dtype=dtype)
+    source = np.zeros((num, order, num))
+    for row in range(num):
+        for column in range(num):
+            distance = theta[row][:, None] - theta[column][None, :]
+            scale = disk.radius**2 * half[row] * half[column]
+            if row != column:
+                block = weighted.T @ disk.kernel(distance) @ weighted
+            else:
+                # 2 sin(δ/2)/δ, by sinc(x) = sin(πx)/(πx), is the smooth factor of the logarithm's argument.
+                smooth = -np.log(np.sinc(distance / (2.0 * np.pi))) / (np.pi * disk.conductivity)
+                block = weighted.T @ (smooth + disk.inclusion_kernel(distance)) @ weighted
+                logarithm = logarithm_moments(order)
+                logarithm[0, 0] += 4.0 * np.log(half[row])
+                block = block - logarithm / (np.pi * disk.conductivity)
+                mass = disk.radius * half[row] * 2.0 / (2.0 * np.arange(order) + 1.0)
+                galerkin[row, :, row, :] += z[row] * np.diag(mass)
+            galerkin[row, :, column, :] += scale * block
+        source[row, 0, row] = 2.0 * disk.radius * half[row]
+
+    source = source.reshape(num * order, num)
+    density = np.linalg.solve(galerkin.reshape(num * order, num * order), source)
+    impedance = np.linalg.inv(source.T @ density)
+    centring = np.eye(num) - 1.0 / num
+    return centring @ impedance @ centring
+
+
+def disc_contact_resistance(conductivity: complex, radius: float, contact_impedance: complex) -> complex:
+    """U − u on the disc's edge, in volts, per ampere fed into the disc: λ I_0(b/λ) / (2πσb I_1(b/λ)).
+
+    Sheet `conductivity` σ in siemens, `radius` b in metres, `contact_impedance` z in ohm·m². As b/λ → 0 this is
+    z/(πb²), a contact fed uniformly; as b/λ → ∞ it is that of a ring of width λ.
+    """
+    transfer_length = np.sqrt(conductivity * contact_impedance)
+    argument = radius / transfer_length
+    return transfer_length * ive(0, argument) / (2.0 * np.pi * conductivity * radius * ive(1, argument))
+
+
+def centre_to_rim_resistance(
+    disk: ConductingDisk, radius: float, contact_impedance: complex, rim_contact_impedance: complex
+) -> complex:
+    """Resistance (ohm) from a disc electrode in the middle to an electrode that covers the whole rim.
+
+    `contact_impedance` of the disc in ohm·m², of the rim in ohm·m.
+    """
+    spreading = np.log(disk.radius / radius) / (2.0 * np.pi * disk.conductivity)
+    rim = rim_contact_impedance / (2.0 * np.pi * disk.radius)
+    return disc_contact_resistance(disk.conductivity, radius, contact_impedance) + spreading + rim
+
+
+def disc_transfer_impedance(
+    disk: ConductingDisk,
+    positions: np.ndarray,
+    radii: np.ndarray,
+    contact_impedance: np.ndarray,
+    num_multipoles: int = 24,
+) -> np.ndarray:
+    """Electrode potentials (V), of sum zero, for one ampere into each disc and −1/L into all: (L, L).
+
+    `positions` (L, 2) and `radii` (L,) in metres, `contact_impedance` (L,) in ohm·m²; no inclusion.
+    """
+    num = len(positions)
+    order = np.arange(1, num_multipoles + 1)
+    centre = positions[:, 0] + 1j * positions[:, 1]
+    num_samples = 4 * num_multipoles
+    circle = np.exp(2j * np.pi * np.arange(num_samples) / num_samples)
+    # Row n of `analysis` takes samples on a circle to the coefficient of cos nφ; row N + n to that of sin nφ.
+    harmonics = circle ** order[:, None]
+    analysis = np.concatenate([harmonics.real, harmonics.imag]) * (2.0 / num_samples)
+    dtype = np.result_type(disk.conductivity, contact_impedance, 1.0)
+    centring = np.eye(num) - 1.0 / num
+
+    regular = np.zeros((num, 2 * num_multipoles, num, 2 * num_multipoles))
+    regular_mean = np.zeros((num, num, 2 * num_multipoles))
+    fed = np.zeros((num, 2 * num_multipoles, num))
+    fed_mean = np.zeros((num, num))
+    reflection = np.zeros((num, 2 * num_multipoles), dtype=dtype)
+    contact = np.zeros(num, dtype=dtype)
+    for at in range(num):
+        transfer_length = np.sqrt(disk.conductivity * contact_impedance[at])
+        argument = radii[at] / transfer_length
+        slope = argument * ive(order + 1, argument) / ive(order, argument) + order
+        reflection[at] = np.tile((order - slope) / (order + slope), 2)
+        contact[at] = disc_contact_resistance(disk.conductivity, radii[at], contact_impedance[at])
+
+        point = centre[at] + radii[at] * circle
+        for source in range(num):
+            # The image a²/w̄ − w_l = (a² − w_l w̄)/w̄; the log|w̄| it brings cancels over currents of sum zero.
+            logarithm = -np.log(np.abs(disk.radius**2 - centre[source] * point.conj()))
+            # Multipole cos nφ is the real part of (b/(w − w_l))^n, sin nφ minus its imaginary part.
+            field = (radii[source] * point.conj() / (disk.radius**2 - centre[source] * point.conj()))[:, None] ** order
+            if at == source:
+                logarithm = logarithm - np.log(radii[source])
+            else:
+                logarithm = logarithm - np.log(np.abs(point - centre[source]))
+                field = field + (radii[source] / (point - centre[source]))[:, None] ** order
+            multipoles = np.concatenate([field.real, -field.imag], axis=1)
+            regular[at, :, source, :] = analysis @ multipoles
+            regular_mean[at, source] = multipoles.mean(axis=0)
+            fed[at, :, source] = analysis @ logarithm
+            fed_mean[at, source] = logarithm.mean()
+
+    current = centring / (2.0 * np.pi * disk.conductivity)
+    size = num * 2 * num_multipoles
+    scatter = reflection[:, :, None, None] * regular
+    incident = reflection[:, :, None] * fed
+    amplitude = np.linalg.solve(np.eye(size) - scatter.reshape(size, size), incident.reshape(size, num) @ current)
+    potential = fed_mean @ current + regular_mean.reshape(num, size) @ amplitude + contact[:, None] * centring
+    return centring @ potential
+
+
+# Images that are farther off than this many radii are not seen in double precision.
+_FARTHEST = 45.0
+
+
+def sphere_sheet_impedance(positions: np.ndarray, conductivity: complex) -> np.ndarray:
+    """Potential (V) at each of `positions` (L, 3), metres, on a sphere for one ampere into each: (L, L), but for a
+    constant.
+
+    Sheet `conductivity` in siemens. A point that feeds a current has an infinite potential; the diagonal holds zero.
+    """
+    distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    np.fill_diagonal(distance, 1.0)
+    return -np.log(distance) / (2 * np.pi * conductivity)
+
+
+def sleeve_sheet_impedance(
+    radius: float, height: float, angles: np.ndarray, heights: np.ndarray, conductivity: complex
+) -> np.ndarray:
+    """Potential (V) at each of L points of a sleeve for one ampere into each: (L, L), but for what cancels over
+    currents of sum zero.
+
+    `radius` and `height` of the sleeve in metres; the points' `angles` (L,) round it in radians and `heights` (L,)
+    above its lower end in metres; sheet `conductivity` in siemens. The diagonal holds zero, as of a sphere.
+    """
+    around = angles[:, None] - angles
+    z, source = heights[:, None], heights
+    number = int(np.ceil(_FARTHEST * radius / (2 * height))) + 1
+    potential = np.zeros(around.shape)
+    for k in range(-number, number + 1):
+        for apart in (z - source + 2 * k * height, z + source + 2 * k * height):
+            decay = np.exp(-np.abs(apart) / radius)
+            inside = 1 - 2 * decay * np.cos(around) + decay**2
+            potential -= np.log(np.where(inside > 0, inside, 1.0)) / 2
+    rod = (z**2 + source**2) / (2 * height) - np.maximum(z, source)
+    potential += rod / radius
+    np.fill_diagonal(potential, 0.0)
+    return potential / (2 * np.pi * conductivity)

@@ -1,0 +1,181 @@
+"""Exact voltages of homogeneous boxes, cylinders and spheres, as series.
+
+A cylinder, solid or hollow, fed through patches of its wall, the current spread evenly over each (the gap model).
+
+In 0 < z < H with insulated ends and R₁ < r < R₂, insulated at R₁, potentials are sums of F(r) cos nφ cos kz, k = mπ/H,
+with
+
+    F = I_n(kr) − I_n'(kR₁)/K_n'(kR₁) K_n(kr)   for m > 0,      F = (r/R₂)^n + (R₁²/rR₂)^n   for m = 0 < n,
+
+and a density of current j in this mode raises the wall by j F(R₂) / (σ F'(R₂)). A patch of half-angle α and height h at
+(φ_l, z_l) that carries one ampere has the density Σ ε_n ε_m w_nm cos n(φ − φ_l) cos kz / (2πR₂H), with w_nm =
+sin(nα)/(nα) · sin(kh/2)/(kh/2) · cos kz_l, ε_0 = 1 and else 2; its mean potential weighs the modes the same way. Ratios
+of Bessel functions come from their recurrences, those of I_n downwards and those of K_n upwards, which are stable.
+
+An electrode with a contact impedance z that is large against its size over σ carries an even current, and measures the
+mean potential beneath it, besides the drop z I / area at its own contact.
+
+A ball, or a hollow one, fed through caps of its surface, the current spread evenly over each (the gap model).
+
+Between an insulated R₁ and R₂ potentials are sums of F(r) P_n(cos γ), F = r^n + n/(n+1) R₁^{2n+1} r^{−n−1}. A cap of
+half-angle α that carries one ampere has the density Σ (2n+1) w_n P_n(cos γ) / (4πR₂²), γ the angle from its middle,
+with
+
+    w_n = (P_{n−1}(cos α) − P_{n+1}(cos α)) / ((2n+1)(1 − cos α)),
+
+the mean of P_n over the cap; by the addition theorem the mean of P_n(cos γ) over another cap is w_n P_n of the angle
+between them. The effect of contact impedances is described in `jeit.forward.exact.solids`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ive, kve
+
+
+def plate_resistance(length: float, area: float, conductivity: complex, contact_impedance: complex) -> complex:
+    """R = ℓ/(σA) + 2z/A, in ohm: Ohm's law, and one contact layer at each plate.
+
+    In 3-D `area` is in m², `conductivity` in S/m, `contact_impedance` in ohm·m²; in 2-D `area` is the plate's
+    length in metres, `conductivity` in siemens, `contact_impedance` in ohm·m.
+    """
+    return length / (conductivity * area) + 2.0 * contact_impedance / area
+
+
+def face_patch_impedance(
+    size: tuple[float, float, float],
+    positions: np.ndarray,
+    patch: tuple[float, float],
+    conductivity: complex,
+    num_modes: tuple[int, int] = (300, 300),
+) -> np.ndarray:
+    """Mean potential (V) under each of L patches on the lower and upper face of a box for one ampere into each, spread
+    evenly over it (the gap model): (L, L), but for what cancels over currents of sum zero.
+
+    `size` (a, b, c) of the box, which fills 0 ≤ x ≤ a, 0 ≤ y ≤ b, 0 ≤ z ≤ c; `positions` (L, 3) of the patches'
+    middles, with z = 0 or c; `patch`: their widths along x and y, all in metres; `conductivity` in S/m.
+
+    Modes cos(pπx/a) cos(qπy/b), of wave number κ, have the potential coth(κc)/κ on the face that they are fed through
+    and 1/(κ sinh κc) on the other; p = q = 0 is a rod, with c/2 between its ends and an even sink.
+    """
+    a, b, c = size
+    wave = [np.arange(number) * np.pi / side for number, side in zip(num_modes, (a, b), strict=True)]
+    across, along = (
+        np.sinc(k * width / 2 / np.pi) * np.cos(k * positions[:, axis, None])
+        for axis, (k, width) in enumerate(zip(wave, patch, strict=True))
+    )
+    kappa = np.hypot(wave[0][:, None], wave[1])
+    kappa[0, 0] = 1.0
+    doubled = np.outer(*(np.where(k > 0, 2, 1) for k in wave))
+    decay = np.exp(-kappa * c)
+    same, other = (1 + decay**2) / (1 - decay**2) / kappa, 2 * decay / (1 - decay**2) / kappa
+    same[0, 0], other[0, 0] = 0.0, -c / 2
+    together = np.equal.outer(positions[:, 2] > c / 2, positions[:, 2] > c / 2)
+    near, far = (
+        np.einsum("lp,kp,pq,lq,kq->lk", across, across, doubled * mode, along, along, optimize=True)
+        for mode in (same, other)
+    )
+    return np.where(together, near, far) / (a * b * conductivity)
+
+
+@dataclass(frozen=True)
+class ConductingCylinder:
+    """An upright cylinder from z = 0 up to its `height`: `radius` in metres, `conductivity` in S/m, and, if it is
+    hollow, an insulated `inner_radius`."""
+
+    radius: float
+    height: float
+    conductivity: complex = 1.0
+    inner_radius: float = 0.0
+
+    def response(self, num_around: int, num_along: int) -> np.ndarray:
+        """F(R₂) / F'(R₂) of the modes n < `num_around` and m < `num_along`, metres: (n, m); 0 for the constant."""
+        order = np.arange(num_around)[:, None]
+        ratio = self.inner_radius / self.radius
+        found = np.zeros((num_around, num_along))
+        power = ratio ** (2.0 * order[1:, 0])
+        found[1:, 0] = self.radius / order[1:, 0] * (1 + power) / (1 - power)
+        wave = np.arange(1, num_along) * np.pi / self.height
+        outer = _Bessel(num_around, wave * self.radius)
+        found[:, 1:] = 1 / (wave * outer.growth)
+        if self.inner_radius > 0:
+            inner = _Bessel(num_around, wave * self.inner_radius)
+            # Minus what K_n has of F at R₂, against what I_n has of it.
+            share = inner.growth / inner.decay * np.exp(inner.log_i - inner.log_k + outer.log_k - outer.log_i)
+            found[:, 1:] *= (1 + share) / (1 - share * outer.decay / outer.growth)
+        return found
+
+
+def wall_patch_impedance(
+    cylinder: ConductingCylinder,
+    angles: np.ndarray,
+    heights: np.ndarray,
+    size: tuple[float, float],
+    num_modes: tuple[int, int] = (300, 300),
+) -> np.ndarray:
+    """Mean potential (V) under each of L patches for one ampere into each: (L, L), but for a constant.
+
+    The patches' middles lie at `angles` (L,) in radians and `heights` (L,) in metres; all have the `size` (arc length,
+    height) in metres. `num_modes`: how many are summed, round the cylinder and along it.
+    """
+    n, m = np.arange(num_modes[0]), np.arange(num_modes[1])
+    wave = m * np.pi / cylinder.height
+    # sin(x)/x is numpy.sinc(x/π).
+    around = np.sinc(n * size[0] / (2 * cylinder.radius) / np.pi)
+    along = np.sinc(wave * size[1] / 2 / np.pi) * np.cos(wave * heights[:, None])
+    doubled = np.outer(np.where(n > 0, 2, 1), np.where(m > 0, 2, 1))
+    weight = doubled * cylinder.response(*num_modes) * around[:, None] ** 2
+    turned = np.cos(n * (angles[:, None] - angles)[..., None])
+    impedance = np.einsum("lkn,nm,lm,km->lk", turned, weight, along, along, optimize=True)
+    return impedance / (2 * np.pi * cylinder.radius * cylinder.height * cylinder.conductivity)
+
+
+class _Bessel:
+    """Modified Bessel functions of orders n < `count` at x (m,), as arrays (n, m): logarithms, growth I_n'/I_n and
+    decay −K_n'/K_n."""
+
+    def __init__(self, count: int, x: np.ndarray):
+        order = np.arange(count)[:, None]
+        rising, falling = np.empty((count, len(x))), np.empty((count, len(x)))
+        ratio = x / (2.0 * (count + 60))
+        for n in range(count + 59, -1, -1):  # I_{n+1} / I_n
+            ratio = 1 / (2 * (n + 1) / x + ratio)
+            if n < count:
+                rising[n] = ratio
+        falling[0] = kve(1, x) / kve(0, x)  # K_{n+1} / K_n
+        for n in range(1, count):
+            falling[n] = 2 * n / x + 1 / falling[n - 1]
+        zero = np.zeros((1, len(x)))
+        self.log_i = np.log(ive(0, x)) + x + np.concatenate([zero, np.cumsum(np.log(rising[:-1]), axis=0)])
+        self.log_k = np.log(kve(0, x)) - x + np.concatenate([zero, np.cumsum(np.log(falling[:-1]), axis=0)])
+        self.growth, self.decay = rising + order / x, falling - order / x
+
+
+@dataclass(frozen=True)
+class ConductingSphere:
+    """A ball round the origin: `radius` in metres, `conductivity` in S/m, and, if it is hollow, an insulated
+    `inner_radius`."""
+
+    radius: float
+    conductivity: complex = 1.0
+    inner_radius: float = 0.0
+
+
+def cap_impedance(sphere: ConductingSphere, directions: np.ndarray, radius: float, num_modes: int = 400) -> np.ndarray:
+    """Mean potential (V) under each of L caps for one ampere into each: (L, L), but for a constant.
+
+    `directions` (L, 3): unit vectors to the caps' middles; `radius`: of all, metres, in a straight line from the middle
+    to the rim, as of `jeit.electrodes.FaceDiscs`. `num_modes`: how many are summed.
+    """
+    n = np.arange(1, num_modes + 1)
+    cosine = 1 - (radius / sphere.radius) ** 2 / 2  # a chord is 2 R sin(α/2)
+    values = np.polynomial.legendre.legvander(np.array([cosine]), num_modes + 1)[0]
+    mean = (values[n - 1] - values[n + 1]) / ((2 * n + 1) * (1 - cosine))
+    power = (sphere.inner_radius / sphere.radius) ** (2.0 * n + 1)
+    response = (1 + n / (n + 1) * power) / (n * (1 - power))
+    between = np.clip(directions @ directions.T, -1, 1)
+    coefficients = np.concatenate([[0.0], (2 * n + 1) * response * mean**2])
+    series = np.polynomial.legendre.legval(between, coefficients)
+    return series / (4 * np.pi * sphere.radius * sphere.conductivity)

@@ -1,0 +1,240 @@
+"""The topology of meshes: edges, faces, neighbours, and loops of boundary edges."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+# Facets of a positively oriented simplex, each with the simplex on its left (2-D) or its normal outward (3-D).
+LOCAL_FACETS = {
+    2: np.array([[0, 1], [1, 2], [2, 0]]),
+    3: np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
+}
+
+
+def cell_facets(cells: np.ndarray) -> np.ndarray:
+    """All facets of all cells, (m (d + 1), d), cell after cell, oriented outward."""
+    dimension = cells.shape[1] - 1
+    return cells[:, LOCAL_FACETS[dimension]].reshape(-1, dimension)
+
+
+def facet_keys(facets: np.ndarray, num_points: int) -> np.ndarray:
+    """One integer per facet that does not depend on the order of its nodes."""
+    key = np.zeros(len(facets), dtype=np.int64)
+    for column in np.sort(facets.astype(np.int64), axis=1).T:
+        key = key * num_points + column
+    return key
+
+
+def odd_permutation(facets: np.ndarray) -> np.ndarray:
+    """True where sorting the nodes of a facet reverses its orientation."""
+    if facets.shape[1] == 2:
+        return facets[:, 0] > facets[:, 1]
+    a, b, c = facets.T
+    return ((a > b).astype(int) + (b > c) + (a > c)) % 2 == 1
+
+
+def match_facets(facets: np.ndarray, num_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of `facets` with the same nodes, in pairs (first, second), and three of one facet if any occurs so often."""
+    key = facet_keys(facets, num_points)
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    same = ordered[1:] == ordered[:-1]
+    triple = np.flatnonzero(same[1:] & same[:-1])
+    if triple.size:
+        return order[:0], order[:0], order[triple[0] : triple[0] + 3]
+    position = np.flatnonzero(same)
+    return order[position], order[position + 1], order[:0]
+
+
+def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Interior facets as pairs of rows of `cell_facets`, and the rows that have no partner.
+
+    Returns (first, second, single). Raises `ValueError` if a facet belongs to more than two cells, or if
+    the two cells of a facet lie on the same side of it.
+    """
+    facets = cell_facets(cells)
+    width = cells.shape[1]
+    first, second, crowded = match_facets(facets, int(cells.max()) + 1)
+    if crowded.size:
+        raise ValueError(
+            f"cells: the facet with nodes {np.sort(facets[crowded[0]]).tolist()} belongs to more than two cells "
+            f"(among them {(crowded // width).tolist()}), so the mesh is not manifold. Remove the surplus cells."
+        )
+    odd = odd_permutation(facets)
+    folded = np.flatnonzero(odd[first] == odd[second])
+    if folded.size:
+        pair = np.sort([first[folded[0]] // width, second[folded[0]] // width]).tolist()
+        raise ValueError(
+            f"cells: {folded.size} pair(s) of neighbouring cells overlap, first {pair}: both lie on the same side of "
+            "the facet they share. A node has been moved across a facet (an inverted cell), or the cells "
+            "come from two meshes laid over each other. Rebuild the mesh or move the node back."
+        )
+    paired = np.zeros(len(facets), bool)
+    paired[first] = paired[second] = True
+    return first, second, np.flatnonzero(~paired)
+
+
+def order_loops(facets: np.ndarray, points: np.ndarray | None) -> np.ndarray:
+    """Boundary edges of triangles sorted head to tail, loop after loop, the outer loop first.
+
+    Each loop starts at its lowest-numbered node. The outer loop is the one that encloses a positive area; where
+    `points` are not known, that of most edges, and of a surface in space, the longest one. Raises `ValueError` where
+    loops meet in a node.
+    """
+    start, counts = np.unique(facets[:, 0], return_counts=True)
+    if np.any(counts > 1):
+        raise ValueError(
+            f"cells: the boundary touches itself at node {start[counts > 1][0]}: parts of the mesh hang together "
+            "by a single node. Join them along an edge, or separate them and keep one."
+        )
+    following = dict(zip(facets[:, 0].tolist(), facets[:, 1].tolist(), strict=True))
+    loops = []
+    for node in start.tolist():
+        if node not in following:
+            continue
+        loop = [node]
+        while (nxt := following.pop(loop[-1])) != node:
+            loop.append(nxt)
+        loops.append(np.array(loop))
+    if points is None:
+        loops.sort(key=len, reverse=True)
+    elif points.shape[1] == 3:
+        loops.sort(key=lambda loop: -np.linalg.norm(points[loop] - points[np.roll(loop, -1)], axis=1).sum())
+    else:
+        loops.sort(key=lambda loop: -signed_area(points[loop]))
+    return np.concatenate([np.stack([loop, np.roll(loop, -1)], axis=1) for loop in loops])
+
+
+def signed_area(outline: np.ndarray) -> float:
+    """Area enclosed by a closed polygon (k, 2), positive if counter-clockwise (shoelace formula)."""
+    x, y = (outline - outline[0]).T
+    return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
+
+
+# Pairs of sides that are compared at once.
+_PAIRS = 250_000
+
+
+def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray:
+    """Vertices (k, 2) of a simple loop turned the way asked, its first vertex kept; `ValueError` if it is none."""
+    try:
+        loop = np.asarray(vertices, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: expected coordinates of shape (k, 2) in metres; {error}.") from None
+    if loop.ndim != 2 or loop.shape[1] != 2 or len(loop) < 3:
+        raise ValueError(f"{name}: expected at least three vertices, shape (k, 2), got {loop.shape}.")
+    if not np.isfinite(loop).all():
+        bad = int(np.flatnonzero(~np.isfinite(loop).all(axis=1))[0])
+        raise ValueError(f"{name}: vertex {bad} is {loop[bad].tolist()}. Every coordinate must be a finite number.")
+    extent = np.ptp(loop, axis=0).max()
+    length = np.linalg.norm(np.roll(loop, -1, axis=0) - loop, axis=1)
+    if length.min() <= 1e-9 * extent:
+        first = int(np.argmin(length))
+        hint = " Do not repeat the first vertex at the end." if first == len(loop) - 1 else " Remove one."
+        raise ValueError(f"{name}: vertices {first} and {(first + 1) % len(loop)} coincide.{hint}")
+    crossing = _first_crossing(loop)
+    if crossing is not None:
+        raise ValueError(
+            f"{name}: the outline crosses or touches itself: side {crossing[0]} (from vertex {crossing[0]}) meets side "
+            f"{crossing[1]}. Give the vertices in order along a simple closed outline."
+        )
+    if (signed_area(loop) < 0) != clockwise:
+        loop = np.concatenate([loop[:1], loop[:0:-1]])
+    return loop
+
+
+def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
+    """Raise `ValueError` unless every hole lies inside the outline and apart from the others."""
+    for k, hole in enumerate(holes):
+        if not inside(hole, [outer]).all() or _touching(hole, outer):
+            raise ValueError(f"holes[{k}]: does not lie strictly inside the outline. Move or shrink it.")
+        for j, other in enumerate(holes[:k]):
+            if _touching(hole, other) or inside(hole[:1], [other])[0] or inside(other[:1], [hole])[0]:
+                raise ValueError(f"holes[{k}]: overlaps or touches holes[{j}]. Merge them into one hole.")
+
+
+def inside(points: np.ndarray, loops: Sequence[np.ndarray]) -> np.ndarray:
+    """True for points (p, 2) inside an odd number of loops (even-odd rule), (p,)."""
+    result = np.zeros(len(points), bool)
+    x, y = points.T
+    for loop in loops:
+        for (x0, y0), (x1, y1) in zip(loop, np.roll(loop, -1, axis=0), strict=True):
+            if y0 == y1:
+                continue
+            result ^= ((y0 > y) != (y1 > y)) & (x < x0 + (y - y0) * (x1 - x0) / (y1 - y0))
+    return result
+
+
+def along(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
+    """Arc length (p,) from the first vertex of a loop to where it comes nearest to points (p, 2)."""
+    sides = np.roll(loop, -1, axis=0) - loop
+    offset = points[:, None] - loop
+    fraction = np.clip((offset * sides).sum(-1) / (sides**2).sum(-1), 0.0, 1.0)
+    nearest = np.argmin(np.linalg.norm(offset - fraction[..., None] * sides, axis=-1), axis=1)
+    length = np.linalg.norm(sides, axis=1)
+    return np.cumsum(length)[nearest] - (1 - fraction[np.arange(len(points)), nearest]) * length[nearest]
+
+
+def distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distance (p, s) of points (p, 2) from segments given by `start` and `end` (s, 2)."""
+    along = end - start
+    offset = points[:, None] - start
+    fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
+    return np.linalg.norm(offset - fraction[..., None] * along, axis=-1)
+
+
+def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
+
+
+def _meeting(first: np.ndarray, second: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
+    """Pairs (p, 2) of a side of one loop and a side of another that cross or come within `tolerance` of each other, in
+    order, some at a time: only sides whose boxes do are looked at, and never all with all at once."""
+    a, b, c, d = first, np.roll(first, -1, axis=0), second, np.roll(second, -1, axis=0)
+    low, high = np.minimum(a, b) - tolerance, np.maximum(a, b) + tolerance
+    other_low, other_high = np.minimum(c, d), np.maximum(c, d)
+    rows = max(1, _PAIRS // len(second))
+    for start in range(0, len(first), rows):
+        block = slice(start, start + rows)
+        near = ((low[block, None] <= other_high) & (other_low <= high[block, None])).all(axis=-1)
+        one, other = np.nonzero(near)
+        one += start
+        yield np.column_stack([one, other])[_meet(a[one], b[one], c[other], d[other], tolerance)]
+
+
+def _meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, tolerance: float) -> np.ndarray:
+    """Whether each segment from a to b crosses or comes within `tolerance` of that from c to d, all (p, 2)."""
+    crosses = (_turn(a, b, c) * _turn(a, b, d) < 0) & (_turn(c, d, a) * _turn(c, d, b) < 0)
+    near = (_apart(a, c, d) <= tolerance) | (_apart(b, c, d) <= tolerance)
+    return crosses | near | (_apart(c, a, b) <= tolerance) | (_apart(d, a, b) <= tolerance)
+
+
+def _apart(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Distance (p,) of each of points (p, 2) from its own segment."""
+    along, offset = end - start, points - start
+    fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
+    return np.linalg.norm(offset - fraction[:, None] * along, axis=-1)
+
+
+def _first_crossing(loop: np.ndarray) -> tuple[int, int] | None:
+    count = len(loop)
+    for pairs in _meeting(loop, loop, 1e-9 * np.ptp(loop, axis=0).max()):
+        apart = np.abs(pairs[:, 0] - pairs[:, 1])
+        others = pairs[(apart > 1) & (apart < count - 1)]
+        if len(others):
+            return int(others[0].min()), int(others[0].max())
+    # Neighbouring sides share a vertex and can only meet elsewhere by folding back onto each other.
+    before, after = np.roll(loop, 1, axis=0) - loop, np.roll(loop, -1, axis=0) - loop
+    cosine = (before * after).sum(1) / (np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1))
+    folded = np.flatnonzero(cosine > 1 - 1e-12)
+    if folded.size:
+        vertex = int(folded[0])
+        return (vertex - 1) % count, vertex
+    return None
+
+
+def _touching(first: np.ndarray, second: np.ndarray) -> bool:
+    return any(len(pairs) for pairs in _meeting(first, second, 1e-9 * np.ptp(second, axis=0).max()))

@@ -1,0 +1,294 @@
+"""The five attributes of touch of Silvera Tawil et al. 2011, section IV-A: measures of a skin's resolution.
+
+Each is computed from recordings of a skin; `touch_attributes` requests all the touches that it needs, from a robot or a
+simulated skin, and measures them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jeit.arguments import check_key, check_kind, describe, is_number, real_array
+from jeit.arguments.moved import with_moved_names as _with_moved_names
+from jeit.inverse.linear.one_step import LinearReconstruction
+from jeit.touch.contacts import Contact, ImageNoise, find_contacts
+from jeit.touch.contacts.finder import AbstractFinder
+
+# The least number of loads, and of touches with each.
+_LEVELS, _REPEATS = 3, 3
+# Shares of the response's rise or fall at which its time begins and ends.
+_BEGUN, _DONE = 0.1, 0.9
+
+
+class Localisation(NamedTuple):
+    """Error of the estimated places of touches.
+
+    `mean`, standard `deviation` and `most`, the greatest, metres; `missed`: the share of touches that were not found.
+    """
+
+    mean: float
+    deviation: float
+    most: float
+    missed: float
+
+
+class ContactArea(NamedTuple):
+    """Linear relation of estimated to true contact areas: `least` + `gain` × the true area, m², with this
+    `correlation`.
+
+    `least` is the estimated area of a point, a measure of the skin's blur.
+    """
+
+    gain: float
+    least: float
+    correlation: float
+
+
+def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Weber's ratio: at each of the k loads, newtons, the least relative change of load that can be detected.
+
+    It is the standard deviation of the response to the load over its slope, and over the load; infinite where the
+    response does not rise. Returns the loads and the ratios. `load` (n,), newtons, three or more different loads, each
+    applied three times or more; `response` (n,), in any unit, such as the peak of an image. Such a change moves the
+    response by one deviation (d′ = 1). Raises `ValueError` for fewer, loads that are not positive, other lengths, and
+    NaN.
+    """
+    load, response = _pair("load", load, "response", response)
+    if (load <= 0).any():
+        raise ValueError("load must be positive, in newtons.")
+    levels, which, count = np.unique(load, return_inverse=True, return_counts=True)
+    if len(levels) < _LEVELS or count.min() < _REPEATS:
+        raise ValueError(
+            f"load: give {_LEVELS} loads or more, each {_REPEATS} times or more; there are {len(levels)}, one of them "
+            f"{count.min()} times."
+        )
+    mean = np.bincount(which, response) / count
+    deviation = np.sqrt(np.bincount(which, (response - mean[which]) ** 2) / (count - 1))
+    slope = np.gradient(mean, levels) * (1.0 if mean[-1] >= mean[0] else -1.0)
+    with np.errstate(divide="ignore"):
+        return levels, np.where(slope > 0, deviation / (np.maximum(slope, 0.0) * levels), np.inf)
+
+
+def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
+    """Error of touches at a `place` (n, 2 or 3) that are `found` (n, 2 or 3) elsewhere, metres; NaN where none was
+    found.
+
+    Raises `ValueError` for other shapes, and where nothing was found at all.
+    """
+    place = real_array("place", place, "metres (n, 2) or (n, 3)")
+    found = real_array("found", found, "metres, as many as places, NaN where nothing was found")
+    if place.ndim != 2 or place.shape != found.shape or not np.isfinite(place).all():
+        raise ValueError(f"place and found must be (n, 2) or (n, 3); they have shapes {place.shape}, {found.shape}.")
+    off = np.linalg.norm(found - place, axis=1)
+    there = np.isfinite(off)
+    if not there.any():
+        raise ValueError("found: nothing was found of any touch.")
+    off = off[there]
+    return Localisation(float(off.mean()), float(off.std()), float(off.max()), float(1 - there.mean()))
+
+
+def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
+    """The least amount that is detected in half of the trials, in its unit; infinite if there is none.
+
+    An amount may be the separation of two points that are distinguished, or the gap between two touches. `amount` (n,)
+    of each trial; `detected` (n,), true or false. The detected share is assumed to rise with the amount (isotonic
+    regression), linearly between amounts. Raises `ValueError` for other lengths, and NaN.
+    """
+    from scipy.optimize import isotonic_regression
+
+    detected = np.asarray(detected)
+    if detected.dtype.kind != "b":
+        raise ValueError(f"detected must be true or false for each trial; it is {detected.dtype}.")
+    amount, detected = _pair("amount", amount, "detected", detected.astype(float))
+    levels, which, count = np.unique(amount, return_inverse=True, return_counts=True)
+    share = isotonic_regression(np.bincount(which, detected) / count, weights=count).x
+    above = int(np.argmax(share >= 0.5))
+    if share[above] < 0.5:
+        return float("inf")
+    if not above:
+        return float(levels[0])
+    part = (0.5 - share[above - 1]) / (share[above] - share[above - 1])
+    return float(levels[above - 1] + part * (levels[above] - levels[above - 1]))
+
+
+def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
+    """Fit areas `found` (n,) to the true areas `area` (n,), m², by least squares.
+
+    Raises `ValueError` for other lengths, NaN, and areas that are all the same.
+    """
+    area, found = _pair("area", area, "found", found)
+    if len(area) < 2 or (area == area[0]).all():
+        raise ValueError("area: give two different areas, or more.")
+    gain, least = np.polyfit(area, found, 1)
+    alike = found.std() > 0
+    return ContactArea(float(gain), float(least), float(np.corrcoef(area, found)[0, 1]) if alike else 0.0)
+
+
+def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, float]:
+    """Rise and fall time, seconds, of the response (T,) to a touch that begins and ends abruptly.
+
+    The rise is from 10 to 90 % of the greatest value, the fall from 90 to 10 % after its last occurrence; the fall is
+    infinite where the `seconds` (T,) end before it. Before the first frame nothing touches. Raises `ValueError` for
+    other lengths, times that do not rise, NaN, and a response that is nowhere positive.
+    """
+    seconds, response = _pair("seconds", seconds, "response", response)
+    if (np.diff(seconds) <= 0).any():
+        raise ValueError("seconds must rise.")
+    size = float(response.max())
+    if size <= 0:
+        raise ValueError("response is nowhere positive; give one in which touches are.")
+    begun, done = (int(np.argmax(response >= share * size)) for share in (_BEGUN, _DONE))
+    last = len(response) - 1 - int(np.argmax(response[::-1] >= _DONE * size))
+    after = response[last:] < _BEGUN * size
+    gone = float(seconds[last + int(np.argmax(after))] - seconds[last]) if after.any() else float("inf")
+    return float(seconds[done] - seconds[begun]), gone
+
+
+def _pair(first: str, one: ArrayLike, second: str, other: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Check that both are (n,) and finite."""
+    left, right = real_array(first, one, "numbers (n,)"), real_array(second, other, "numbers (n,)")
+    if left.ndim != 1 or left.shape != right.shape or not left.size:
+        raise ValueError(f"{first} and {second} must be (n,), as many; they have shapes {left.shape}, {right.shape}.")
+    for name, values in ((first, left), (second, right)):
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} has NaN or infinite values.")
+    return left, right
+
+
+# Numbers of untouched frames, repeats of a load, places, and trials of each separation.
+_UNTOUCHED, _PRESSED_TIMES, _PLACES, _TRIALS = 50, 8, 40, 8
+# As multiples of the load: those at which Weber's ratio is measured. As multiples of the disc's diameter: separations,
+# from centre to centre, and diameters of other discs under the same pressure.
+_LOADS = np.geomspace(0.25, 4.0, 7)
+_SEPARATIONS = np.array([1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0])
+_DIAMETERS = np.array([1.0, 1.5, 2.0, 3.0, 4.0])
+
+
+class DiscTouch(NamedTuple):
+    """A flat disc of a `diameter`, metres, that presses with a `load`, newtons, at a `place` (x, y), metres."""
+
+    place: Float[np.ndarray, "2"]
+    load: float
+    diameter: float
+
+
+class TouchAttributes(NamedTuple):
+    """The attributes of touch of a skin.
+
+    **Fields**: `load` (k,), newtons, and `weber` (k,), the least relative change of each that is detected;
+    `localisation`, metres; `two_points`, metres, the distance between the centres of two discs that are distinguished
+    in half of the trials; `area`; `rise` and `fall`, seconds, of the image's response to a touch that begins and ends
+    abruptly, None where none was recorded.
+    """
+
+    load: Float[np.ndarray, " k"]
+    weber: Float[np.ndarray, " k"]
+    localisation: Localisation
+    two_points: float
+    area: ContactArea
+    rise: float | None
+    fall: float | None
+
+
+def touch_attributes(
+    key: Array,
+    press: Callable[[Sequence[Sequence[DiscTouch]]], ArrayLike],
+    linear: LinearReconstruction,
+    finder: AbstractFinder,
+    *,
+    middle: ArrayLike = (0.0, 0.0),
+    within: float = 0.03,
+    load: float = 1.0,
+    diameter: float = 0.01,
+    recording: tuple[ArrayLike, ArrayLike] | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> TouchAttributes:
+    """Measure a real or simulated skin, through `linear` images of its changes and the contacts that `finder` finds.
+
+    `press` is given n touches, each a list of simultaneous discs, none for an untouched skin, and returns a frame (n,
+    M), volts, of each: a robot with discs, or a simulated skin. Discs of a `diameter`, metres, press with a `load`,
+    newtons, or from a quarter to four times that, near the `middle` (x, y); for localisation, anywhere in a disk of
+    radius `within`, metres, about it. `recording`: seconds (T,), and frames (T, M) of one touch that begins and ends
+    abruptly. `key` draws places and directions; `progress` is called with what is measured. Raises `ValueError` for
+    what is no key, image or finder, sizes and loads that are not positive, frames of another shape, and a skin on which
+    nothing is found.
+    """
+    check_key(key)
+    if not callable(press):
+        raise ValueError(f"press must be a function from touches to frames (n, M); it is {describe(press)}.")
+    check_kind("linear", linear, LinearReconstruction, "linear images, such as of one_step(...)")
+    check_kind("finder", finder, AbstractFinder, "a finder, such as CellFinder(mesh)")
+    for name, value in (("within", within), ("load", load), ("diameter", diameter)):
+        if not (is_number(value) and value > 0):
+            raise ValueError(f"{name} must be positive; it is {describe(value)}.")
+    centre = real_array("middle", middle, "(x, y) in metres")
+    if centre.shape != (2,):
+        raise ValueError(f"middle must be (x, y) in metres; it has shape {centre.shape}.")
+    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    report = progress or (lambda said: None)
+    report("untouched frames")
+    untouched = _frames(press([[] for _ in range(_UNTOUCHED)]), _UNTOUCHED, linear)
+    reference, noise = untouched.mean(axis=0), ImageNoise.of_frames(linear, untouched)
+
+    def contacts_in(frames: np.ndarray) -> list[list[Contact]]:
+        return [find_contacts(finder, image, noise) for image in np.asarray(linear.image(frames - reference))]
+
+    def contacts(touches: Sequence[Sequence[DiscTouch]]) -> list[list[Contact]]:
+        return contacts_in(_frames(press(touches), len(touches), linear))
+
+    report("Weber ratio")
+    loads = np.repeat(load * _LOADS, _PRESSED_TIMES)
+    levels, weber = weber_ratio(
+        loads, [_size(one) for one in contacts([[DiscTouch(centre, n, diameter)] for n in loads])]
+    )
+    report("localisation")
+    places = centre + (within * np.sqrt(random.uniform(size=_PLACES)))[:, None] * _directions(random, _PLACES)
+    found = contacts([[DiscTouch(place, load, diameter)] for place in places])
+    localisation = point_localisation(places, np.array([_where(one) for one in found]))
+    report("two points")
+    apart = np.repeat(_SEPARATIONS * diameter, _TRIALS)
+    half = apart[:, None] / 2 * _directions(random, len(apart))
+    found = contacts([[DiscTouch(centre + way * one, load, diameter) for way in (-1, 1)] for one in half])
+    two_points = least_detected(apart, np.array([len(one) > 1 for one in found]))
+    report("contact area")
+    wide = np.repeat(_DIAMETERS, _PRESSED_TIMES)
+    found = contacts([[DiscTouch(centre, load * one**2, one * diameter)] for one in wide])
+    area = contact_area(np.pi / 4 * (wide * diameter) ** 2, [one[0].area if one else 0.0 for one in found])
+    rise = fall = None
+    if recording is not None:
+        report("times")
+        seconds = real_array("recording", recording[0], "seconds (T,), and frames (T, M)")
+        frames = _frames(recording[1], len(np.atleast_1d(seconds)), linear)
+        rise, fall = response_times(seconds, [_size(one) for one in contacts_in(frames)])
+    return TouchAttributes(levels, weber, localisation, two_points, area, rise, fall)
+
+
+def _frames(given, number: int, linear: LinearReconstruction) -> Float[np.ndarray, "n M"]:
+    frames, wanted = real_array("frames", given, "volts (n, M)"), (number, linear.num_measurements)
+    if frames.shape != wanted or not np.isfinite(frames).all():
+        raise ValueError(f"frames must be finite volts {wanted}, one for each touch; they have shape {frames.shape}.")
+    return frames
+
+
+def _directions(random: np.random.Generator, number: int) -> Float[np.ndarray, "n 2"]:
+    angle = random.uniform(0, 2 * np.pi, number)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _size(found: list[Contact]) -> float:
+    """Peak of the strongest contact; 0 if there is none."""
+    return abs(found[0].peak) if found else 0.0
+
+
+def _where(found: list[Contact]) -> np.ndarray:
+    """Centroid of the strongest contact; NaN if there is none."""
+    return found[0].centroid if found else np.full(2, np.nan)
+
+
+__getattr__ = _with_moved_names(__name__)

@@ -1,0 +1,298 @@
+"""Trees, nearest neighbours and support vector machines as arrays, for one frame within microseconds.
+
+Support vector machines as arrays, with one decision boundary for each pair of classes.
+
+The sums are taken class by class: with thousands of pairs scikit-learn would take a hundredth of a second for one
+frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jeit.touch.learnt.extras import in_parts
+
+# The number of frames evaluated at once, so that the data stay in the cache.
+_AT_ONCE = 128
+
+
+@dataclass(frozen=True)
+class Forest:
+    """T decision trees of up to n nodes.
+
+    `feature` (T, n) and `threshold` (T, n) of each node; `left` and `right` (T, n): the next nodes where the feature is
+    not above the threshold, and where it is; leaves lead to themselves. `value` (T, n, d) of leaves: the sum of these
+    and `start` (d,) are the answer. `depth`: the number of steps to a leaf. `classes_` (d,), for classifiers.
+    """
+
+    feature: Int[np.ndarray, "T n"]
+    threshold: Float[np.ndarray, "T n"]
+    left: Int[np.ndarray, "T n"]
+    right: Int[np.ndarray, "T n"]
+    value: Float[np.ndarray, "T n d"]
+    depth: int
+    start: Float[np.ndarray, " d"]
+    classes_: np.ndarray
+
+    def __post_init__(self):
+        """Check the depth. Raises `ValueError` for a depth that trees of so many nodes do not have."""
+        if not 0 <= self.depth <= self.value.shape[1]:
+            raise ValueError(f"depth is {self.depth}, of trees of {self.value.shape[1]} nodes.")
+
+    def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
+        """Sum of the trees' values."""
+        trees, size, targets = self.value.shape
+        first_node = size * np.arange(trees)
+        # Nodes are numbered throughout, and all arrays flat: `take` is faster than indexing two axes.
+        feature, threshold = self.feature.ravel(), self.threshold.ravel()
+        below, above = ((one + first_node[:, None]).ravel() for one in (self.left, self.right))
+        value = self.value.reshape(-1, targets)
+
+        def answer(some: np.ndarray) -> np.ndarray:
+            row = (some.shape[1] * np.arange(len(some)))[:, None]
+            flat = np.ascontiguousarray(some).ravel()
+            node = np.broadcast_to(first_node, (len(some), trees))
+            for _ in range(self.depth):
+                further = flat.take(row + feature.take(node)) > threshold.take(node)
+                node = np.where(further, above.take(node), below.take(node))
+            return value.take(node, axis=0).sum(axis=1)
+
+        return in_parts(answer, features, _AT_ONCE) + self.start
+
+    def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
+        """For classifiers: the trees' votes for each class."""
+        return self.predict(features)
+
+    @classmethod
+    def of_boosted(cls, models: list[Any]) -> "Forest":
+        """Convert scikit-learn's histogram gradient boosting, one model for each of d targets."""
+        trees = []
+        for target, model in enumerate(models):
+            for (one,) in model._predictors:
+                nodes = one.nodes
+                value = np.zeros((len(nodes), len(models)))
+                value[:, target] = nodes["value"]
+                leaf = nodes["is_leaf"].astype(bool)
+                trees.append((nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], leaf, value))
+        start = np.array([float(np.ravel(model._baseline_prediction)[0]) for model in models])
+        return cls._joined(trees, start, np.arange(len(models)))
+
+    @classmethod
+    def of_boosted_classes(cls, model: Any) -> "Forest":
+        """Convert scikit-learn's histogram gradient boosting classifier, to log-odds of its classes.
+
+        Of two classes, the second has half of the model's log-odds, and the first the same with a negative sign.
+        """
+        trees, number = [], len(model.classes_)
+        for one in model._predictors:
+            for target, tree in enumerate(one):
+                nodes = tree.nodes
+                own = np.array([-0.5, 0.5]) if number == 2 else np.eye(number)[target]
+                leaf = nodes["is_leaf"].astype(bool)
+                value = np.outer(nodes["value"], own)
+                trees.append((nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], leaf, value))
+        start = np.ravel(model._baseline_prediction).astype(float)
+        start = np.array([-0.5, 0.5]) * start[0] if number == 2 else start
+        return cls._joined(trees, start, model.classes_)
+
+    @classmethod
+    def of_averaged(cls, models: list[Any]) -> "Forest":
+        """Convert scikit-learn's regression trees, whose mean is taken."""
+        trees = []
+        for model in models:
+            one = model.tree_
+            leaf = one.children_left < 0
+            value = one.value[:, :, 0] / len(models)
+            trees.append((one.feature, one.threshold, one.children_left, one.children_right, leaf, value))
+        targets = trees[0][-1].shape[1]
+        return cls._joined(trees, np.zeros(targets), np.arange(targets))
+
+    @classmethod
+    def of_trees(cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool) -> "Forest":
+        """Convert scikit-learn's classification trees: their leaves' class shares, or whole `votes`, weighted."""
+        trees = []
+        for model, weight in zip(models, weights, strict=True):
+            one = model.tree_
+            share = one.value[:, 0] / one.value[:, 0].sum(axis=1, keepdims=True)
+            if votes:
+                share = np.eye(share.shape[1])[share.argmax(axis=1)]
+            value = np.zeros((len(share), len(classes)))
+            value[:, model.classes_.astype(int)] = weight * share
+            leaf = one.children_left < 0
+            trees.append((one.feature, one.threshold, one.children_left, one.children_right, leaf, value))
+        return cls._joined(trees, np.zeros(len(classes)), classes)
+
+    @classmethod
+    def of_stumps(cls, model: Any) -> "Forest":
+        """Convert a `LogitBoostClassifier`: a tree for each stump, with its contribution to all classes."""
+        rounds, number = model.feature_.shape
+        trees = []
+        for one, kind in np.ndindex(rounds, number):
+            own = np.eye(number)[kind] - 1 / number
+            said = np.outer([0.0, model.below_[one, kind], model.above_[one, kind]], own)
+            asked, at = np.array([model.feature_[one, kind], 0, 0]), np.array([model.threshold_[one, kind], 0.0, 0.0])
+            trees.append((asked, at, np.array([1, 1, 2]), np.array([2, 1, 2]), np.array([False, True, True]), said))
+        return cls._joined(trees, np.zeros(number), model.classes_)
+
+    @classmethod
+    def _joined(cls, trees: list[tuple], start: np.ndarray, classes: np.ndarray) -> "Forest":
+        most, depth = max(len(tree[0]) for tree in trees), 1
+        feature, left, right = (np.zeros((len(trees), most), np.int32) for _ in range(3))
+        threshold = np.zeros((len(trees), most))
+        value = np.zeros((len(trees), most, len(start)))
+        for number, (asked, at, below, above, leaf, said) in enumerate(trees):
+            size, itself = len(asked), np.arange(len(asked))
+            feature[number, :size] = np.where(leaf, 0, asked)
+            threshold[number, :size] = np.where(leaf, 0.0, at)
+            left[number, :size] = np.where(leaf, itself, below)
+            right[number, :size] = np.where(leaf, itself, above)
+            value[number, :size] = said
+            level = np.zeros(size, int)
+            for node in itself[~leaf]:  # parents come before their children
+                level[[left[number, node], right[number, node]]] = level[node] + 1
+            depth = max(depth, int(level.max()))
+        return cls(feature, threshold, left, right, value, depth, start, classes)
+
+
+# The number of frames whose distances from all presses are computed at once.
+_FRAMES = 128
+_COUNTS = (3, 5, 8, 12)
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """Mean of the known values of the `count` presses whose `features` (N, k) are nearest, weighted by inverse
+    distance.
+
+    `known` (N, d): numbers, or 1 for the class of each; `classes_` (d,).
+    """
+
+    features: Float[np.ndarray, "N k"]
+    known: Float[np.ndarray, "N d"]
+    count: int
+    classes_: np.ndarray
+
+    @classmethod
+    def of_numbers(cls, features, targets) -> "Nearest":
+        """Learn targets (N, d), with the count that has the least leave-one-out error."""
+        count = min(max(_COUNTS), len(features) - 1)
+        every = cls(features, targets, count + 1, np.arange(targets.shape[1]))
+        distance, number = (one[:, 1:] for one in every._near(features))
+        weight = 1 / np.maximum(distance, 1e-12)[..., None]
+        means = np.cumsum(weight * targets[number], axis=1) / np.cumsum(weight, axis=1)
+        off = np.linalg.norm(means - targets[:, None], axis=-1).mean(axis=0)
+        best = min([one for one in _COUNTS if one <= count] or [count], key=lambda one: off[one - 1])
+        return cls(features, targets, best, every.classes_)
+
+    @classmethod
+    def of_classes(cls, features, label) -> "Nearest":
+        """Learn classes, with the single nearest press."""
+        classes = np.unique(label)
+        return cls(features, (np.asarray(label)[:, None] == classes).astype(float), 1, classes)
+
+    def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
+        """Predict means (n, d)."""
+        distance, number = self._near(features)
+        weight = 1 / np.maximum(distance, 1e-12)
+        return np.einsum("nc,ncd->nd", weight / weight.sum(axis=1, keepdims=True), self.known[number])
+
+    def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
+        """Predict shares of the classes (n, C)."""
+        return self.predict(features)
+
+    def _near(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
+        """Distances of the nearest presses, the nearest first, and their numbers."""
+
+        def near(some: np.ndarray) -> np.ndarray:
+            squared = (-2 * some) @ self.features.T
+            squared += self._squares  # without the frame's own square, which is the same for all
+            number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
+            apart = np.linalg.norm(self.features[number] - some[:, None], axis=2)
+            order = np.argsort(apart, axis=1, kind="stable")
+            return np.stack([np.take_along_axis(one, order, axis=1) for one in (apart, number)], axis=-1)
+
+        found = in_parts(near, features, _FRAMES)
+        return found[..., 0], found[..., 1].astype(int)
+
+    @cached_property
+    def _squares(self) -> Float[np.ndarray, " N"]:
+        """|x|² of every press's features."""
+        return np.sum(self.features**2, axis=1)
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A support vector machine.
+
+    `support` (S, k): the support vectors sorted by class, those of class c from `start` (C + 1,) c to c + 1; `weights`
+    (C - 1, S): their weights for the boundaries with every other class; `intercepts` (P,) of the pairs (0, 1), (0, 2),
+    …; and the kernel, (gain x·y + offset)^degree. A linear machine has the boundaries' own `slopes` (P, k).
+    """
+
+    support: Float[np.ndarray, "S k"]
+    weights: Float[np.ndarray, "D S"]
+    start: Int[np.ndarray, " E"]
+    intercepts: Float[np.ndarray, " P"]
+    gain: float
+    offset: float
+    degree: int
+    slopes: Float[np.ndarray, "P k"] | None
+    classes_: np.ndarray
+
+    @classmethod
+    def of(cls, machine) -> "Machine":
+        """Convert scikit-learn's machine, with a linear or a polynomial kernel."""
+        linear = machine.kernel == "linear"
+        start = np.concatenate([[0], np.cumsum(machine.n_support_)])
+        # Of two classes, positive values mean the second in scikit-learn; of more, the first of each pair.
+        sign = -1.0 if len(machine.classes_) == 2 else 1.0
+        return cls(
+            machine.support_vectors_,
+            sign * machine.dual_coef_,
+            start,
+            sign * machine.intercept_,
+            1.0 if linear else float(machine._gamma),
+            0.0 if linear else float(machine.coef0),
+            1 if linear else int(machine.degree),
+            sign * machine.coef_ if linear else None,
+            machine.classes_,
+        )
+
+    def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
+        """Number of pairwise decisions won by each class (n, C), plus less than a half from the distances."""
+        pairs, side = self._borders(features)
+        votes = (pairs > 0) @ (side > 0).astype(float) + (pairs <= 0) @ (side < 0).astype(float)
+        sure = pairs @ side
+        return votes + sure / (3 * (np.abs(sure) + 1))
+
+    def pair_odds(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
+        """Sums of the log-probabilities of each class relative to every other (n, C).
+
+        Relative to one other, the probability is 1 / (1 + exp(-2 d)) at a distance d from their boundary, in units of
+        its margin. Unlike votes, it is a measure of confidence.
+        """
+        pairs, side = self._borders(features)
+        won, lost = -np.logaddexp(0.0, -2 * pairs), -np.logaddexp(0.0, 2 * pairs)
+        return won @ (side > 0).astype(float) + lost @ (side < 0).astype(float)
+
+    def _borders(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n P"], Float[np.ndarray, "P C"]]:
+        """Distances from the boundaries of all pairs of classes, and which class is on which side."""
+        count = len(self.classes_)
+        first, second = np.triu_indices(count, 1)
+        if self.slopes is not None:
+            pairs = features @ self.slopes.T + self.intercepts
+        else:
+            kernel = (self.gain * features @ self.support.T + self.offset) ** self.degree
+            sums = np.empty((len(features), count - 1, count))
+            for one in range(count):
+                own = slice(self.start[one], self.start[one + 1])
+                sums[:, :, one] = kernel[:, own] @ self.weights[:, own].T
+            pairs = sums[:, second - 1, first] + sums[:, first, second] + self.intercepts
+        side = np.zeros((len(first), count))
+        side[np.arange(len(first)), first], side[np.arange(len(first)), second] = 1.0, -1.0
+        return pairs, side

@@ -1,1 +1,0 @@
-"""Small dense systems in elementwise operations and matrix products, which batch."""
