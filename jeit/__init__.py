@@ -1,20 +1,21 @@
 """jeit: differentiable electrical impedance tomography in JAX.
 
-The names used most, and where the rest is:
+The most common names, and the packages with further ones:
 
-- `read`: measured files (`jeit.data`);
-- `image_difference`: from two frames to a picture, in one call (`jeit.imaging`, `jeit.report`);
+- `read`: reading of measured files (`jeit.data`);
+- `image_difference`: an image from two frames, in one call (`jeit.imaging`, `jeit.report`);
 - `Disk`: outlines and their meshes (`jeit.mesh`);
-- `BoundaryElectrodes`, `ring`: electrodes (`jeit.electrodes`) and where to put them (`jeit.layout`);
-- `adjacent`: what is driven and measured (`jeit.protocol`);
-- `ForwardModel`: conductivity to voltages and Jacobian (`jeit.forward`);
+- `BoundaryElectrodes`, `ring`: electrodes (`jeit.electrodes`) and their layouts (`jeit.layout`);
+- `adjacent`: drive and measurement patterns (`jeit.protocol`);
+- `ForwardModel`: voltages and Jacobian for a given conductivity (`jeit.forward`);
 - `calibrate`, `one_step`, `reconstruct`: linear and nonlinear imaging (`jeit.inverse`);
-- `find_inclusions`: what an image shows (`jeit.image`); who touches a skin, where and how hard: `jeit.touch`;
-- layouts of electrodes compared and improved: `jeit.design`; microphones under a skin: `jeit.acoustic`;
-- `plot_image`: pictures (`jeit.plot`).
+- `find_inclusions`: analysis of images (`jeit.image`); location, force and gestures of touches on a skin: `jeit.touch`;
+- comparison and optimisation of electrode layouts: `jeit.design`; microphones under a skin: `jeit.acoustic`;
+- `plot_image`: plots (`jeit.plot`).
 
-Importing jeit turns on JAX's 64-bit mode, unless JAX_ENABLE_X64 is set, and keeps compiled code in the user's cache
-folder, unless JAX has been given another or JEIT_COMPILATION_CACHE is "off". Rooms are imported when first used.
+Importing jeit turns on JAX's 64-bit mode, unless JAX_ENABLE_X64 is set. It also keeps compiled code in the user's cache
+folder, unless JAX is configured with another folder or JEIT_COMPILATION_CACHE is "off". Subpackages are imported when
+first used.
 """
 
 from __future__ import annotations

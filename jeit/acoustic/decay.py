@@ -1,7 +1,7 @@
 """Decay models: the intensity received by each microphone as a function of its distance from the source.
 
-A source of strength I₀ at distance r is received with intensity I₀ f_i(r). Every model gives log f_i. The fit is over
-the logarithms of the parameters, which keeps them positive.
+Microphone i receives a source of strength I₀ at distance r with the intensity I₀ f_i(r). The models compute the
+response f_i and its logarithm. Fits use the logarithms of the parameters, which keeps the parameters positive.
 """
 
 from __future__ import annotations
@@ -17,51 +17,52 @@ from jeit.acoustic.noise import column
 from jeit.arguments import check_name
 from jeit_solvers.engines import host, namespace
 
-# Metres²: r = √r² has no derivative at r = 0; a hundredth of a micrometre rounds off the tip.
+# Constant in m² added to r², since r = √r² has no derivative at r = 0: the square of a hundredth of a micrometre.
 _TIP = 1e-16
 
 
 class AbstractDecay(eqx.Module):
-    """Base class of decay models: responses f_i of M microphones. A new model is one subclass."""
+    """Base class of decay models, which give the responses f_i of M microphones. A new model is a subclass."""
 
     name: ClassVar[str]
     parameters: ClassVar[tuple[str, ...]]
 
     @abc.abstractmethod
     def log_response(self, squared_distance: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """log f_i at squared distances r² (m²) of each microphone."""
+        """Logarithm of the response f_i of each microphone at squared distances r² in m²."""
 
     @abc.abstractmethod
     def response(self, squared_distance: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Response f_i at squared distances r² (m²)."""
+        """Response f_i of each microphone at squared distances r² in m²."""
 
     @property
     @abc.abstractmethod
     def gain(self) -> Float[Array, " M"]:
-        """f_i(0), the response to a source at the microphone."""
+        """Response f_i(0) of each microphone to a source at distance 0."""
 
     @abc.abstractmethod
     def logarithms(self) -> Float[Array, "K M"]:
-        """Logarithms of the parameters (SI units), in the order of `parameters`; the first scales the response."""
+        """Logarithms (K, M) of the parameters in SI units, in the order of `parameters`. The first parameter is a
+        factor of the response."""
 
     @classmethod
     @abc.abstractmethod
     def from_logarithms(cls, values: Float[Array, "K M"]) -> Self:
-        """The model whose parameters have these logarithms."""
+        """Create the model from the logarithms of its parameters in SI units."""
 
     @classmethod
     @abc.abstractmethod
     def start(cls, spacing: float, num_microphones: int) -> Self:
-        """Initial guess with gain 1 and a range of about `spacing` (m)."""
+        """Create the initial model of a fit, with gain 1 and a decay over about `spacing` metres."""
 
     @classmethod
     @abc.abstractmethod
     def bounds(cls, extent: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Lower and upper bounds of the logarithms for an array `extent` (m) across."""
+        """Lower and upper bounds of the logarithms of the parameters, for an array of size `extent` in metres."""
 
 
 class InverseSquare(AbstractDecay):
-    """f = a / (r² + b): a (M,) and b (M,) in m², b > 0 (Park 2022, text S2)."""
+    """Inverse-square decay model f = a / (r² + b), with a (M,) and b (M,) in m² and b > 0 (Park 2022, text S2)."""
 
     a: Float[Array, " M"]
     b: Float[Array, " M"]
@@ -69,42 +70,42 @@ class InverseSquare(AbstractDecay):
     parameters: ClassVar[tuple[str, ...]] = ("a", "b")
 
     def log_response(self, squared_distance):
-        """log a − log(r² + b)."""
+        """Logarithm of the response: log a − log(r² + b)."""
         log = namespace(self, squared_distance).log
         return column(log(self.a), squared_distance) - log(squared_distance + column(self.b, squared_distance))
 
     def response(self, squared_distance):
-        """a / (r² + b)."""
+        """Response a / (r² + b)."""
         return column(self.a, squared_distance) / (squared_distance + column(self.b, squared_distance))
 
     @property
     def gain(self):
-        """a / b."""
+        """Response a / b at distance 0."""
         return self.a / self.b
 
     def logarithms(self):
-        """log a, log b."""
+        """Logarithms of the parameters: log a, log b."""
         return _logarithms(self.a, self.b)
 
     @classmethod
     def from_logarithms(cls, values):
-        """From log a, log b."""
+        """Create the model from log a and log b."""
         return cls(*namespace(values).exp(values))
 
     @classmethod
     def start(cls, spacing, num_microphones):
-        """a = b = spacing²."""
+        """Initial model with a = b = spacing²."""
         same = host.full(num_microphones, float(spacing) ** 2)
         return cls(same, same)
 
     @classmethod
     def bounds(cls, extent):
-        """b from (extent / 1,000)² to (10 extents)²."""
+        """Bounds of the logarithms: b is between (extent / 1,000)² and (10 extent)²; a is not bounded."""
         return (-math.inf, 2 * math.log(1e-3 * extent)), (math.inf, 2 * math.log(10 * extent))
 
 
 class Exponential(AbstractDecay):
-    """f = a exp(−r / l): a (M,) without unit, attenuation length l (M,) in m."""
+    """Exponential decay model f = a exp(−r / l), with dimensionless a (M,) and attenuation length l (M,) in m."""
 
     a: Float[Array, " M"]
     length: Float[Array, " M"]
@@ -112,44 +113,45 @@ class Exponential(AbstractDecay):
     parameters: ClassVar[tuple[str, ...]] = ("a", "length")
 
     def log_response(self, squared_distance):
-        """log a − r / l."""
+        """Logarithm of the response: log a − r / l."""
         xp = namespace(self, squared_distance)
         distance = xp.sqrt(squared_distance + _TIP)
         return column(xp.log(self.a), squared_distance) - distance / column(self.length, squared_distance)
 
     def response(self, squared_distance):
-        """a exp(−r / l)."""
+        """Response a exp(−r / l)."""
         xp = namespace(self, squared_distance)
         distance = xp.sqrt(squared_distance + _TIP)
         return column(self.a, squared_distance) * xp.exp(-distance / column(self.length, squared_distance))
 
     @property
     def gain(self):
-        """a."""
+        """Response a at distance 0."""
         return self.a
 
     def logarithms(self):
-        """log a, log l."""
+        """Logarithms of the parameters: log a, log l."""
         return _logarithms(self.a, self.length)
 
     @classmethod
     def from_logarithms(cls, values):
-        """From log a, log l."""
+        """Create the model from log a and log l."""
         return cls(*namespace(values).exp(values))
 
     @classmethod
     def start(cls, spacing, num_microphones):
-        """a = 1, l = spacing."""
+        """Initial model with a = 1 and l = spacing."""
         return cls(host.ones(num_microphones), host.full(num_microphones, float(spacing)))
 
     @classmethod
     def bounds(cls, extent):
-        """l from a thousandth of the extent to 30 extents."""
+        """Bounds of the logarithms: l is between extent / 1,000 and 30 extent; a is not bounded."""
         return (-math.inf, math.log(1e-3 * extent)), (math.inf, math.log(30 * extent))
 
 
 class AttenuatedInverseSquare(AbstractDecay):
-    """f = a exp(−r / l) / (r² + b): spreading and attenuation; a, b (M,) in m², l (M,) in m."""
+    """Decay model with spreading and attenuation, f = a exp(−r / l) / (r² + b), with a (M,) and b (M,) in m² and l (M,)
+    in m."""
 
     a: Float[Array, " M"]
     b: Float[Array, " M"]
@@ -158,7 +160,7 @@ class AttenuatedInverseSquare(AbstractDecay):
     parameters: ClassVar[tuple[str, ...]] = ("a", "b", "length")
 
     def log_response(self, squared_distance):
-        """log a − log(r² + b) − r / l."""
+        """Logarithm of the response: log a − log(r² + b) − r / l."""
         xp = namespace(self, squared_distance)
         distance = xp.sqrt(squared_distance + _TIP)
         spreading = xp.log(squared_distance + column(self.b, squared_distance))
@@ -166,7 +168,7 @@ class AttenuatedInverseSquare(AbstractDecay):
         return column(xp.log(self.a), squared_distance) - spreading - attenuation
 
     def response(self, squared_distance):
-        """a exp(−r / l) / (r² + b)."""
+        """Response a exp(−r / l) / (r² + b)."""
         xp = namespace(self, squared_distance)
         distance = xp.sqrt(squared_distance + _TIP)
         left = column(self.a, squared_distance) * xp.exp(-distance / column(self.length, squared_distance))
@@ -174,27 +176,27 @@ class AttenuatedInverseSquare(AbstractDecay):
 
     @property
     def gain(self):
-        """a / b."""
+        """Response a / b at distance 0."""
         return self.a / self.b
 
     def logarithms(self):
-        """log a, log b, log l."""
+        """Logarithms of the parameters: log a, log b, log l."""
         return _logarithms(self.a, self.b, self.length)
 
     @classmethod
     def from_logarithms(cls, values):
-        """From log a, log b, log l."""
+        """Create the model from log a, log b and log l."""
         return cls(*namespace(values).exp(values))
 
     @classmethod
     def start(cls, spacing, num_microphones):
-        """a = b = spacing², l = 3 spacings."""
+        """Initial model with a = b = spacing² and l = 3 spacing."""
         same = host.full(num_microphones, float(spacing) ** 2)
         return cls(same, same, host.full(num_microphones, 3.0 * spacing))
 
     @classmethod
     def bounds(cls, extent):
-        """As those of the other two."""
+        """Bounds of the logarithms: those of `InverseSquare` for a and b, and of `Exponential` for l."""
         low, high = InverseSquare.bounds(extent), Exponential.bounds(extent)
         return (*low[0], high[0][1]), (*low[1], high[1][1])
 
@@ -210,8 +212,8 @@ DECAYS: dict[str, type[AbstractDecay]] = {
 
 
 def find_decay(name: str | type[AbstractDecay]) -> type[AbstractDecay]:
-    """Class of a decay model from its name ("inverse-square", "exponential", "attenuated") or the class itself. Raises
-    `ValueError` for an unknown name."""
+    """Return the class of the decay model with this `name` ("inverse-square", "exponential" or "attenuated"); a class
+    is returned unchanged. Raises `ValueError` for an unknown name."""
     if isinstance(name, type) and issubclass(name, AbstractDecay):
         return name
     check_name("decay", name, DECAYS, ", a class like theirs, or 'auto'")

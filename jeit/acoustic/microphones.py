@@ -1,4 +1,4 @@
-"""`MicrophoneArray`: positions of the microphones, the expected intensities of a source, and their variances."""
+"""`MicrophoneArray`: an array of microphones, with the expected intensities of a source and their variances."""
 
 from __future__ import annotations
 
@@ -16,7 +16,11 @@ from jeit_solvers.engines import namespace
 
 
 class MicrophoneArray(eqx.Module):
-    """All that a source's intensities depend on: microphones (M, d) in metres, surface, decay models, noise."""
+    """Model of an array of microphones, from which the intensities of a source are computed.
+
+    **Fields**: `microphones`: positions (M, d) in metres; `surface`: surface on which sources lie; `decay`: decay model
+    of each microphone; `noise`: noise of the intensities.
+    """
 
     microphones: Float[Array, "M d"]
     surface: AbstractSurface
@@ -24,14 +28,15 @@ class MicrophoneArray(eqx.Module):
     noise: IntensityNoise
 
     def response(self, chart: Float[Array, "2 ..."]) -> Float[Array, "M ..."]:
-        """Responses f_i to sources at chart coordinates."""
+        """Responses f_i of the microphones to sources at chart coordinates (2, …)."""
         place = self.surface.place(chart)
         mine = self.microphones.reshape(self.microphones.shape + (1,) * (place.ndim - 1))
         squares = [(place[k] - mine[:, k]) ** 2 for k in range(place.shape[0])]
         return self.decay.response(sum(squares[1:], squares[0]))
 
     def expected(self, unknowns: Float[Array, "n F"]) -> tuple[Float[Array, "M F"], Float[Array, "M F"]]:
-        """Expected levels m and their variances v."""
+        """Expected levels m (M, F) and their variances v (M, F). `unknowns` (n, F): chart coordinates and logarithm of
+        the strength of one or more sources."""
         each = [unknowns[k : k + 3] for k in range(0, len(unknowns), 3)]
         xp = namespace(self, unknowns)
         sent = [xp.exp(one[2]) * self.response(one[:2]) for one in each]
@@ -40,6 +45,6 @@ class MicrophoneArray(eqx.Module):
 
 
 def check_array(microphone_array: MicrophoneArray) -> None:
-    """Check the type of an array. Raises `ValueError` for what is no `MicrophoneArray`."""
+    """Raises `ValueError` if `microphone_array` is not a `MicrophoneArray`."""
     wanted = "a MicrophoneArray, such as calibration.microphone_array"
     check_kind("microphone_array", microphone_array, MicrophoneArray, wanted)

@@ -1,14 +1,15 @@
-"""Error model of intensities, and the fitted statistic: the logarithm of the received power.
+"""Error model of intensities, and of levels: the logarithms of the received power, to which models are fitted.
 
-For expected power S at a microphone, the power above the floor has mean S and variance
+If a microphone receives the expected power S from a source, the measured power minus the noise floor has the mean S and
+the variance
 
-    var = τ² S² + κ S + s²,
+    var = τ² S² + κ S + s².
 
-with τ the relative error of the decay model and of coupling, s the residual of the floor after its subtraction, and κ S
-the product of signal and floor in the power of their sum. With ν degrees of freedom of a window and floor power N, the
-last two are s² = 2 N² / ν and κ = 4 N / ν (noncentral chi-square). The fitted statistic is y = log(power + N). Where S
-≫ N it is the logarithm of intensity, whose errors are those of gains; where S ≪ N it only bounds the intensity from
-above. It is nearly normal in both cases.
+Here τ is the relative error of the decay model and of the coupling between skin and microphone, s² is the variance of
+the power of noise alone, and κ S is due to the product of signal and noise. For a noise power N and ν degrees of
+freedom of a window, s² = 2 N² / ν and κ = 4 N / ν (noncentral chi-square distribution). Models are fitted to the levels
+y = log(power + N). For S ≫ N, the level is the logarithm of intensity, with the errors of gains; for S ≪ N, it is only
+an upper bound of the intensity. The level is nearly normally distributed in both cases.
 """
 
 from __future__ import annotations
@@ -20,14 +21,19 @@ from numpy.typing import ArrayLike
 
 from jeit_solvers.engines import as_array, namespace
 
-# Least relative error of a decay model.
+# Minimum relative error of a decay model.
 LEAST_RELATIVE = 1e-3
-# Where no floor is known, a floor of so many standard deviations keeps the argument of the logarithm positive.
+# Minimum floor in standard deviations of the noise, which keeps the argument of the logarithm positive if no floor is
+# known.
 _FLOOR_DEVIATIONS = 4.0
 
 
 class IntensityNoise(eqx.Module):
-    """Noise parameters of the intensities of M microphones, in the unit of intensity."""
+    """Noise parameters of the intensities of M microphones; see `jeit.acoustic.noise` for the error model.
+
+    **Fields**, each (M,): `floor`: noise floor N; `deviation`: standard deviation s of the power of noise; `cross`:
+    coefficient κ; these three are in the unit of intensity. `relative`: relative error τ of the decay model.
+    """
 
     floor: Float[Array, " M"]
     deviation: Float[Array, " M"]
@@ -44,8 +50,9 @@ class IntensityNoise(eqx.Module):
         deviation: ArrayLike | None = None,
         relative: ArrayLike = LEAST_RELATIVE,
     ) -> "IntensityNoise":
-        """Create from the subtracted `floor` and the degrees of `freedom` of a window, or from the standard `deviation`
-        of the intensity without a source. Each a number or (M,)."""
+        """Create the noise parameters from the subtracted `floor` and the degrees of freedom ν of a window (`freedom`),
+        or from the standard deviation s of the intensity without a source (`deviation`). `relative`: relative error τ.
+        All are numbers or (M,)."""
         wide = [np.broadcast_to(np.asarray(value, float), (num_microphones,)) for value in (floor, freedom, relative)]
         base, degrees, scatter = wide
         rest = base * np.sqrt(2 / degrees)
@@ -55,27 +62,28 @@ class IntensityNoise(eqx.Module):
         return cls(*(as_array(values) for values in (floor, rest, 4 * base / degrees, least)))
 
     def variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Variance of the power above the floor, for expected power `received`."""
+        """Variance of the power minus the floor, for the expected power `received` (M, …)."""
         relative, cross, deviation = (column(x, received) for x in (self.relative, self.cross, self.deviation))
         return (relative**2 * received + cross) * received + deviation**2
 
     def level(self, power: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Level y = log(power + floor); −∞ where the sum is not positive."""
+        """Level y = log(power + floor). The sum is bounded below by 0.05 floor."""
         floor, xp = column(self.floor, power), namespace(self, power)
         return xp.log(xp.maximum(power + floor, 0.05 * floor))
 
     def level_variance(self, received: Float[Array, "M ..."]) -> Float[Array, "M ..."]:
-        """Variance of the level y, for expected power `received`."""
+        """Variance of the level y, for the expected power `received` (M, …)."""
         return self.variance(received) / (received + column(self.floor, received)) ** 2
 
 
 def column(values: Float[Array, " M"], like: Array) -> Array:
-    """Broadcast one value per microphone along the first axis of `like`."""
+    """Reshape values (M,), one per microphone, so that they broadcast along the first axis of `like`."""
     return values.reshape((-1,) + (1,) * (like.ndim - 1))
 
 
 def below_nothing(power: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """Standard deviation (M,) of the noise, estimated from negative intensities (F, M), which are due to noise only."""
+    """Standard deviation (M,) of the noise, estimated from the negative values among the intensities `power` (F, M).
+    Only noise can make intensities negative."""
     below = np.where(usable & (power < 0), power, 0.0)
     number = (below < 0).sum(axis=0)
     return np.sqrt((below**2).sum(axis=0) / np.maximum(number, 1))

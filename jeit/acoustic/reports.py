@@ -1,4 +1,4 @@
-"""Reports, tables and plots of acoustic localisation, written to a folder."""
+"""Output files of acoustic localisation: reports, tables and plots."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from jeit.report.folder import plain, results, version_of, write_json, write_row
 
 
 def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
-    """Write the calibration to `path` (JSON, for `Calibration.load`) and a plot of it to the same path with suffix
-    `.png`; the folder is created if needed. Raises `ValueError` for a path that is a folder, in no folder, or that of
-    the plot."""
+    """Write the calibration to the JSON file `path`, for `Calibration.load`, and a plot of it to the same path with the
+    suffix `.png`. The folder is created if needed. Raises `ValueError` if `path` is a folder, has the suffix `.png`, or
+    is in a folder that cannot be created."""
     path, picture = calibration_files(path)
     with results(path.parent, (path.name, picture.name)) as made:
         fit.calibration.save(made / path.name)
@@ -28,8 +28,8 @@ def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
 
 
 def calibration_files(path: str | Path) -> tuple[Path, Path]:
-    """Paths of the calibration file and the plot that `write_calibration` writes for `path`. Raises `ValueError` as it
-    does."""
+    """Return the paths of the calibration file and the plot that `write_calibration` writes. Raises `ValueError` if
+    `path` is a folder or has the suffix `.png`."""
     path = Path(path)
     if path.is_dir():
         raise ValueError(f"path {path} is a folder; give a file, such as {path / 'calibration.json'}.")
@@ -40,7 +40,7 @@ def calibration_files(path: str | Path) -> tuple[Path, Path]:
 
 
 def draw_calibration(fit: CalibrationFit):
-    """Plot the receptive fields of all microphones, as a matplotlib `Figure` that needs no display."""
+    """Plot the receptive fields of all microphones. Returns a matplotlib `Figure`; no display is needed."""
     from matplotlib.figure import Figure
 
     from jeit.acoustic.plots import plot_receptive_fields
@@ -51,18 +51,19 @@ def draw_calibration(fit: CalibrationFit):
 
 
 _PACKAGES = ("jeit", "jax", "numpy", "scipy")
-# Pixels along a side of the maps; frames processed at once.
+# Number of pixels along each side of a map, and number of frames whose maps are computed at once.
 _PIXELS, _FRAMES = 100, 256
 
 
 def write_track(found: LocatedTouches, folder: str | Path) -> None:
-    """Write `track.csv`, `report.json` and `track.png` of a result of `locate_touches` into `folder`, created if
-    needed.
+    """Write the result of `locate_touches` to the files `track.csv`, `report.json` and `track.png` in `folder`, which
+    is created if needed.
 
-    The table has a row for every frame: `time_s`; the estimated position `x_m`, `y_m`, its standard deviations
-    `std_x_m`, `std_y_m` and `covariance` (m², of x and y); `strength`, in units of intensity; `status`; then the
-    smoothed position, `track_x_m`, `track_y_m`, `track_std_x_m`, `track_std_y_m`, and the number of the `touch` from 1.
-    In space, columns for z follow. Missing values are empty. Raises `ValueError` for what cannot be a folder.
+    The table has a row for each frame, with these columns: `time_s`; the estimated position `x_m`, `y_m`, its standard
+    deviations `std_x_m`, `std_y_m`, and the `covariance` of x and y in m²; `strength` in the unit of intensity;
+    `status`; the smoothed position `track_x_m`, `track_y_m` and its standard deviations `track_std_x_m`,
+    `track_std_y_m`; and the number of the `touch`, from 1. For a surface in space, columns for z follow. Missing values
+    are empty. Raises `ValueError` if the folder cannot be created.
     """
     with results(folder, ("track.csv", "report.json", "track.png")) as made:
         columns = _columns(found.locations.position.shape[1])
@@ -72,7 +73,8 @@ def write_track(found: LocatedTouches, folder: str | Path) -> None:
 
 
 def report_track(found: LocatedTouches) -> dict[str, Any]:
-    """Report of a result as plain numbers, strings, lists and dictionaries; None for unknown values."""
+    """Summarise the result of `locate_touches` in a dictionary of numbers, strings, lists and dictionaries, with None
+    for unknown values."""
     locations, track, calibration = found.locations, found.track, found.calibration
     touches = []
     for number, touch in enumerate(track.touches, 1):
@@ -128,7 +130,7 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
 
 
 def draw_track(found: LocatedTouches):
-    """Plot the track, as a matplotlib `Figure` that needs no display."""
+    """Plot the track of a recording. Returns a matplotlib `Figure`; no display is needed."""
     from matplotlib.figure import Figure
 
     from jeit.acoustic.plots import plot_track
@@ -142,7 +144,8 @@ def draw_track(found: LocatedTouches):
 
 
 def _overlay(found: LocatedTouches) -> np.ndarray | None:
-    """Overlay of the maps of all located frames (rows, columns), older frames fainter; None without a touch."""
+    """Overlay (rows, columns) of the maps of all located frames, in which older frames are fainter; None if no frame is
+    located."""
     locations, intensities = found.locations, found.intensities
     located = np.flatnonzero(locations.located & (locations.status != LocationStatus.TWO_TOUCHES))
     if not located.size:
@@ -190,7 +193,7 @@ def _rows(locations: Locations, track: Track):
 
 
 def _median_deviation(locations: Locations) -> float:
-    """Median standard deviation along the longest axis of the located frames' ellipses."""
+    """Median over the located frames of the standard deviation along the major axis of the error ellipse, in metres."""
     if not locations.located.any():
         return math.nan
     return float(np.median(np.sqrt(np.linalg.eigvalsh(locations.covariance[locations.located])[:, -1])))

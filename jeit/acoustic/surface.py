@@ -1,7 +1,8 @@
-"""Surfaces on which sources lie: charts of two coordinates u (m), with an outline in the chart.
+"""Surfaces on which sources lie, described by a chart with two coordinates u in metres and an outline in the chart.
 
-A plane is its own chart. A curved surface is a height over its best plane, interpolated by a thin-plate spline through
-known points of it; no two points of the surface may lie above each other.
+The chart of a plane surface is the plane itself. A curved surface is described by its height above the best-fitting
+plane, which a thin-plate spline interpolates between known points. The height must be a unique function of the chart
+coordinates.
 """
 
 import abc
@@ -15,40 +16,40 @@ from jeit.arguments import describe
 from jeit.mesh import Domain, Polygon
 from jeit_solvers.engines import as_array, namespace, on_host, slopes
 
-# Most knots of the spline: more make evaluations slower and the surface no smoother.
+# Maximum number of spline knots: more would slow down evaluation without making the surface smoother.
 _MOST_KNOTS = 300
 
 
 class AbstractSurface(eqx.Module):
-    """A surface with its outline."""
+    """Base class of surfaces. `outline` is the outline of the surface in chart coordinates, in metres."""
 
     outline: eqx.AbstractVar[Polygon]
 
     @abc.abstractmethod
     def place(self, chart: Float[Array, "2 ..."]) -> Float[Array, "d ..."]:
-        """Points in space from chart coordinates."""
+        """Points (d, …) of the surface in metres from chart coordinates (2, …)."""
 
     @abc.abstractmethod
     def project(self, points: Float[Array, "d ..."]) -> Float[Array, "2 ..."]:
-        """Chart coordinates of points in space, along the normal of the chart's plane."""
+        """Chart coordinates (2, …) of points (d, …) in metres, projected along the normal of the chart's plane."""
 
     @property
     @abc.abstractmethod
     def dimension(self) -> int:
-        """Dimension of the space: 2 or 3."""
+        """Dimension d of the space: 2 or 3."""
 
 
 class Plane(AbstractSurface):
-    """The plane itself: coordinates are positions (x, y)."""
+    """A plane surface, whose chart coordinates are the positions (x, y) in metres."""
 
     outline: Polygon
 
     def place(self, chart):
-        """Nothing to do."""
+        """Return the chart coordinates, which are the positions."""
         return chart
 
     def project(self, points):
-        """Nothing to do."""
+        """Return the positions, which are the chart coordinates."""
         return points
 
     @property
@@ -58,7 +59,9 @@ class Plane(AbstractSurface):
 
 
 class CurvedSurface(AbstractSurface):
-    """x(u) = origin + axes u + normal h(u), with a thin-plate spline h = Σ w_k ρ_k² log ρ_k + affine."""
+    """A curved surface x(u) = origin + axes u + normal h(u). The height h = Σ w_k ρ_k² log ρ_k + affine is a thin-plate
+    spline, where ρ_k is the distance of u from knot k, w_k are the `weights`, and `affine` are the coefficients of 1,
+    u₁ and u₂."""
 
     outline: Polygon
     origin: Float[Array, " 3"]
@@ -69,7 +72,7 @@ class CurvedSurface(AbstractSurface):
     affine: Float[Array, " 3"]
 
     def place(self, chart):
-        """Points above the chart coordinates u."""
+        """Points (3, …) of the surface in metres from chart coordinates (2, …)."""
         flat = chart.reshape(2, -1)
         squared = namespace(self, chart).sum((flat[:, None] - self.knots.T[:, :, None]) ** 2, axis=0)
         height = self.weights @ _thin_plate(squared) + self.affine[0] + self.affine[1:] @ flat
@@ -77,7 +80,7 @@ class CurvedSurface(AbstractSurface):
         return points.reshape(3, *chart.shape[1:])
 
     def project(self, points):
-        """Coordinates in the plane."""
+        """Chart coordinates (2, …) of points (3, …), projected along the normal."""
         flat = points.reshape(3, -1) - self.origin[:, None]
         return (self.axes.T @ flat).reshape(2, *points.shape[1:])
 
@@ -88,10 +91,12 @@ class CurvedSurface(AbstractSurface):
 
 
 def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -> AbstractSurface:
-    """Create the surface within `outline`: vertices (K, 2), or an outline such as `Disk`; or (K, 3) in space.
+    """Create the surface with the given `outline`.
 
-    In space the surface passes through the outline and `points` (T, 3), places of taps for instance. Raises
-    `ValueError` for outlines that are none, and for surfaces that fold over their best plane.
+    A plane surface is given by vertices (K, 2) in metres or an outline such as `Disk`; a curved surface by vertices (K,
+    3) in metres and optionally `points` (T, 3), such as the positions of taps. The curved surface passes through the
+    vertices and points. Raises `ValueError` for invalid outlines, and for surfaces that fold over their best-fitting
+    plane.
     """
     if isinstance(outline, Domain):
         edge, *holes = outline.loops()
@@ -112,7 +117,7 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
 
 
 def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
-    """Lower left and upper right corner of the outline's box in the chart, metres."""
+    """Lower left and upper right corner (2,) of the bounding box of the outline in the chart, in metres."""
     vertices = surface.outline.vertices
     return vertices.min(axis=0), vertices.max(axis=0)
 
@@ -120,7 +125,8 @@ def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Ar
 def in_space(
     surface: AbstractSurface, chart: Float[Array, "2 F"], covariance: Float[Array, "2 2 F"]
 ) -> tuple[Float[Array, "F d"], Float[Array, "F d d"]]:
-    """Positions in space, and their covariances, from positions and covariances in the chart."""
+    """Transform positions (2, F) and covariances (2, 2, F) in the chart to positions (F, d) and covariances (F, d, d)
+    in space."""
     place, along = slopes(surface.place, chart)
     xp = namespace(place, covariance)
     along = xp.stack(along)
@@ -128,14 +134,14 @@ def in_space(
 
 
 def longer_side(surface: AbstractSurface) -> Float[Array, ""]:
-    """The longer side of the outline's box, metres."""
+    """Length in metres of the longer side of the outline's bounding box."""
     low, high = bounding_box(surface)
     return (high - low).max()
 
 
 def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centres of columns × rows pixels that fill the outline's box, (2, rows, columns), bottom row first; and the mask
-    of those inside the outline, (rows, columns)."""
+    """Return the centres (2, rows, columns) of the pixels of a raster over the outline's bounding box, bottom row
+    first, and the mask (rows, columns) of the pixels inside the outline."""
     at_hand: AbstractSurface = on_host(surface)
     (left, bottom), (right, top) = bounding_box(at_hand)
     x = left + (right - left) * (np.arange(columns) + 0.5) / columns
@@ -145,7 +151,7 @@ def chart_grid(surface: AbstractSurface, columns: int, rows: int) -> tuple[np.nd
 
 
 def outline_sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[Array, "2 K"]]:
-    """Start and end of each side of the outline and of its holes, in the chart."""
+    """Start and end points (2, K) of all sides of the outline and its holes, in chart coordinates."""
     loops = surface.outline.loops()
     xp = namespace(loops)
     start, end = (xp.concatenate([xp.roll(loop, -shift, axis=0) for loop in loops]) for shift in (0, 1))
@@ -153,7 +159,7 @@ def outline_sides(surface: AbstractSurface) -> tuple[Float[Array, "2 K"], Float[
 
 
 def _thin_plate(squared):
-    """ρ² log ρ of ρ², and 0 at 0."""
+    """Thin-plate kernel ρ² log ρ as a function of ρ²; 0 for ρ = 0."""
     xp = namespace(squared)
     positive = squared.real > 0
     safe = xp.where(positive, squared, 1.0)
@@ -166,7 +172,7 @@ def _curved(vertices: np.ndarray, known: np.ndarray) -> CurvedSurface:
     if spread[1] <= 1e-6 * spread[0]:
         raise ValueError("outline: its vertices lie on one line; give the outline of a surface, in metres.")
     normal = directions[2] * (1.0 if directions[2][np.argmax(np.abs(directions[2]))] > 0 else -1.0)
-    # The chart's first axis follows that of space which is most nearly in its plane.
+    # The first axis of the chart is the projection of the coordinate axis that is most nearly parallel to the plane.
     leading = np.eye(3)[np.argmin(np.abs(normal) + np.array([0.0, 1e-3, 2e-3]))]
     first = leading - normal * (normal @ leading)
     first /= np.linalg.norm(first)
@@ -185,7 +191,7 @@ def _curved(vertices: np.ndarray, known: np.ndarray) -> CurvedSurface:
     squared = np.sum((chart[:, None] - chart) ** 2, axis=-1)
     kernel = _thin_plate(squared)
     polynomial = np.column_stack([np.ones(len(chart)), chart])
-    # A little smoothing, so that points known to a fraction of a per cent do not make waves.
+    # Slight smoothing, so that small errors of the points, a fraction of a per cent, do not make the surface wavy.
     system = np.block([[kernel + 1e-9 * scale**2 * np.eye(len(chart)), polynomial], [polynomial.T, np.zeros((3, 3))]])
     solution = np.linalg.lstsq(system, np.concatenate([height, np.zeros(3)]), rcond=None)[0]
     arrays = (origin, axes, normal, chart, solution[:-3], solution[-3:])
@@ -193,7 +199,7 @@ def _curved(vertices: np.ndarray, known: np.ndarray) -> CurvedSurface:
 
 
 def _spread(points: np.ndarray, most: int) -> np.ndarray:
-    """Indices of at most `most` points, far from each other."""
+    """Indices of at most `most` points that are far from each other (farthest-point sampling)."""
     if len(points) <= most:
         return np.arange(len(points))
     chosen, distance = [0], np.full(len(points), np.inf)

@@ -1,4 +1,4 @@
-"""Localisation of touches in one call: intensities, the position in every frame, and the track of every touch."""
+"""Localisation of touches in one call: intensities, the position in each frame, and the track of each touch."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.acoustic.tracking import Track, track
 
-# Pixels of the map on which the paper's loss is minimised.
+# Rows and columns of the map on which the consistency loss is minimised, as in Park 2022.
 _PAPERS_MAP = (200, 200)
 
 
 class LocatedTouches(eqx.Module):
-    """Touches located in a recording: its `intensities`, the `locations` of its frames, and the `track` through them;
-    with the `calibration` and the `method` used."""
+    """Touches located in a recording.
+
+    **Fields**: `intensities`: intensities of the recording; `locations`: position and status of each frame; `track`:
+    smoothed positions and touches; `calibration`, `method`: the calibration and method used.
+    """
 
     intensities: Intensities
     locations: Locations
@@ -40,16 +43,17 @@ def locate_touches(
     silence: Recording | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> LocatedTouches:
-    """Locate every touch of a recording, as `jeit locate` does; `jeit.acoustic.reports.write_track` writes its output
-    files.
+    """Locate every touch in a recording. The command `jeit locate` calls this function;
+    `jeit.acoustic.reports.write_track` writes its output files.
 
-    `method`: "likelihood", or "consistency" for the paper's loss on a map of 200 × 200 pixels, refined. `gap`: seconds
-    without a place that end a touch. `intensity`: band and window, for samples, those of the calibration unless given.
-    `silence`: samples of the array untouched, for the noise floor of a recording that never pauses. `progress` is
-    called with the name of each step as it begins.
+    `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022, minimised on a map of 200 ×
+    200 pixels and then refined. `gap`: time in seconds without a position after which a touch has ended. `intensity`:
+    band and windows, for recordings of samples; by default those of the calibration. `silence`: recording of the
+    untouched array, from which the noise floor is estimated if touches never pause. `progress` is called with the name
+    of each step when it begins.
 
-    Raises `ValueError` for a recording of another number of microphones, fewer than three of use, frames farther apart
-    than `gap`, `intensity` or `silence` for a recording of intensities, and values out of range.
+    Raises `ValueError` for a recording with another number of microphones, fewer than three usable microphones, frames
+    farther apart than `gap`, `intensity` or `silence` given for a recording of intensities, and values out of range.
     """
     said = progress or (lambda step: None)
     if intensity is not None and isinstance(recording, Intensities):

@@ -1,8 +1,9 @@
 """Tracks: positions of consecutive frames smoothed in time, and onset and offset of each touch.
 
-A touch moves with a velocity that changes at random: white acceleration of spectral density q (m²/s³). Positions are
-filtered forwards by a Kalman filter and smoothed backwards after Rauch, Tung and Striebel. Frames without a position
-are skipped, and a position too far from the predicted one is rejected. q is the most likely of a range.
+The motion of a touch is modelled by a random acceleration: white noise of spectral density q in m²/s³. A Kalman filter
+runs forwards over the positions, and a Rauch-Tung-Striebel smoother runs backwards. Frames without a position are
+skipped, and positions too far from the prediction are rejected. The value of q with the highest likelihood is selected
+from a range.
 """
 
 from __future__ import annotations
@@ -17,16 +18,20 @@ from jeit.acoustic.localisation.locations import FEW_FRAMES, Locations
 from jeit.arguments import check_kind
 from jeit_solvers.engines import at_once, namespace, scan
 
-# Candidate densities: from a finger at rest to one that moves violently (m²/s³).
+# Candidate spectral densities of acceleration in m²/s³, from a finger at rest to one that moves violently.
 _DENSITIES = np.geomspace(1e-5, 10.0, 13)
+# Probability that a correct position is rejected as too far from its prediction.
 _BELIEVED = 1e-4
-# Standard deviation of the initial speed of a touch (m/s).
+# Standard deviation of each component of the initial velocity of a touch, in m/s.
 _FIRST_SPEED = 0.5
 
 
 class Touch(eqx.Module):
-    """One touch: `onset` and `offset` in seconds (middles of its first and last frame), its frames [first, last], and
-    the `length` of its path in metres."""
+    """A touch in a track.
+
+    **Fields**: `onset`, `offset`: times in seconds of the middles of its first and last frame; `first`, `last`: indices
+    of these frames, both part of the touch; `length`: length of its path in metres.
+    """
 
     onset: float
     offset: float
@@ -36,8 +41,12 @@ class Touch(eqx.Module):
 
 
 class Track(eqx.Module):
-    """Smoothed `position` (F, d) in metres with `covariance` (F, d, d), `velocity` (F, d) in m/s, NaN outside touches;
-    the `touches`; and which frames were `rejected` (F,), too far off to belong to their touch."""
+    """Smoothed positions of a recording with F frames.
+
+    **Fields**: `times`: (F,) in seconds; `position`: (F, d) in metres; `covariance`: (F, d, d) in m²; `velocity`:
+    (F, d) in m/s; `touches`: the touches in order of time; `rejected`: mask (F,) of frames whose position is too far
+    from the track of its touch. Position, covariance and velocity are NaN outside touches.
+    """
 
     times: Float[np.ndarray, " F"]
     position: Float[np.ndarray, "F d"]
@@ -48,12 +57,12 @@ class Track(eqx.Module):
 
 
 def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None = None) -> Track:
-    """Smooth the positions of a recording, touch by touch.
+    """Smooth the positions of each touch in a recording.
 
-    `gap`: seconds without a place after which a touch has ended. `acceleration`: spectral density q of the random
-    acceleration (m²/s³), the most likely of a range unless given. Errors of windows that share a sample are correlated:
-    covariances are multiplied by `locations.overlap`. Raises `ValueError` for what is not positive, and for what is no
-    `Locations`.
+    `gap`: time in seconds without a position after which a touch has ended. `acceleration`: spectral density q of the
+    random acceleration in m²/s³; by default the most likely value in a range. Covariances are multiplied by
+    `locations.overlap`, since the errors of overlapping windows are correlated. Raises `ValueError` for values that are
+    not positive, and if `locations` is not a `Locations`.
     """
     check_kind("locations", locations, Locations, "Locations, as of locate(recording, calibration)")
     if not (np.isfinite(gap) and gap > 0):
@@ -71,10 +80,11 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
         part = slice(first, last + 1)
         measured = np.where(located[part, None], locations.position[part], 0.0)
         spread = np.where(located[part, None, None], locations.covariance[part], np.eye(d)) * locations.overlap
-        # A covariance may be singular on a curved surface; the least standard deviation is a tenth of a micrometre.
+        # A minimum standard deviation of a tenth of a micrometre is added, since covariances on a curved surface are
+        # singular.
         spread = spread + 1e-14 * np.eye(d)
         step = np.diff(times[part], prepend=times[first])
-        state, error, believed = _smoothed(step, measured, spread, located[part], densities)
+        state, error, believed = _smooth_touch(step, measured, spread, located[part], densities)
         position[part], velocity[part] = state[:, :d], state[:, d:]
         covariance[part] = error[:, :d, :d]
         rejected[part] = located[part] & ~believed
@@ -84,7 +94,7 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
 
 
 def _runs(times, located, gap: float) -> list[tuple[int, int]]:
-    """First and last located frame of each touch."""
+    """Indices of the first and last located frame of each touch."""
     index = np.flatnonzero(located)
     if not index.size:
         return []
@@ -93,8 +103,9 @@ def _runs(times, located, gap: float) -> list[tuple[int, int]]:
     return [(int(index[a]), int(index[b])) for a, b in zip(firsts, lasts, strict=True)]
 
 
-def _smoothed(step, measured, spread, located, densities) -> tuple[np.ndarray, ...]:
-    """Result of `_smooth`: in NumPy for a touch of few frames; compiled for more, padded to a power of two."""
+def _smooth_touch(step, measured, spread, located, densities) -> tuple[np.ndarray, ...]:
+    """Call `_smooth`: with NumPy for a touch with few frames; otherwise compiled, with frames padded to a power of
+    two."""
     frames, d = measured.shape
     if frames <= FEW_FRAMES:
         return at_once(_smooth, step, measured, spread, located, densities)
@@ -109,7 +120,11 @@ def _smoothed(step, measured, spread, located, densities) -> tuple[np.ndarray, .
 
 
 def _smooth(step, measured, spread, located, densities):
-    """States (n, 2 d), their covariances, and the mask of accepted positions, at the most likely of the densities."""
+    """Smooth the positions of one touch with n frames, for the most likely of the densities.
+
+    Returns the states (n, 2 d), position and velocity; their covariances (n, 2 d, 2 d); and the mask (n,) of accepted
+    positions.
+    """
     xp, d = namespace(measured), measured.shape[1]
     score, filtered = _filter(step, measured, spread, located, densities)
     best = xp.argmax(score)
@@ -124,7 +139,8 @@ def _smooth(step, measured, spread, located, densities):
         error = error + gain @ (later_error - next_error) @ gain.T
         return (mean, error), (mean, error)
 
-    # After the last frame there are only predictions: there the smoother changes nothing.
+    # The recursion starts behind the last frame with a state equal to its prediction, so that the last frame is
+    # unchanged.
     beyond = predicted_mean[-1], predicted_error[-1]
     later = (xp.concatenate([array[1:], array[-1:]]) for array in (predicted_mean, predicted_error, step))
     _, (means, errors) = scan(back, beyond, (mean, error, *later), reverse=True)
@@ -132,8 +148,11 @@ def _smooth(step, measured, spread, located, densities):
 
 
 def _filter(step, measured, spread, located, densities):
-    """Log-likelihood (Q,) of each density, and for every frame and density mean, covariance, their predictions, and
-    whether its position was accepted."""
+    """Run the Kalman filter for Q spectral densities at once.
+
+    Returns the log-likelihood (Q,) of each density; and for every frame and density the filtered mean and covariance of
+    the state, the predicted mean and covariance, and whether the position was accepted.
+    """
     xp, d = namespace(measured), measured.shape[1]
     limit = float(chdtri(d, _BELIEVED))
 
@@ -147,10 +166,11 @@ def _filter(step, measured, spread, located, densities):
         square = xp.sum(off * xp.linalg.solve(inner, off[:, :, None])[:, :, 0], axis=1)
         believed = there & (square < limit)
         logarithm = xp.log(xp.linalg.det(inner))
-        # A rejected position still lowers the likelihood of a density, as much as one at the limit.
+        # A rejected position lowers the likelihood of a density as much as a position at the limit of acceptance.
         score = xp.where(there, -0.5 * (xp.minimum(square, limit) + logarithm), 0.0)
         new_mean = xp.where(believed[:, None], mean + xp.einsum("qij,qj->qi", gain, off), mean)
-        # Joseph's form, which is symmetric: the textbook difference is lost in rounding where positions are exact.
+        # The Joseph form of the update is accurate also for nearly exact positions, where the difference in the usual
+        # form is lost to rounding.
         keep = xp.eye(2 * d) - xp.concatenate([gain, xp.zeros_like(gain)], axis=2)
         updated = keep @ error @ xp.swapaxes(keep, 1, 2) + gain @ spread @ xp.swapaxes(gain, 1, 2)
         new_error = xp.where(believed[:, None, None], (updated + xp.swapaxes(updated, 1, 2)) / 2, error)
@@ -165,12 +185,13 @@ def _filter(step, measured, spread, located, densities):
 
 
 def _move(step, d: int) -> Float[Array, "s s"]:
-    """Transition matrix of position and velocity for a time step."""
+    """Transition matrix (2 d, 2 d) of position and velocity for a time step in seconds."""
     xp = namespace(step)
     return xp.kron(xp.eye(2) + step * xp.eye(2, k=1), xp.eye(d))
 
 
 def _noise(step, d: int) -> Float[Array, "s s"]:
-    """Covariance of position and velocity after a step of white acceleration of density 1."""
+    """Covariance (2 d, 2 d) of position and velocity after a time step with white acceleration of spectral density
+    1."""
     xp = namespace(step)
     return xp.kron(xp.stack([step**3 / 3, step**2 / 2, step**2 / 2, step]).reshape(2, 2), xp.eye(d))

@@ -1,4 +1,4 @@
-"""Checks of arguments, and the words of their messages."""
+"""Checks of arguments, and helpers that word the error messages."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ import numpy as np
 
 from jeit_solvers.engines import has_values
 
-# Types whose values are shown in messages, with at most this many letters; of all others the type is named.
+# Types whose values are shown in messages, and maximum number of characters of a value; for other types, the name of
+# the type is shown.
 _PLAIN, _LONGEST = (str, bytes, int, float, complex, type(None)), 60
 
 
 def check_kind(name: str, given: Any, kind: type | tuple[type, ...], wanted: str) -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no `kind`; `wanted` says what is, with an example."""
+    """Raise `ValueError` with the argument's `name` unless `given` is an instance of `kind`; `wanted` describes what is
+    expected, with an example."""
     if not isinstance(given, kind):
         raise ValueError(f"{name} must be {wanted}; it is {describe(given)}.")
 
 
 def is_number(given: Any) -> bool:
-    """Whether it is one real number, and finite; an array of no dimensions is one, a truth value is not."""
+    """Whether the argument is one finite real number; a zero-dimensional array counts as a number, a boolean does
+    not."""
     number = _scalar(given)
     return isinstance(number, Real) and not isinstance(number, bool) and math.isfinite(number)
 
@@ -39,7 +42,7 @@ def describe(given: Any) -> str:
         try:
             text = repr(thing)
         except ValueError:
-            # A whole number of more digits than Python writes.
+            # An integer with more digits than Python converts to text.
             return "a number without end"
         return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
     if isinstance(thing, type):
@@ -49,15 +52,16 @@ def describe(given: Any) -> str:
 
 
 def _scalar(given: Any) -> Any:
-    """An array of no dimensions as the number that it holds, all else as it is; random keys hold none."""
+    """Convert a zero-dimensional array to a Python scalar; everything else, including random keys, is returned
+    unchanged."""
     if isinstance(given, (np.generic, np.ndarray, jax.Array)) and given.shape == () and hasattr(given.dtype, "kind"):
         return np.asarray(given).item()
     return given
 
 
 def real_array(name: str, given: Any, wanted: str) -> np.ndarray:
-    """Convert an argument to an array of float64. Raises `ValueError`, about the argument `name`, for what holds no
-    real numbers, or rows of several lengths; `wanted` says what is."""
+    """Convert an argument to a float64 array. Raises `ValueError` with the argument's `name` for rows of different
+    lengths and for anything but real numbers; `wanted` describes what is expected."""
     try:
         values = np.asarray(given)
     except (ValueError, TypeError):
@@ -67,7 +71,7 @@ def real_array(name: str, given: Any, wanted: str) -> np.ndarray:
     return values.astype(float)
 
 
-# Below this, the exact value does not matter.
+# Percentage below which the value is not stated exactly.
 _LEAST_PERCENT = 0.001
 
 
@@ -78,7 +82,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def percent(value: float | None) -> str:
-    """A ratio in per cent with two digits, all of those before the point, and never an exponent."""
+    """A ratio in per cent with two significant digits, all digits before the decimal point, and no exponent."""
     if value is None:
         return "not known"
     share = 100 * float(value)
@@ -89,18 +93,19 @@ def percent(value: float | None) -> str:
     return f"{share:.2g} %"
 
 
-# No instrument reads more, in volts or any part of them; the squares of such numbers are still of use.
+# Maximum reading of any instrument, in volts or fractions of volts; squares of such numbers do not overflow.
 _MOST = 1e12
 
 
 def readings(values: np.ndarray) -> np.ndarray:
-    """Values with NaN where there is no reading: where they are NaN, infinite, or beyond any instrument (1e12)."""
+    """Replace values that are not readings by NaN: infinite values, and values beyond any instrument (1e12)."""
     with np.errstate(invalid="ignore", over="ignore"):
         return np.where(np.abs(values) <= _MOST, values, np.nan)
 
 
 def check_key(key: Any, name: str = "key") -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no single key of JAX, of the new kind or the old."""
+    """Raise `ValueError` with the argument's `name` unless `key` is a single JAX random key, of either the new or the
+    old type."""
     if isinstance(key, (jax.Array, np.ndarray)):
         new = jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0
         if new or (key.dtype == np.uint32 and key.ndim == 1):
@@ -110,12 +115,12 @@ def check_key(key: Any, name: str = "key") -> None:
 
 
 IN_MILLIMETRES = "were millimetres given for metres?"
-"""What is asked where a length is larger than it can be."""
+"""Question to append to a message about a length that is larger than possible."""
 
 
 def check_metres(name: str, value: Any, most: float = np.inf, limit: str = "") -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no positive length in metres, and for one of more than
-    `most` metres; `limit` says in words what is so long."""
+    """Raise `ValueError` with the argument's `name` unless `value` is a positive length in metres of at most `most`;
+    `limit` describes that maximum in words."""
     if not (is_number(value) and value > 0):
         raise ValueError(f"{name} must be a positive length in metres; it is {describe(value)}.")
     if value > most:
@@ -123,7 +128,8 @@ def check_metres(name: str, value: Any, most: float = np.inf, limit: str = "") -
 
 
 def check_name(argument: str, given: Any, names: Iterable[str], otherwise: str = "") -> None:
-    """Raise `ValueError`, about `argument`, for what is none of `names`; `otherwise` says what else could be given."""
+    """Raise `ValueError` with the `argument` unless `given` is one of `names`; `otherwise` describes what else is
+    accepted."""
     known = list(names)
     if not (isinstance(given, str) and given in known):
         said = f"it is {describe(given)}{did_you_mean(given, known)}"
@@ -131,7 +137,8 @@ def check_name(argument: str, given: Any, names: Iterable[str], otherwise: str =
 
 
 def did_you_mean(given: Any, names: Iterable[str]) -> str:
-    """The name nearest to what was given, or that begins so, as a question in brackets; nothing where none is near."""
+    """Question, in brackets, that proposes the name most similar to the given one or beginning with it; empty if none
+    is."""
     known, word = list(names), given.lower() if isinstance(given, str) else ""
     begun = [name for name in known if word and name.startswith(word)]
     close = difflib.get_close_matches(word, known, n=1) or begun
@@ -139,7 +146,7 @@ def did_you_mean(given: Any, names: Iterable[str]) -> str:
 
 
 def listed(names: Iterable[Any], most: int = 8) -> str:
-    """The first names, such as are in a file, in one short line, and how many more there are."""
+    """List the first names, such as those in a file, in one short line, with the number of remaining names."""
     known = [str(name) for name in names]
     shown = [name if len(name) <= 24 else f"{name[:23]}…" for name in known[:most]]
     more = f" and {len(known) - most} more" if len(known) > most else ""
@@ -147,8 +154,8 @@ def listed(names: Iterable[Any], most: int = 8) -> str:
 
 
 def check_has_values(name: str, given: Any, use: str, instead: str) -> None:
-    """Raise `ValueError`, about the argument `name`, for a pytree in which anything is traced by `jax.jit`, `jax.vmap`
-    or a derivative; `use` says what its values are needed for, `instead` what to give or do."""
+    """Raise `ValueError` with the argument's `name` for a pytree that contains values traced by `jax.jit`, `jax.vmap`
+    or a derivative; `use` says what the values are needed for, `instead` what to give or do."""
     if not has_values(given):
         raise ValueError(
             f"{name} is traced, inside jax.jit, jax.vmap or a derivative, and {use} its values: {instead}."

@@ -1,4 +1,4 @@
-"""Packages that only a part of jeit needs: the extras of pyproject.toml, and the error where one is not installed."""
+"""Optional packages, listed as extras in pyproject.toml, and the error raised if one is not installed."""
 
 from __future__ import annotations
 
@@ -17,12 +17,13 @@ EXTRAS = {
     "cluster": {"dask": "dask", "distributed": "distributed", "zarr": "zarr", "xarray": "xarray"},
 }
 
-# Greatest number of letters of the reason why a package cannot be imported, which precedes the advice what to install.
+# Maximum number of characters of the reason why a package cannot be imported, which precedes the advice what to
+# install.
 _REASON = 120
 
 
 def need_extra(extra: str, task: str) -> None:
-    """Raise `ImportError`, naming what to install, where a package of `extra`, which `task` needs, is missing."""
+    """Raise `ImportError`, naming what to install, if a package of `extra` is missing; `task` names what needs it."""
     missing = [package for module, package in EXTRAS[extra].items() if _is_missing(module)]
     if missing:
         names = " and ".join(", ".join(missing).rsplit(", ", 1))
@@ -30,13 +31,14 @@ def need_extra(extra: str, task: str) -> None:
 
 
 def optional(module: str, task: str, otherwise: str = "") -> ModuleType:
-    """Import a module of an extra, which `task` needs.
+    """Import a module of an extra; `task` names what needs it.
 
-    Raises `ImportError` where it cannot be imported: why, what to install, and what to do `otherwise`.
+    Raises `ImportError` if the import fails: the message states the reason, what to install, and the alternative
+    `otherwise`.
     """
     try:
         return importlib.import_module(module)
-    except (ImportError, OSError) as error:  # OSError: a library of the system that it loads
+    except (ImportError, OSError) as error:  # OSError: a system library that the package loads
         extra = next(extra for extra, held in EXTRAS.items() if module.partition(".")[0] in held)
         package = EXTRAS[extra][module.partition(".")[0]]
         why = "" if _is_missing(module.partition(".")[0]) else f", which cannot be imported ({str(error)[:_REASON]})"
@@ -53,5 +55,5 @@ def how_to_install(extra: str) -> str:
 def _is_missing(module: str) -> bool:
     try:
         return find_spec(module) is None
-    except ValueError:  # it is there without a specification, as of a test's
+    except ValueError:  # the module is loaded without a specification, as in a test
         return False

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any
 
-# For each contents page, the new places of names that have moved unchanged.
+# For each package that exported names in version 0.2, the new modules of the names that have moved unchanged.
 _MOVED = {
     "jeit.imaging": {
         "jeit.touch": "LearntGestures NamedTouch TouchImages TouchWatch WatchedFrame doubts_of learn_gestures "
@@ -58,9 +58,9 @@ MOVED = _RENAMED | {
     for home, names in homes.items()
     for name in names.split()
 }
-"""The new name for each old one."""
+"""New full name for each old full name."""
 
-# Contents pages that have moved as a whole.
+# Modules that have moved as a whole.
 _MOVED_PAGES = {
     "jeit.report.study": "jeit.design.reports",
     "jeit.simulate.acoustic": "jeit.acoustic.simulate",
@@ -72,9 +72,10 @@ _MOVED_PAGES = {
 
 
 def with_moved_names(page: str, find: Callable[[str], Any] | None = None) -> Callable[[str], Any]:
-    """The `__getattr__` of a contents page that names have left; `find` is that of the names it still has.
+    """The `__getattr__` of a package from which names have moved; `find` is the `__getattr__` for the names it still
+    has.
 
-    Pages below it that have moved as a whole can be imported, too.
+    Modules of the package that have moved as a whole can still be imported.
     """
     for below in _MOVED_PAGES:
         if below.rpartition(".")[0] == page:

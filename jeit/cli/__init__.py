@@ -1,6 +1,6 @@
-"""The `jeit` command line: one file for each command, and `app`, which combines them.
+"""The `jeit` command line: one file for each command, and `app`, which combines the commands.
 
-The commands import what they need when they run, so that `jeit --help` answers at once.
+Commands import other modules only when they run, so that `jeit --help` responds quickly.
 """
 
 from __future__ import annotations

@@ -24,7 +24,8 @@ from jeit.cli.options import (
 )
 from jeit.start import discarded_damaged, quick_compilation
 
-# Commands that run one program again and again: a frame in a third of the time.
+# Commands that run the same compiled program many times. Full optimisation by the compiler makes a frame three times as
+# fast.
 _REPEATING = (
     "study",
     "stream",
@@ -36,15 +37,15 @@ _REPEATING = (
     "listen fit",
 )
 
-# Warnings of future changes in packages that jeit uses: useful to programmers, noise to users of the command line.
+# Warnings of future changes in other packages, which are useful to programmers but not to users of the command line.
 _FOR_PROGRAMMERS = (DeprecationWarning, PendingDeprecationWarning, FutureWarning)
 
-# Greatest number of letters of an error's message.
+# Maximum number of characters of an error message.
 _LONGEST = 390
 
 
 def application(commands: Iterable[str] = COMMANDS) -> typer.Typer:
-    """The command line with these of its commands."""
+    """Create the command-line application with the given commands."""
     app = typer.Typer(
         name="jeit",
         add_completion=False,
@@ -76,14 +77,14 @@ def _top(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command with `arguments` (those of the process unless given); returns its exit status.
+    """Run the command with `arguments` (default: those of the process), and return its exit status.
 
-    0: done. 1: something is wrong with the data or the values given. 2: the command was not called as it should be.
-    Errors are reported in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
+    Exit status: 0 for success, 1 for an error in the data or in given values, 2 for wrong usage of the command, 130 if
+    stopped. Errors are reported in one line on standard error; JEIT_DEBUG=1 shows the traceback instead.
     """
     for output in (sys.stdout, sys.stderr):
         if isinstance(output, io.TextIOWrapper):
-            output.reconfigure(errors="replace")  # a terminal without Greek letters must not end the run
+            output.reconfigure(errors="replace")  # avoids errors on terminals without Greek letters
     given = sys.argv[1:] if arguments is None else list(arguments)
     command = as_command(given)
     try:
@@ -104,9 +105,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def as_command(arguments: Sequence[str] = ()):
-    """The application as one click command, whose errors name options where jeit's name arguments.
+    """Create the application as a click command whose error messages name options instead of Python arguments.
 
-    Where the first of the `arguments` is a command, the others are left out, and not imported.
+    If the first of the `arguments` is the name of a command, only that command is imported.
     """
     called = arguments[0] if arguments else None
     command = typer.main.get_command(application([called] if called in COMMANDS else COMMANDS))
@@ -115,7 +116,7 @@ def as_command(arguments: Sequence[str] = ()):
 
 
 def _name_options(command) -> None:
-    """Make every command's errors name the option where jeit names the argument."""
+    """Make the error messages of all commands name options instead of Python arguments."""
     for one in getattr(command, "commands", {}).values():
         _name_options(one)
     options = {one.name: max(one.opts, key=len) for one in command.params if one.param_type_name == "option"}
@@ -127,7 +128,7 @@ def _name_options(command) -> None:
 
 def _explain(error: Exception) -> int:
     """Report an error in one line on standard error; return the exit status."""
-    if hasattr(error, "format_message"):  # how the command was called: click's and typer's own errors
+    if hasattr(error, "format_message"):  # an error of click or typer about the usage of the command
         context = getattr(error, "ctx", None)
         path = context.command_path if context is not None else "jeit"
         message = error.format_message().rstrip(".")  # pyright: ignore[reportAttributeAccessIssue]
@@ -156,14 +157,14 @@ def _fail(message: str, status: int) -> int:
 
 
 def _one_line(message: str) -> str:
-    """Text as one line that a terminal shows as it is, shortened in the middle where it is long."""
+    """Convert text to one line of printable characters, shortened in the middle if it is too long."""
     line = "".join(letter if letter.isprintable() else "�" for letter in " ".join(message.split()))
     half = (_LONGEST - 3) // 2
     return line if len(line) <= _LONGEST else f"{line[:half]} … {line[-half:]}"
 
 
 def _shown_once() -> Callable[..., None]:
-    """Function that shows a command's warnings, each only once, since the same objects are often created again."""
+    """Create a function that prints each warning only once, since the same objects are often created repeatedly."""
     shown: set[str] = set()
 
     def show(message, category, filename, lineno, file=None, line=None) -> None:
@@ -178,10 +179,10 @@ def _shown_once() -> Callable[..., None]:
 
 
 def _start(*, quickly: bool) -> None:
-    """Set up the process; `quickly` for commands that run no program many times, whose time would be mostly
+    """Set up the process. `quickly`: whether to compile quickly, for commands that spend most of their time on
     compilation. XLA_FLAGS set by the user take precedence."""
     if quickly:
         os.environ.setdefault("XLA_FLAGS", quick_compilation())
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # of folders that it cannot write to, and fonts
-    # Imports and tracing create many small objects, which Python's garbage collector would scan again and again.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # hides messages about fonts and unwritable folders
+    # Imports and tracing create many small objects, which Python's garbage collector would scan repeatedly.
     gc.set_threshold(100_000, 20, 50)

@@ -1,4 +1,4 @@
-"""Commands of the applications above the core, by name: they are imported when they are called."""
+"""Table of all commands and their modules, which are imported only when a command is called."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from jeit.cli.options import NETWORK
 
-# Each command and the module that has it, which is imported when the command is called.
+# Module of each command, by name of the command.
 COMMANDS = {
     "demo": "jeit.cli.commands.demo",
     "reconstruct": "jeit.cli.commands.reconstruct",
@@ -28,7 +28,7 @@ COMMANDS = {
 
 
 def check_method(method: str | None, others: Iterable[str]) -> None:
-    """Raise `ValueError` for a `--method` that is neither among `others` nor the network's."""
+    """Check `--method`. Raises `ValueError` unless it is "network" or among `others`."""
     from jeit.arguments import check_name
 
     if method is not None:
@@ -36,5 +36,5 @@ def check_method(method: str | None, others: Iterable[str]) -> None:
 
 
 def image_by_network(*arguments: Any, **options: Any) -> None:
-    """Image frames by a network: `jeit.touch.commands.networks.image_by_network`."""
+    """Image frames by a network; see `jeit.touch.commands.networks.image_by_network`."""
     importlib.import_module("jeit.touch.commands.networks").image_by_network(*arguments, **options)

@@ -1,4 +1,4 @@
-"""Output of the commands: progress of their steps, and tables of results."""
+"""Output of commands: progress of their steps, and tables of results."""
 
 from __future__ import annotations
 
@@ -17,20 +17,22 @@ if TYPE_CHECKING:
     from jeit.image import Inclusion
 
 
-# Number of columns that all properties of a body fit into.
+# Maximum width of a table, in characters.
 _WIDTH = 80
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
 
 def plain_console() -> Console:
-    """Standard output on which text is shown as it is: the content of files is never interpreted as rich's markup."""
+    """Console for standard output without highlighting and markup, so that the content of files is printed
+    unchanged."""
     return Console(highlight=False, markup=False)
 
 
 class Steps:
-    """Progress on standard output: the step under way with a spinner, steps done with the seconds they took.
+    """Progress on standard output: the current step with a spinner, and completed steps with their duration.
 
-    Call it with the name of each step as it begins; `report` says how far it is. Prints nothing when `quiet`.
+    Call it with the name of each step when the step begins; `report` shows the progress within the step. Prints nothing
+    if `quiet`.
     """
 
     def __init__(self, console: Console, *, quiet: bool):
@@ -49,11 +51,11 @@ class Steps:
 
     @property
     def under_way(self) -> str:
-        """The name of the step that was begun last, empty before the first."""
+        """Name of the current step; empty before the first."""
         return self._step
 
     def report(self, detail: str) -> None:
-        """Say how far the step under way is, beside its spinner."""
+        """Show the progress within the current step beside its spinner."""
         if self._status is not None:
             self._status.update(Text(f"{self._step} … {detail}"))
 
@@ -75,7 +77,7 @@ class Steps:
 
 
 def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
-    """A table of names and values."""
+    """Create a table of names and values."""
     table = Table(title=title, title_justify="left", title_style="bold", show_header=False, box=None, padding=(0, 2))
     table.add_column(style="dim")
     table.add_column(overflow="fold")
@@ -85,12 +87,12 @@ def pairs(title: str, rows: list[tuple[str, str]]) -> Table:
 
 
 def say_written(console: Console, first: Path, *others: str) -> None:
-    """Say which files there are now: the `first` with its folder, others by name."""
+    """Print the names of the files written: the `first` with its folder, the others by name alone."""
     console.print(Text("Written:", "dim"), ", ".join([str(first), *others]), soft_wrap=True)
 
 
 def scaled(value: float | None, unit: str) -> str:
-    """A value with three digits and an SI prefix: 0.00132 S is "1.32 mS"."""
+    """Format a value with three digits and an SI prefix, such as "1.32 mS" for 0.00132 S."""
     if value is None:
         return "not known"
     value = float(f"{value:.3g}")  # 999.6 µS is 1 mS
@@ -101,7 +103,8 @@ def scaled(value: float | None, unit: str) -> str:
 
 
 def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
-    """A unit with the SI prefix that suits the largest of the values, and all of them in it, for a table's column."""
+    """Format the values of a table column in one unit, with the SI prefix that suits the largest value; return the unit
+    and the formatted values."""
     largest = float(f"{max((abs(value) for value in values), default=0.0):.3g}")
     exponent, prefix = next((pair for pair in _PREFIXES if largest >= 10.0 ** pair[0]), _PREFIXES[0])
     return f"{prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
@@ -114,19 +117,21 @@ def inclusion_table(
     *,
     background: float | None = None,
 ) -> Table:
-    """A row for each inclusion, of a sheet (or the slice through a solid) or of a solid: kind, place, size, and the
-    change of conductivity at its peak; `unit` is that of conductivity. `ranges`: from where to where peaks may lie, if
-    that is known. `background`: the conductivity that they are changes of, if it is known."""
+    """Create a table with a row for each inclusion: kind, place, size, and peak change of conductivity.
+
+    `unit`: unit of conductivity. `ranges`: range of each peak, if known. `background`: conductivity of the reference,
+    if known.
+    """
     ends = [end for both in ranges for end in both]
     unit, said = in_one_unit([*(one.peak for one in inclusions), *ends], unit)
     peaks, ends = said[: len(inclusions)], said[len(inclusions) :]
     dimension = max((len(one.centroid) for one in inclusions), default=2)
     solid = any(one.is_solid for one in inclusions)
     places = [f"{axis} / mm" for axis in "xyz"[:dimension]]
-    # A million times either: square metres in mm², cubic metres in cm³.
+    # The same factor 1e6 converts square metres to mm² and cubic metres to cm³.
     size, digits = ("volume\n/ cm³", 2) if solid else ("area / mm²", 0)
     more = [*(["± 1 σ"] if ranges else []), *(["of back-\nground"] if background else [])]
-    # All that a solid body has goes into 80 columns.
+    # Narrow columns let all properties of a solid body fit into 80 characters.
     close = {"box": None, "padding": (0, 1 if ranges else 2), "collapse_padding": True, "pad_edge": not ranges}
 
     rows = []
@@ -137,7 +142,7 @@ def inclusion_table(
         rows.append([*place, f"{1e6 * inclusion.area:.{digits}f}", peak, *after])
 
     def table_of(parted: str) -> Table:
-        """Table with this text between the kind of a body and "column"."""
+        """Create the table; `parted` separates the kind of a body from the word "column"."""
         table = Table("inclusion", *places, size, f"peak change\n/ {unit}", *more, **close)
         table.columns[0].min_width = max((len(one.kind) for one in inclusions), default=0)
         for column in table.columns[1:]:

@@ -1,4 +1,4 @@
-"""Frames of standard input, and the seconds they come at: by a rate, or by the clock."""
+"""Frames from standard input, with their times from a given rate or from the clock."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-# Share of the usual time between frames after which a frame counts as arriving live; the number of such frames in a row
-# that ends the search; and the most seconds for reading earlier frames.
+# Minimum waiting time for a frame to count as live, as a share of the usual interval between frames; number of
+# consecutive live frames after which earlier frames are taken to be read; and maximum time for reading earlier frames,
+# in seconds.
 _WAITED, _IN_A_ROW, _BEFORE = 0.4, 3, 5.0
 
 
 class LiveFrames:
-    """Pairs of a second and a frame, of `lines` as `parse_frames` gives them, that end with them.
+    """Iterator of pairs (time in seconds, frame) over `lines`, the frames that `parse_frames` returns.
 
-    With a `rate`, frames/s, all frames count. Without one the clock gives their seconds, except for frames that arrived
-    while nobody read: those are left out, `left_out` of them; and where all frames have arrived already, as from a
-    file, the `usual` rate is used.
+    With a `rate`, in frames/s, all frames are used. Without it, times come from the clock, and frames that arrived
+    before reading began are skipped and counted in `left_out`. If all frames have already arrived, such as from a file,
+    none is skipped, and the `usual` rate is used.
     """
 
     def __init__(self, lines: Iterator[object], rate: float | None, usual: float):
@@ -29,14 +30,15 @@ class LiveFrames:
 
     @property
     def rate_seen(self) -> float:
-        """Frames/s of what has been read."""
+        """Frame rate in frames/s: the given rate, the mean rate of the frames read, or the usual rate."""
         if self.rate is not None:
             return self.rate
         seconds = [second for second, _ in self.read]
         return (len(seconds) - 1) / seconds[-1] if len(seconds) > 1 and seconds[-1] > 0 else self.usual
 
     def untouched(self, span: float) -> Float[np.ndarray, "u M"]:
-        """The frames of the first `span` seconds, which will come again. Raises `ValueError` where there is none."""
+        """Read the frames of the first `span` seconds; iteration returns them again. Raises `ValueError` if there are
+        none."""
         self._catch_up()
         while not self.read or self.read[-1][0] < span:
             frame = self._next()
@@ -57,7 +59,7 @@ class LiveFrames:
             yield self._second(), frame
 
     def _catch_up(self) -> None:
-        """Leave out what came before it was read; if that is all there is, keep it, by a rate."""
+        """Skip frames that arrived before reading began. If the input ends with them, keep them and use a rate."""
         if not self.by_clock:
             return
         before, in_a_row, start = [], 0, time.monotonic()
@@ -86,5 +88,5 @@ class LiveFrames:
         return max(second, self.read[-1][0] if self.read else 0.0)
 
     def _next(self) -> object | None:
-        """The next frame, waited for; None after the last."""
+        """Wait for the next frame; None after the last."""
         return next(self.lines, None)

@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share."""
+"""Options and arguments shared by several commands."""
 
 from __future__ import annotations
 
@@ -59,17 +59,18 @@ ReferenceFrames = Annotated[
     ),
 ]
 NETWORK = "network"
-"""The method that `--method` of `reconstruct` and `stream` has beside those of `jeit.imaging`."""
+"""Value of `--method` of `reconstruct` and `stream` for imaging by a network, besides the methods of `jeit.imaging`."""
 
-# Folders that make_folder made, the innermost of each first; files that the command under way was given.
+# Folders created by `make_folder`, inner folders first.
 _MADE: list[Path] = []
+# Input files of the current command.
 _GIVEN: list[Path] = []
-# Options whose files are written, not read.
+# Options that name output files.
 _WRITTEN = ("output", "page", "film")
 
 
 def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a command so that `make_folder` knows the files that it was given."""
+    """Wrap a command so that its input files are recorded for `make_folder`."""
 
     @wraps(command)
     def call(**values: Any) -> Any:
@@ -84,11 +85,11 @@ def remembering_files(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class StoppedError(Exception):
-    """Raised when Ctrl-C ended a command, with the message to print."""
+    """Error raised when Ctrl-C stops a command, with the message to print."""
 
 
 def telling_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a command so that it raises `StoppedError` on Ctrl-C, which typer would not report."""
+    """Wrap a command so that Ctrl-C raises `StoppedError`, since typer does not report `KeyboardInterrupt`."""
 
     @wraps(command)
     def call(*given: Any, **values: Any) -> Any:
@@ -102,7 +103,7 @@ def telling_when_stopped(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextmanager
 def naming_options(options: dict[str, str]) -> Iterator[None]:
-    """Context in which errors about these arguments name their options instead; see `in_options`."""
+    """Context manager that replaces arguments by the names of their `options` in error messages; see `in_options`."""
     try:
         yield
     except (ValueError, FileNotFoundError) as error:
@@ -119,7 +120,7 @@ def read_file(
     description: str | None,
     like: "Measurement | None" = None,
 ) -> "Measurement":
-    """The measurement in a file given as `option`, "DATA" or "--reference", which an error says that has no file."""
+    """Read the measured file given as `option`, "DATA" or "--reference", which is named in error messages."""
     from jeit.data import read
 
     with naming_options({"path": option}):
@@ -129,7 +130,8 @@ def read_file(
 def read_pair(
     data: Path, reference: Path | None, frames: str | None, format: str | None, description: str | None
 ) -> "tuple[Measurement, Measurement | None]":
-    """The measurement in DATA and its reference: a file's, or only some `frames` of that, or else of DATA's own."""
+    """Read DATA and its reference. `frames`: range of the frames of the reference, or of DATA without one, that are
+    used as reference."""
     base = None if reference is None else read_file("--reference", reference, format, description)
     measurement = read_file("DATA", data, format, description, like=base)
     if frames is None:
@@ -146,10 +148,9 @@ def read_pair(
 
 
 def in_options(said: str, options: dict[str, str]) -> str:
-    """Turn a message about jeit's arguments, at the beginning of a sentence or as `name=`, into one about a command's
-    options.
+    """Replace Python arguments by options in an error message, at its beginning or where written as `name=`.
 
-    An option in millimetres says so in its name: the question whether millimetres were given for metres is left out.
+    For options in millimetres, whose names end in "-mm", the question whether lengths were given in metres is removed.
     """
     from jeit.arguments import IN_MILLIMETRES
 
@@ -165,29 +166,29 @@ def in_options(said: str, options: dict[str, str]) -> str:
 
 
 def check_positive(options: dict[str, float]) -> None:
-    """Raise `ValueError` for options that are not positive and finite."""
+    """Check options that must be positive and finite. Raises `ValueError` otherwise."""
     for name, value in options.items():
         if not 0 < value < float("inf"):
             raise ValueError(f"{name} must be positive; it is {value:g}.")
 
 
 def check_at_least(options: dict[str, tuple[int | None, int]]) -> None:
-    """Raise `ValueError` for options, if given, that are less than the least that goes with each."""
+    """Check options, given as pairs of value and minimum. Raises `ValueError` for values below their minimum."""
     for name, (value, least) in options.items():
         if value is not None and value < least:
             raise ValueError(f"{name} must be at least {least}; it is {value}.")
 
 
 def check_within(name: str, value: float, least: float, most: float, unit: str = "") -> None:
-    """Raise `ValueError` for an option that is not a number from `least` to `most`."""
+    """Check an option that must be a number from `least` to `most`. Raises `ValueError` otherwise."""
     if not least <= value <= most:
         unit = f" {unit}" if unit else ""
         raise ValueError(f"{name} must be from {least:g} to {most:g}{unit}; it is {value:g}.")
 
 
 def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz", "report.json", "image.vtu")) -> None:
-    """Make the folder for results of these names before any work is done; `remove_empty_folders` undoes it. Raises
-    `ValueError` if it cannot be one, and where a file of that name in it is one that the command was given."""
+    """Create the folder for result files of the given names before the computation; `remove_empty_folders` undoes it.
+    Raises `ValueError` if the path cannot be a folder, and if a result would overwrite an input file of the command."""
     for name in names:
         if any((output / name).exists() and (output / name).samefile(one) for one in _GIVEN):
             raise ValueError(
@@ -202,14 +203,14 @@ def make_folder(output: Path, names: tuple[str, ...] = ("image.png", "image.npz"
 
 
 def remove_empty_folders() -> None:
-    """Remove what `make_folder` made and nothing was written to."""
+    """Remove the empty folders among those created by `make_folder`."""
     while _MADE:
         with suppress(OSError):
             _MADE.pop(0).rmdir()
 
 
 def number_or_name(text: str, number: type = float):
-    """The number that `text` spells, or else the text."""
+    """Convert text to a number; return the text itself if it is not a number."""
     try:
         return number(text)
     except ValueError:

@@ -1,5 +1,5 @@
-"""Handling of Ctrl-C and SIGTERM while frames are streamed: the frames received are written, and the exit status says
-which signal ended the command."""
+"""Handling of Ctrl-C and SIGTERM during streaming: the frames received are written, and the exit status tells which
+signal stopped the command."""
 
 from __future__ import annotations
 
@@ -19,17 +19,18 @@ from jeit.cli.options import remove_empty_folders
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _NO_MORE = object()
-# Seconds between reports of the number of frames received.
+# Interval between reports of the number of frames received, in seconds.
 _EVERY = 0.25
 
 
 class _StoppedError(Exception):
-    """Raised when a stream was stopped, to skip the remaining work."""
+    """Error raised to skip the remaining work when a stream was stopped."""
 
 
 class Stopping:
-    """A context in which those signals end the frames of `until` after the one under way, or at once where the next is
-    waited for. A second signal ends the command at once, and so does the first where there are no frames yet."""
+    """Context manager that stops a stream on Ctrl-C and SIGTERM: the iterator of `until` ends after the current frame,
+    or at once while waiting for the next. A second signal, or a signal before the first frame, stops the command at
+    once."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -37,7 +38,7 @@ class Stopping:
         self._earlier: dict[int, Any] = {}
 
     def until(self, frames: Iterable) -> Iterator:
-        """The frames, until a signal comes."""
+        """Iterate over the frames until a signal arrives."""
         self._streaming = True
         source = iter(frames)
         try:
@@ -56,7 +57,7 @@ class Stopping:
             self._waiting = False
 
     def before(self, pictures: Sequence[str], step: Steps) -> Callable[[str], None]:
-        """Function that reports what is written and drawn as steps; nothing is drawn once a signal has come."""
+        """Create a function that reports writing and drawing as steps, and skips drawing after a signal."""
 
         def report(what: str) -> None:
             part = "draw" if what.partition(":")[0] in pictures else "write"
@@ -70,8 +71,8 @@ class Stopping:
 
     @contextmanager
     def ending(self, come: "FrameCounter", *files: str) -> Iterator[None]:
-        """End the command after what is within, where a signal has come, and say after how many frames; `files` have
-        them."""
+        """Context manager that exits the command at its end if a signal has arrived, and prints the number of frames
+        received and the `files` that contain them."""
         try:
             yield
             held = f"; {' and '.join(files)} have them"
@@ -82,7 +83,7 @@ class Stopping:
         except KeyboardInterrupt:
             if self.signal is None or come.number:
                 raise
-            held = ""  # the first frame's programs were being compiled
+            held = ""  # stopped during compilation, before the first frame
         if self.signal is not None:
             self._end(f" after {counted(come.number, 'frame')}{held}")
 
@@ -111,14 +112,15 @@ class Stopping:
 
 
 class FrameCounter:
-    """Reports, a few times a second, how many frames have been received, of `number` where that is known."""
+    """Counter of frames that reports the number received a few times per second. `number`: total number of frames, if
+    known."""
 
     def __init__(self, step: Steps, number: int | None = None):
         self._step, self._of = step, "" if number is None else f" of {number:,}"
         self.number, self._last = 0, 0.0
 
     def one_more(self) -> None:
-        """Count one more frame."""
+        """Count a frame."""
         self.number += 1
         now = time.monotonic()
         if now - self._last > _EVERY:

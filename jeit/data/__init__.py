@@ -1,7 +1,7 @@
-"""Measured data: readers, checks of what was measured, and writing it out again.
+"""Measured data: readers for files, checks of the measurements, and export.
 
-`read(path)` gives a `Measurement`: voltages, mask, protocol, electrodes, outline. `check_imageable` says
-whether a frame can be imaged against a reference.
+`read(path)` returns a `Measurement`, which holds voltages, mask, protocol, electrodes and body. `check_imageable`
+checks whether a frame can be imaged against a reference.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""The body and the electrodes that [geometry] and [electrodes] of a description give, checked against each other."""
+"""Construction of body and electrodes from the sections `[geometry]` and `[electrodes]` of a description, and checks
+that they fit together."""
 
 from __future__ import annotations
 
@@ -24,13 +25,14 @@ if TYPE_CHECKING:
     from jeit.data.description_tables import ElectrodesTable, FacetsTable, GeometryTable, MeshTable, PlacedTable
 
 _UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
-# Size of the body over the length given by a key.
+# Size of the body divided by the length that a key gives.
 _ACROSS = {"radius": 2.0, "width": 1.0, "depth": 1.0, "height": 1.0, "thickness": 1.0}
 
 
 def warn_large_body(table: GeometryTable, body: Body, origin: str) -> None:
-    """Warn, in one sentence, of lengths in `[geometry]` of the file `origin` that look like those of another unit."""
-    from jeit.data.description_tables import PolygonTable  # it was imported when the table was read
+    """Warn if lengths in `[geometry]` of the file `origin` are so large that they seem to be in another unit than
+    metres."""
+    from jeit.data.description_tables import PolygonTable  # already imported when the table was read
 
     lengths = {key: float(getattr(table, key, None) or 0) for key in _ACROSS}
     large = {key: length for key, length in lengths.items() if _ACROSS[key] * length > LARGE}
@@ -61,15 +63,15 @@ def _extent(points) -> float:
     return float(np.ptp(np.asarray(points), axis=0).max())
 
 
-# Greatest distance of an electrode from the surface, as a share of its smaller size, and its greatest overhang beyond
-# the wall, as a share of its height.
+# Maximum distance of an electrode from the surface as a fraction of its smaller dimension, and maximum overhang beyond
+# the wall as a fraction of its height.
 _MOST_OFF = 0.1
 _MOST_OUT = 0.02
 
 
 def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
-    """Raise `ValueError` for the first electrode off the surface, the first two at one place, the first patch wider
-    than the body, and the first partly above or below a wall."""
+    """Raise `ValueError` for electrodes that lie off the surface, that coincide, that are wider than the body
+    (patches), or that extend above or below the wall."""
     if isinstance(electrodes, FacePatches):
         height = np.asarray(electrodes.height)
         smaller = np.minimum(electrodes.width, height)
@@ -78,7 +80,7 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
     else:
         return
     place = np.asarray(electrodes.position)
-    check_on_surface(place, _MOST_OFF * smaller, lambda places: _off(body, places)[0])
+    check_on_surface(place, _MOST_OFF * smaller, lambda places: _surface_distance(body, places)[0])
     check_apart(place, smaller)
     if isinstance(electrodes, FacePatches):
         x_min, x_max, y_min, y_max = body.extent
@@ -86,7 +88,7 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
         across = max(sides) if isinstance(body.outline, Disk | Rectangle) else float(np.hypot(*sides))
         check_size("width", np.asarray(electrodes.width), across, "the body")
     z, top = place[:, 2], body.thickness
-    out, on_wall = np.maximum(height / 2 - z, z + height / 2 - top), _off(body, place)[1]
+    out, on_wall = np.maximum(height / 2 - z, z + height / 2 - top), _surface_distance(body, place)[1]
     for number in np.flatnonzero(on_wall & (out > _MOST_OUT * height))[:1]:
         low, high = z[number] - height[number] / 2, z[number] + height[number] / 2
         key = "height: " if height[number] > top else ""
@@ -96,12 +98,12 @@ def check_on_solid(electrodes: AbstractElectrodes, body: Solid) -> None:
         )
 
 
-def _off(body: Solid, place: Float[np.ndarray, "L 3"]):
-    """Distance of places from the surface, metres, and whether the wall is nearer than the lids."""
+def _surface_distance(body: Solid, place: Float[np.ndarray, "L 3"]):
+    """Distance of places from the surface, in metres, and whether the wall is nearer than the lids."""
     z = place[:, 2]
     within, between = np.asarray(body.outline.signed_distance(place[:, :2])), np.minimum(z, body.thickness - z)
     off_wall, off_lid = np.abs(within), np.abs(between)
-    # Outside, beyond the wall and beyond the lid are two sides of a right angle.
+    # Outside the body, the distances beyond the wall and beyond the lid are the legs of a right triangle.
     outside = np.hypot(np.minimum(within, 0), np.minimum(between, 0))
     return np.where(outside > 0, outside, np.minimum(off_wall, off_lid)), off_wall <= off_lid
 
@@ -115,22 +117,22 @@ def _cylinder(radius: float, height: float) -> Solid:
 
 
 SHAPES: dict[str, Callable[..., Body]] = {**OUTLINES, "box": _box, "cylinder": _cylinder}
-"""What makes each body, by the name of its shape."""
+"""Constructor of each body, by the name of its shape."""
 ELECTRODES: dict[str, dict[int, type[Any]]] = {
     "boundary": {2: BoundaryElectrodes},
     "disc": {2: SheetDiscs, 3: FaceDiscs},
     "patch": {3: FacePatches},
     "point": {2: PointElectrodes, 3: PointElectrodes},
 }
-"""Electrodes at positions, by kind and the number of their coordinates."""
+"""Classes of electrodes with positions, by kind and number of coordinates."""
 _SIZES = {"boundary": ("width",), "disc": ("radius",), "patch": ("width", "height"), "point": ()}
-# Keys of a shape's table that are no arguments of what makes it.
+# Keys of a shape's table that are not arguments of its constructor.
 _NO_ARGUMENT = {"shape", "thickness"}
 
 
 def described_body(table: GeometryTable, folder: Path, origin: str) -> Body:
-    """The body of a table `[geometry]`; a mesh's file is looked for in `folder`. Raises `ValueError`, and warns once of
-    lengths that are too large for metres, by their keys."""
+    """The body of a table `[geometry]`; the file of a mesh is looked for in `folder`. Raises `ValueError` if it is not
+    valid, and warns if lengths are too large for metres."""
     with size_checked():
         body = _body(table, folder, origin)
     warn_large_body(table, body, origin)
@@ -138,7 +140,7 @@ def described_body(table: GeometryTable, folder: Path, origin: str) -> Body:
 
 
 def _body(table: GeometryTable, folder: Path, origin: str) -> Body:
-    from jeit.data.description_tables import MeshTable  # it was imported when the table was read
+    from jeit.data.description_tables import MeshTable  # already imported when the table was read
 
     if isinstance(table, MeshTable):
         return _own_mesh(table, folder, origin)
@@ -166,7 +168,8 @@ def _own_mesh(table: MeshTable, folder: Path, origin: str) -> OwnMesh:
 
 
 def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str) -> AbstractElectrodes:
-    """The electrodes of a table `[electrodes]` on a body, if that is described. Raises `ValueError`."""
+    """The electrodes of a table `[electrodes]`, on a body if one is described. Raises `ValueError` if they are not
+    valid."""
     try:
         if table.kind == "facets":
             return _facets(table, body)
@@ -191,14 +194,15 @@ def described_electrodes(table: ElectrodesTable, body: Body | None, origin: str)
 
 
 def _of_keys(message: str) -> str:
-    """A message that begins with an argument of electrodes, beginning with the key of that."""
+    """Replace the argument name at the beginning of a message about electrodes by the corresponding key of the
+    description."""
     argument, colon, rest = message.partition(": ")
     key = {"position": "positions", "positions": "positions", "width": "width", "height": "height"}.get(argument)
     return f"electrodes.{key}{colon}{rest}" if key else message
 
 
 def _facets(table: FacetsTable, body: Body | None) -> AbstractElectrodes:
-    """Groups of facets that the mesh has names for."""
+    """Electrodes that are named groups of facets of the mesh."""
     if not isinstance(body, OwnMesh):
         raise ValueError("kind = 'facets' is of facets that a mesh has names for: give [geometry] mesh.")
     return plates(body.given, table.tags, table.contact_impedance)
@@ -225,12 +229,12 @@ def _positions(table: PlacedTable, body: Body | None, origin: str) -> np.ndarray
     if levels.max() > body.thickness:
         raise ValueError(f"levels must be heights from 0 to {body.thickness:g} m; one is {levels.max():g}.")
     around = _around(table, outline, table.number)
-    # Level after level, each with as many electrodes.
+    # Electrodes are ordered level after level, with the same number on each level.
     return np.concatenate([np.column_stack([around, np.full(len(around), level)]) for level in levels])
 
 
 def _around(table: PlacedTable, outline: Domain, number: int) -> np.ndarray:
-    """Places (L, 2) along the edge of an outline."""
+    """Positions (L, 2) along the edge of an outline."""
     if table.layout == "perimeter":
         return perimeter(outline, number, start=table.start)
     if not isinstance(outline, Disk):
@@ -245,6 +249,6 @@ def _around(table: PlacedTable, outline: Domain, number: int) -> np.ndarray:
 
 
 def located(error: Exception | str, origin: str, where: str) -> ValueError:
-    """An error, in 400 characters, with the file and the key that it is about."""
+    """A `ValueError` with the file and the key that an error concerns, cut to 400 characters."""
     text = str(error).removeprefix(f"{origin}: ")
     return ValueError(f"{origin[:80]}: {text if text.startswith(where) else f'{where}: {text}'}"[:400])

@@ -1,11 +1,4 @@
-"""The protocol that [protocol] of a description gives, and the order in which electrodes on an edge are numbered.
-
-Whether electrodes on an edge are numbered as they follow each other along it.
-
-A layout may be numbered in any order. But two exchanged rows of a table of positions look the same, spoil every image,
-and go unnoticed; so such an order is reported, with what the signs of the voltages, which depend on the order, say of
-it.
-"""
+"""Construction of the protocol that the section `[protocol]` of a description specifies."""
 
 from __future__ import annotations
 
@@ -26,18 +19,20 @@ if TYPE_CHECKING:
 
 PROTOCOL_ARRAYS = ("drive", "measurement", "drive_index", "measurement_index")
 _CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
-# Keys that are no options of a constructor.
+# Keys that are not passed to a constructor as options.
 _COMMON = {"kind", "number", "name", "current", "current_from_name", "current_unit"}
-# Keys that number electrodes, from 0.
+# Keys whose values are indices of electrodes, from 0.
 _NUMBERING = ("common", "reference", "pairs", "drive_pairs", "measurement_pairs")
-# Bytes that are taken for every channel beside its pattern, and copies of the patterns, while a protocol is used.
+# Estimated memory of a protocol in use: bytes for every channel in addition to its pattern, and number of copies of the
+# patterns.
 _CHANNEL, _COPIES = 64, 2
 
 
 def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
-    """The protocol of a table `[protocol]` for the file at `path`; of so many electrodes, if they are described.
+    """The protocol of a table `[protocol]` for the file at `path`. `num_electrodes`: number of electrodes, None if they
+    are not described.
 
-    Raises `ValueError` where what is described makes no protocol, or one that would not fit in memory.
+    Raises `ValueError` if the table is not a valid protocol, or if the protocol would not fit in memory.
     """
     try:
         if table.kind == "matrices":
@@ -50,14 +45,14 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
             return protocol_of_file(table, path)
         if table.kind == "optimal":
             return _optimal(table, origin)
-        return _constructed(table, num_electrodes, path, origin)
+        return _construct(table, num_electrodes, path, origin)
     except ValueError as error:
         raise located(error, origin, "protocol") from None
 
 
-def _constructed(table: ConstructedTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
-    """Make a protocol by the constructor of that name."""
-    # The number of a protocol with a reference electrode counts those on the boundary only.
+def _construct(table: ConstructedTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:
+    """The protocol made by the constructor that `kind` names."""
+    # For a protocol with a reference electrode, `number` counts only the electrodes on the boundary.
     apart = 1 if table.kind == "reference_electrode" else 0
     number = table.number if num_electrodes is None or table.number is not None else num_electrodes - apart
     if number is None:
@@ -93,7 +88,7 @@ def _optimal(table: OptimalTable, origin: str) -> Protocol:
 
 
 def _counts(kind: str, number: int, options: dict[str, Any]) -> tuple[int, int, int, int]:
-    """Upper bounds of the numbers of drive and measurement patterns, electrodes and channels of a protocol."""
+    """Upper bounds of the numbers of drive patterns, measurement patterns, electrodes and channels of a protocol."""
     if kind == "two_terminal":
         pairs = number * (number - 1) // 2 if options.get("pairs") is None else len(options["pairs"])
         return pairs, pairs, number, pairs
@@ -109,7 +104,7 @@ def _check_size(drives: int, measurements: int, number: int, channels: int, orig
 
 
 def _current(table: DrivenTable, path: Path) -> float:
-    """Amperes."""
+    """Amplitude of the current in amperes."""
     unit = _CURRENT_UNITS[table.current_unit]
     if table.current_from_name is None:
         assert table.current is not None
@@ -124,8 +119,8 @@ def _current(table: DrivenTable, path: Path) -> float:
 
 
 def number_in_name(pattern: str, name: str) -> float | None:
-    """The first number, such as 30 or 0.5, that stands in a `name` where a `pattern` has {current}; * in the pattern
-    stands for anything. None where there is none."""
+    """The first number, such as 30 or 0.5, in a file `name` at the place where the `pattern` has {current}; * in the
+    pattern matches any text. None if the name does not match."""
     before, _, after = pattern.partition("{current}")
     start = 0
     while start < len(name):
@@ -137,7 +132,7 @@ def number_in_name(pattern: str, name: str) -> float | None:
 
 
 def _number_end(text: str, start: int) -> int:
-    """The end of a number that begins at `start`."""
+    """Index after the last character of the number that begins at index `start`."""
     end = start
     while end < len(text) and text[end] in "0123456789":
         end += 1
@@ -149,8 +144,8 @@ def _number_end(text: str, start: int) -> int:
 
 
 def _matches(pattern: str, text: str) -> bool:
-    """Whether a text is as a pattern in which * stands for anything: each part as early as it can be, so that no part
-    is ever looked for twice."""
+    """Whether a text matches a pattern in which * stands for any text. Each part is matched at its earliest place, so
+    no part is searched for twice."""
     first, *others = pattern.split("*")
     if not others:
         return pattern == text

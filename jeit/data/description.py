@@ -1,29 +1,31 @@
-"""The small TOML file beside measured data that says what a table of numbers means.
+"""Descriptions: small TOML files beside measured data that state what the numbers in a table mean.
 
-Sections (`tank6cm.toml` in this folder is an example; only `[protocol]` must be there):
+Sections of a description (`tank6cm.toml` in this folder is an example; only `[protocol]` is required):
 
-- `[geometry]`: `shape` = "disk" (`radius`, `centre`), "rectangle" (`width`, `height`, `centre`) or "polygon"
-  (`vertices`, `holes`), each with `thickness` a solid from z = 0 up; "box" (`width`, `depth`, `height`) or "cylinder"
-  (`radius`, `height`). Metres. Or `mesh` = "tank.msh", a file beside the description, any that `jeit.mesh.read` knows,
-  and `scale`, the length of its unit in metres (1e-3 for millimetres).
-- `[electrodes]`: `kind` = "boundary" (`width`), "disc" (`radius`; in a sheet or on a solid's surface), "patch" (on a
-  solid: `width`, `height`), "point", or "facets" (`tags`, the names of groups of a mesh's facets); `contact_impedance`,
-  ohm·m² (on the edge of a sheet ohm·m); and where they are: `layout` = "ring" (disk, cylinder: `number`,
-  `start_angle_degrees`, `clockwise`) or "perimeter" (`number`, `start`), on a solid at each height z of `levels`, one
-  number or a list, one level after the other; or `positions`, of two or three coordinates.
-- `[protocol]`: `kind` = name of a constructor in `jeit.protocol` with its arguments, or "matrices" with
-  `drive` (S, L) in amperes and `measurement` (K, L), or "channels" with those and `drive_index` (M,) and
-  `measurement_index` (M,), from 0. `current` in amperes, or `current_unit`; or `current_from_name`, the name of
-  the file with {current} in place of the number and * for anything, such as "*_{current}uA_*". Or "optimal" with
-  `transfer`, and `other`, (L, L) ohm, and `current` or `power`; or "measured", of a .mat or .npz file that holds its
-  currents in `drive_key` ("current_patterns" unless given, a column a pattern; `patterns_in` = "rows" otherwise), and
-  `measurement`, what is read of all potentials: "mean-removed" (less their mean), "mean", "adjacent" or "against" an
-  electrode `reference`; or `measurement_key`, a matrix of the file.
+- `[geometry]`: the body, in metres. `shape` = "disk" (`radius`, `centre`), "rectangle" (`width`, `height`, `centre`) or
+  "polygon" (`vertices`, `holes`) is a sheet, or, with a `thickness`, a solid from z = 0 upwards; "box" (`width`,
+  `depth`, `height`) and "cylinder" (`radius`, `height`) are solids. Alternatively `mesh` = "tank.msh" names a mesh file
+  beside the description, in any format that `jeit.mesh.read` knows, and `scale` is the length of its unit in metres
+  (1e-3 for millimetres).
+- `[electrodes]`: `kind` = "boundary" (`width`), "disc" (`radius`; in a sheet or on the surface of a solid), "patch" (on
+  a solid: `width`, `height`), "point", or "facets" (`tags`: names of groups of facets of the mesh); `contact_impedance`
+  in ohm·m² (on the edge of a sheet in ohm·m). Their positions follow from `layout` = "ring" (disk, cylinder: `number`,
+  `start_angle_degrees`, `clockwise`) or "perimeter" (`number`, `start`), on a solid at each height z in `levels` (a
+  number or a list), numbered level after level; or from `positions`, each of two or three coordinates.
+- `[protocol]`: `kind` = name of a constructor in `jeit.protocol`, with its arguments and the amplitude: `current` in
+  amperes, or in `current_unit`; or `current_from_name`, the name of the data file with {current} in place of the number
+  and * for any text, such as "*_{current}uA_*". Or `kind` = "matrices" with `drive` (S, L) in amperes and `measurement`
+  (K, L); "channels" with both of these and `drive_index` (M,) and `measurement_index` (M,), counted from 0; or
+  "optimal" with `transfer`, optionally `other`, both (L, L) in ohm, and `current` or `power`. Or "measured", for a .mat
+  or .npz data file that holds the currents in the variable `drive_key` (default "current_patterns"), one pattern per
+  column, or per row with `patterns_in` = "rows"; `measurement` states how the potentials of all electrodes are read:
+  "mean-removed" (minus the mean of all), "mean" (against the mean of the others), "adjacent", or "against" an electrode
+  `reference`; alternatively `measurement_key` names a matrix of measurement patterns in the file.
 - `[data]`: `frames_in` = "columns" or "rows"; `delimiter`, `skip_rows`; `complex_pairs`, `component`; `gain`,
-  `polarity`, `unit`, `saturation`; `frame_names`; `keys`, the variables to read from a .mat or .npz file, of three
-  axes if they are as `axes` says (electrodes, patterns, frames unless given); `frames` = "all", or "mean" of them;
-  `frame_rate`, in a second.
-- `[notes]`: `text`, a list of sentences to carry along.
+  `polarity`, `unit`, `saturation`; `frame_names`; `keys`: variables to read from a .mat or .npz file; `axes`: order of
+  the axes of a three-dimensional array (default: electrodes, patterns, frames); `frames` = "all", or "mean" for their
+  average; `frame_rate` in frames per second.
+- `[notes]`: `text`, a list of sentences that are copied to the notes of the measurement.
 """
 
 from __future__ import annotations
@@ -53,7 +55,7 @@ _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
 
 @dataclass(frozen=True)
 class TableLayout:
-    """Arrangement of the numbers in a file (section `[data]`)."""
+    """Arrangement of the numbers in a data file (section `[data]`)."""
 
     frames_in: str = "rows"
     delimiter: str = ","
@@ -71,7 +73,7 @@ class TableLayout:
 
 @dataclass(frozen=True)
 class Description:
-    """A description read and checked: see the module's docstring."""
+    """A checked description; its sections are explained in the docstring of the module."""
 
     origin: str
     title: str
@@ -82,9 +84,9 @@ class Description:
     protocol_section: ProtocolTable | None = field(repr=False)
 
     def protocol(self, path: str | Path) -> Protocol | None:
-        """The protocol of the file at `path` (whose name may hold the current), or None if not described.
+        """The protocol of the file at `path`, or None if none is described. The name of the file may state the current.
 
-        Raises `ValueError`, with file and section named, if what is described makes no protocol.
+        Raises `ValueError`, with file and section named, if the section `[protocol]` is not a valid protocol.
         """
         if self.protocol_section is None:
             return None
@@ -93,12 +95,12 @@ class Description:
 
     @property
     def patterns_measured(self) -> bool:
-        """Whether the currents lie in the data file."""
+        """Whether the current patterns are stored in the data file."""
         return self.protocol_section is not None and self.protocol_section.kind == "measured"
 
     @property
     def mean_removed(self) -> bool:
-        """Whether the file has the potentials of all electrodes less their mean, beside the currents."""
+        """Whether the data file stores currents, and potentials of all electrodes whose mean is subtracted."""
         section = self.protocol_section
         if section is None or section.kind != "measured" or section.measurement_key is not None:
             return False
@@ -106,19 +108,19 @@ class Description:
 
     @property
     def reading(self) -> tuple[Reading, int | None]:
-        """Reading of the potentials of all electrodes where the currents lie in the data file, and the electrode they
-        are read against."""
+        """For current patterns stored in the data file: how the potentials of all electrodes are read, and the
+        reference electrode, if there is one."""
         section = self.protocol_section
         if section is None or section.kind != "measured":
             return "mean-removed", None
         return section.measurement, section.reference
 
     def model(self, path: str | Path, *, num_points: int | None = None) -> ForwardModel:
-        """A model of what the file at `path` was measured on: on a new mesh of about `num_points` nodes, or, without
-        them, on a mesh of one's own.
+        """A forward model of the body on which the file at `path` was measured. A new mesh has about `num_points`
+        nodes; for a body given as a mesh, leave `num_points` out.
 
-        Raises `ValueError` where geometry, electrodes or protocol are not described, and for `num_points` where it is
-        missing or has no effect.
+        Raises `ValueError` if geometry, electrodes or protocol are not described, and if `num_points` is missing or has
+        no effect.
         """
         domain, electrodes, protocol = self.domain, self.electrodes, self.protocol(path)
         if domain is None or electrodes is None or protocol is None:
@@ -130,7 +132,7 @@ class Description:
 
 
 def load_description(which: str | Path) -> Description:
-    """Read a description: a path to a TOML file, or the name of a bundled one ("tank6cm").
+    """Read a description from a TOML file, or by the name of a bundled one ("tank6cm").
 
     Raises `ValueError` with the section and key at fault.
     """
@@ -147,11 +149,11 @@ def load_description(which: str | Path) -> Description:
 
 
 def parse_description(table: dict[str, Any], origin: str, folder: str | Path = ".") -> Description:
-    """Check a description given as nested dictionaries; files that it names are looked for in `folder`.
+    """Check a description given as nested dictionaries; files named in it are looked for in `folder`.
 
     Raises `ValueError` with the keys at fault.
     """
-    # pydantic takes longer to import than most of what jeit does with a description.
+    # Imported here because importing pydantic takes longer than most operations on a description.
     from jeit.data.description_tables import DescriptionTable
     from jeit.files.schema import validated
 
@@ -178,7 +180,8 @@ def _layout(data: DataTable) -> TableLayout:
         complex_pairs=data.complex_pairs,
         component=data.component,
         scale=scale,
-        # Given as the instrument reads it, compared after the gain is taken out.
+        # The saturation level is given in the numbers of the file, but compared with voltages from which the gain is
+        # removed.
         saturation=None if data.saturation is None else data.saturation * abs(scale),
         frame_names=tuple(data.frame_names),
         keys=tuple(data.keys),

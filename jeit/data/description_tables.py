@@ -1,4 +1,4 @@
-"""The tables of a description, key by key: what each may hold, from where to where, in which unit."""
+"""The tables of a description: for each key its type, range and unit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from pydantic import FailFast, Field, model_validator
 from jeit.files import MOST_ELECTRODES
 from jeit.files.schema import Number, Numbers, OneOf, Table, Word, Words, fault
 
-# Vertices of a polygon and holes in it: each side is compared with every other, each hole with every other.
+# Maximum numbers of vertices of a polygon and of its holes: each side is compared with every other side, and each hole
+# with every other hole.
 _MOST_VERTICES, _MOST_HOLES = 4096, 64
 _COUNT = Number(2, MOST_ELECTRODES, beyond="Channels grow with its square; in Python there is no such limit.")
 _INDEX = Number(0, MOST_ELECTRODES)
@@ -21,9 +22,9 @@ Sizes = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-9, 1e3, "m", s
 Place = Annotated[np.ndarray, Numbers(((2, 2),), -1e3, 1e3, "m")]
 Loop = Annotated[np.ndarray, Numbers(((3, _MOST_VERTICES), (2, 2)), -1e3, 1e3, "m")]
 Positions = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES), (2, 3)), -1e3, 1e3, "m")]
-# A single number stands for one ring, as one size stands for all electrodes.
+# A single number means one ring of electrodes, just as a single size applies to all electrodes.
 Levels = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 0, 1e3, "m", single=True)]
-# The contact impedance of arcs on the edge of a sheet is in ohm·m.
+# For arcs on the edge of a sheet the contact impedance is in ohm·m.
 Impedances = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-15, 1e12, "ohm·m²", single=True)]
 Patterns = Annotated[np.ndarray, Numbers(((1, math.inf), (2, MOST_ELECTRODES)), -1e12, 1e12)]
 Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MOST_ELECTRODES, kind=int)]
@@ -33,7 +34,7 @@ Choices = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=boo
 
 
 class DiskTable(Table):
-    """Table of a disk, or with a thickness a cylinder."""
+    """Table of a disk or, with a thickness, of a cylinder."""
 
     what = "a disk"
     shape: Literal["disk"]
@@ -43,7 +44,7 @@ class DiskTable(Table):
 
 
 class RectangleTable(Table):
-    """Table of a rectangle, or with a thickness a box."""
+    """Table of a rectangle or, with a thickness, of a box."""
 
     what = "a rectangle"
     shape: Literal["rectangle"]
@@ -54,7 +55,7 @@ class RectangleTable(Table):
 
 
 class PolygonTable(Table):
-    """Table of a polygon, or with a thickness the upright solid on it."""
+    """Table of a polygon or, with a thickness, of an upright solid with that base."""
 
     what = "a polygon"
     shape: Literal["polygon"]
@@ -63,7 +64,7 @@ class PolygonTable(Table):
     thickness: Length | None = None
 
     @model_validator(mode="after")
-    def _small_enough(self) -> "PolygonTable":
+    def _check_size(self) -> "PolygonTable":
         number = len(self.vertices) + sum(map(len, self.holes))
         if number > _MOST_VERTICES:
             raise fault(
@@ -94,7 +95,7 @@ class CylinderTable(Table):
 
 
 class MeshTable(Table):
-    """Table of a mesh in a file beside the description. `scale`: its unit."""
+    """Table of a mesh in a file beside the description. `scale`: length of its unit in metres."""
 
     what = "a mesh"
     mesh: Word
@@ -102,7 +103,7 @@ class MeshTable(Table):
 
 
 class PlacedTable(Table):
-    """Base of tables of electrodes of all kinds but facets: their positions."""
+    """Base class of the tables of electrodes with positions, i.e. of all kinds except facets."""
 
     layout: Literal["ring", "perimeter"] | None = None
     number: Annotated[int, _COUNT] | None = None
@@ -113,7 +114,7 @@ class PlacedTable(Table):
     positions: Positions | None = None
 
     @model_validator(mode="after")
-    def _placed(self) -> "PlacedTable":
+    def _check_positions(self) -> "PlacedTable":
         round_it = ("layout", "number", "start_angle_degrees", "clockwise", "start", "levels")
         if self.positions is not None:
             idle = [key for key in round_it if key in self.model_fields_set]
@@ -127,7 +128,7 @@ class PlacedTable(Table):
 
 
 class BoundaryTable(PlacedTable):
-    """Table of arcs on the edge of a sheet. `contact_impedance`: ohm·m."""
+    """Table of electrodes that are arcs on the edge of a sheet. `contact_impedance` in ohm·m."""
 
     what = "electrodes of kind 'boundary'"
     kind: Literal["boundary"] = "boundary"
@@ -136,7 +137,7 @@ class BoundaryTable(PlacedTable):
 
 
 class DiscTable(PlacedTable):
-    """Table of discs."""
+    """Table of electrodes that are discs."""
 
     what = "electrodes of kind 'disc'"
     kind: Literal["disc"]
@@ -145,7 +146,7 @@ class DiscTable(PlacedTable):
 
 
 class PatchTable(PlacedTable):
-    """Table of rectangles on a solid."""
+    """Table of electrodes that are rectangles on a solid."""
 
     what = "electrodes of kind 'patch'"
     kind: Literal["patch"]
@@ -155,14 +156,14 @@ class PatchTable(PlacedTable):
 
 
 class PointTable(PlacedTable):
-    """Table of points."""
+    """Table of electrodes that are points."""
 
     what = "electrodes of kind 'point'"
     kind: Literal["point"]
 
 
 class FacetsTable(Table):
-    """Table of groups of a mesh's facets, by their names."""
+    """Table of electrodes that are named groups of facets of a mesh."""
 
     what = "electrodes of kind 'facets'"
     kind: Literal["facets"]
@@ -171,7 +172,7 @@ class FacetsTable(Table):
 
 
 class DrivenTable(Table):
-    """Base of tables of protocols of all kinds but matrices and channels."""
+    """Base class of the tables of protocols with a current amplitude."""
 
     number: Annotated[int, _COUNT] | None = None
     name: Word | None = None
@@ -180,7 +181,7 @@ class DrivenTable(Table):
     current_unit: Literal["A", "mA", "uA", "µA"] = "A"
 
     @model_validator(mode="after")
-    def _driven(self) -> "DrivenTable":
+    def _check_current(self) -> "DrivenTable":
         pattern = self.current_from_name
         if pattern is None and self.current is None:
             raise fault("is missing; give it, or current_from_name.", "current")
@@ -196,7 +197,7 @@ class DrivenTable(Table):
 
 
 class AdjacentTable(DrivenTable):
-    """Table of `jeit.protocol.adjacent`."""
+    """Table of the arguments of `jeit.protocol.adjacent`."""
 
     what = "the protocol 'adjacent'"
     kind: Literal["adjacent"]
@@ -206,7 +207,7 @@ class AdjacentTable(DrivenTable):
 
 
 class SkipTable(DrivenTable):
-    """Table of `jeit.protocol.skip`."""
+    """Table of the arguments of `jeit.protocol.skip`."""
 
     what = "the protocol 'skip'"
     kind: Literal["skip"]
@@ -218,7 +219,7 @@ class SkipTable(DrivenTable):
 
 
 class OppositeTable(DrivenTable):
-    """Table of `jeit.protocol.opposite`."""
+    """Table of the arguments of `jeit.protocol.opposite`."""
 
     what = "the protocol 'opposite'"
     kind: Literal["opposite"]
@@ -228,7 +229,7 @@ class OppositeTable(DrivenTable):
 
 
 class AgainstOneTable(DrivenTable):
-    """Table of `jeit.protocol.all_against_one`."""
+    """Table of the arguments of `jeit.protocol.all_against_one`."""
 
     what = "the protocol 'all_against_one'"
     kind: Literal["all_against_one"]
@@ -239,7 +240,7 @@ class AgainstOneTable(DrivenTable):
 
 
 class ReferenceTable(DrivenTable):
-    """Table of `jeit.protocol.reference_electrode`. `number`: on the boundary."""
+    """Table of the arguments of `jeit.protocol.reference_electrode`. `number`: number of electrodes on the boundary."""
 
     what = "the protocol 'reference_electrode'"
     kind: Literal["reference_electrode"]
@@ -250,7 +251,7 @@ class ReferenceTable(DrivenTable):
 
 
 class TwoTerminalTable(DrivenTable):
-    """Table of `jeit.protocol.two_terminal`."""
+    """Table of the arguments of `jeit.protocol.two_terminal`."""
 
     what = "the protocol 'two_terminal'"
     kind: Literal["two_terminal"]
@@ -258,14 +259,14 @@ class TwoTerminalTable(DrivenTable):
 
 
 class AllAtOnceTable(DrivenTable):
-    """Base of tables of protocols that drive all electrodes: the reading of their potentials."""
+    """Base class of the tables of protocols that drive all electrodes at once: how their potentials are read."""
 
     measurement: Reading = "mean-removed"
     reference: Annotated[int, _INDEX] | None = None
 
 
 class TrigonometricTable(AllAtOnceTable):
-    """Table of `jeit.protocol.trigonometric`."""
+    """Table of the arguments of `jeit.protocol.trigonometric`."""
 
     what = "the protocol 'trigonometric'"
     kind: Literal["trigonometric"]
@@ -273,14 +274,15 @@ class TrigonometricTable(AllAtOnceTable):
 
 
 class HaarTable(AllAtOnceTable):
-    """Table of `jeit.protocol.haar`."""
+    """Table of the arguments of `jeit.protocol.haar`."""
 
     what = "the protocol 'haar'"
     kind: Literal["haar"]
 
 
 class OptimalTable(Table):
-    """Table of `jeit.protocol.optimal`. `transfer`, `other`: ohm; `drives`: how many; `power`: watts."""
+    """Table of the arguments of `jeit.protocol.optimal`. `transfer`, `other`: transfer impedances in ohm; `drives`:
+    number of drive patterns; `power`: watts."""
 
     what = "the protocol 'optimal'"
     kind: Literal["optimal"]
@@ -295,14 +297,15 @@ class OptimalTable(Table):
     current_unit: Literal["A", "mA", "uA", "µA"] = "A"
 
     @model_validator(mode="after")
-    def _bounded(self) -> "OptimalTable":
+    def _check_bound(self) -> "OptimalTable":
         if (self.current is None) == (self.power is None):
             raise fault("or power: give one of them, the most of an electrode or of a pattern.", "current")
         return self
 
 
 class MeasuredTable(Table):
-    """Table of currents that lie in the data file. `drive_key`, `measurement_key`: the names of its matrices."""
+    """Table of a protocol whose currents are stored in the data file. `drive_key`, `measurement_key`: names of its
+    matrices."""
 
     what = "a protocol of measured currents"
     kind: Literal["measured"]
@@ -316,7 +319,7 @@ class MeasuredTable(Table):
 
 
 class BipolarTable(DrivenTable):
-    """Table of `jeit.protocol.bipolar`."""
+    """Table of the arguments of `jeit.protocol.bipolar`."""
 
     what = "the protocol 'bipolar'"
     kind: Literal["bipolar"]
@@ -327,7 +330,8 @@ class BipolarTable(DrivenTable):
 
 
 class MatricesTable(Table):
-    """Table of every drive pattern, amperes, with every measurement pattern that `select` says."""
+    """Table of a protocol that combines every drive pattern, in amperes, with the measurement patterns chosen by
+    `select`."""
 
     what = "a protocol of matrices"
     kind: Literal["matrices"]
@@ -338,7 +342,8 @@ class MatricesTable(Table):
 
 
 class ChannelsTable(Table):
-    """Table of a drive pattern, amperes, and a measurement pattern for each channel, by their numbers from 0."""
+    """Table of a protocol that gives for each channel the indices, from 0, of its drive pattern (in amperes) and
+    measurement pattern."""
 
     what = "a protocol of channels"
     kind: Literal["channels"]
@@ -369,7 +374,7 @@ class DataTable(Table):
     frame_rate: Annotated[float, Number(1e-9, 1e9, "frames in a second")] | None = None
 
     @model_validator(mode="after")
-    def _every_axis(self) -> "DataTable":
+    def _check_axes(self) -> "DataTable":
         if self.axes and sorted(self.axes) != ["electrodes", "frames", "patterns"]:
             raise fault("must be electrodes, patterns and frames, each once, in the order of the array.", "axes")
         if self.frames == "mean" and (self.frame_names or self.frame_rate is not None):
@@ -379,7 +384,7 @@ class DataTable(Table):
 
 
 class NotesTable(Table):
-    """Table of sentences to carry along."""
+    """Table of sentences that are copied to the notes of the measurement."""
 
     what = "[notes]"
     text: Annotated[list[Annotated[str, Field(max_length=10_000)]], FailFast()] = Field(default=[])

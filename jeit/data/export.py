@@ -1,4 +1,4 @@
-"""Write a measurement as NPZ with a TOML description beside it, for other tools and for `read`."""
+"""Export of a measurement to NPZ with a TOML description beside it, for `read` and for other software."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from jeit.protocol import Protocol
 
 
 def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]:
-    """Write `path` (.npz) and a description of the same name (.toml); return both paths.
+    """Write a measurement to `path` (.npz) and its description to a file of the same name (.toml); return both paths.
 
-    The NPZ holds `voltages` (F, M) volts, `mask` (F, M), `frame_names`, `notes`, and if known `times` (F,) seconds; and
-    the protocol's `drive` (S, L) amperes, `measurement` (K, L), `drive_index` (M,), `measurement_index` (M,),
-    `protocol_name`. The TOML holds geometry, electrodes and protocol, and so describes any table of the same sensor.
-    `read` gives the same measurement back.
+    The NPZ file holds `voltages` (F, M) in volts, `mask` (F, M), `frame_names`, `notes`, `times` (F,) in seconds if
+    known, and the protocol: `drive` (S, L) in amperes, `measurement` (K, L), `drive_index` (M,), `measurement_index`
+    (M,), `protocol_name`. The TOML file holds geometry, electrodes and protocol, so it also describes other tables of
+    the same sensor. `read` restores the measurement.
 
-    Raises `ValueError` for another suffix, and for electrodes or bodies that cannot be written into a description (a
-    mesh or an outline of your own, and what lies on its facets).
+    Raises `ValueError` for another suffix, and for electrodes or bodies that a description cannot express (a mesh or an
+    outline of your own, and electrodes on its facets).
     """
     file = Path(path)
     if file.suffix.lower() != ".npz":
@@ -94,5 +94,6 @@ def _assignments(section: dict) -> list[str]:
 
 
 def _toml(value) -> str:
-    """Strings, numbers and nested lists: TOML as JSON writes it (floats by repr, so that they survive)."""
+    """TOML text of a string, a number or a nested list, as JSON writes it; floats are written by `repr`, so no digits
+    are lost."""
     return json.dumps(value, ensure_ascii=False)

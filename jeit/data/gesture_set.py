@@ -1,4 +1,4 @@
-"""Recordings of frames and of labelled gestures, in files."""
+"""Files of recorded frames and of labelled gestures."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from jeit.files import need, npz_arrays, written_whole
 
 
 def join(measurements: Sequence[Measurement]) -> Measurement:
-    """Join the frames of measurements of one set-up, one after the other, with their times if all have times that rise.
+    """Join the frames of measurements of the same set-up in the given order. Times are kept if all measurements have
+    times and the joined times increase.
 
-    The body, the electrodes and the notes are those of the first. Raises `ValueError` for none, and where two drive or
-    read differently.
+    The body, the electrodes and the notes are taken from the first measurement. Raises `ValueError` for an empty
+    sequence, and if two measurements have different protocols.
     """
     if not measurements:
         raise ValueError("measurements: there is none; give at least one.")
@@ -49,8 +50,8 @@ _FRAMES, _TIMES = ("voltages", "frames"), ("seconds", "time")
 
 @dataclass(frozen=True)
 class FrameRecording:
-    """**Fields**: `frames` (F, M), volts, NaN where there is no reading; `seconds` (F,), None where nothing says;
-    `reference` (M,) or (r, M) of the untouched skin, volts, None where there is none; `name`."""
+    """Frames of a file. **Fields**: `frames`: (F, M) volts, NaN for missing readings; `seconds`: (F,) times, None if
+    unknown; `reference`: (M,) or (r, M) volts of the untouched skin, or None; `name`: name of the file."""
 
     frames: Float[np.ndarray, "F M"]
     seconds: Float[np.ndarray, " F"] | None
@@ -59,13 +60,16 @@ class FrameRecording:
 
 
 def read_frame_recording(path: str | Path, description: Description | None = None) -> FrameRecording:
-    """Frames of a file: NPZ with `frames` or `voltages` (F, M), and if it has them `seconds` or `time` (F,) and
-    `reference` (M,) or (r, M) of the untouched skin; or a table (.csv, .txt, .dat, .npy), a frame a row unless `[data]`
-    of the description says otherwise, where a frame named "reference" is that.
+    """Read the frames of a file.
 
-    Without a description, or a protocol in it, any number of channels will do, and units are the file's. Raises
-    `FileNotFoundError`, and `ValueError` for what is no such file, other numbers of channels than the protocol has, and
-    times that fall, are not finite or not as many.
+    An NPZ file holds `frames` or `voltages` (F, M), and optionally `seconds` or `time` (F,), and `reference` (M,) or
+    (r, M) of the untouched skin. A table (.csv, .txt, .dat, .npy) has one frame per row unless `[data]` of the
+    description states otherwise; its frames named "reference" are taken as the reference.
+
+    Without a description, or without a protocol in it, any number of channels is accepted, and voltages keep the unit
+    of the file. Raises `FileNotFoundError`, and `ValueError` for another kind of file, for a number of channels that
+    differs from that of the protocol, and for times that decrease, are not finite, or do not match the number of
+    frames.
     """
     path = Path(path)
     if path.is_dir():
@@ -93,7 +97,7 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
 
 
 def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> np.ndarray:
-    """The numbers of a file as they lie in it."""
+    """The numbers of a file, arranged as in the file."""
     if not arrays:
         return np.atleast_2d(table.numbers(path, layout))
     key = next((one for one in (*layout.keys, *_FRAMES) if one in arrays), None)
@@ -139,12 +143,13 @@ _ARRAYS = ("gesture", "person", "start", "seconds", "voltages", "reference", "un
 
 @dataclass(frozen=True)
 class GestureSet:
-    """n recordings of one gesture each, one after the other: frames F in all, M channels.
+    """n recordings of one gesture each, concatenated: F frames in total, M channels.
 
-    **Fields**: `gesture` (n,), names, and `person` (n,), a name or number for each; `start` (n + 1,), where each
-    recording's frames begin, and the last one's end; `seconds` (F,), of each recording from 0; `voltages` (F, M),
-    volts, NaN where there is no reading; `reference` (M,), volts, the mean of frames of the untouched skin before;
-    `untouched` (u, M), frames of the untouched skin, over as long as recordings last.
+    **Fields**: `gesture`: (n,) name of each gesture; `person`: (n,) name or number of the person of each recording;
+    `start`: (n + 1,) index of the first frame of each recording, and last the number of frames F; `seconds`: (F,)
+    times, from 0 in each recording; `voltages`: (F, M) volts, NaN for missing readings; `reference`: (M,) volts, mean
+    of frames of the untouched skin before the recordings; `untouched`: (u, M) frames of the untouched skin, recorded
+    over as long a time as the recordings.
     """
 
     gesture: np.ndarray
@@ -156,7 +161,7 @@ class GestureSet:
     untouched: Float[np.ndarray, "u M"]
 
     def __post_init__(self):
-        """Raises `ValueError` for arrays that do not belong together, and what is no text, number or time."""
+        """Raises `ValueError` for arrays whose shapes do not match, and for wrong types of values."""
         for name, kinds, said in (
             ("gesture", "U", "text"),
             ("person", "iuU", "whole numbers or text"),
@@ -205,14 +210,15 @@ class GestureSet:
         return seconds, voltages - self.reference
 
     def write(self, path: str | Path) -> None:
-        """Write it to an NPZ file. Raises `OSError` where it cannot be written."""
+        """Write the set to an NPZ file. Raises `OSError` if the file cannot be written."""
         with written_whole(path) as file:
             np.savez_compressed(file, **{name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
     def read(cls, path: str | Path) -> "GestureSet":
-        """Undo `write`; without `person`, all are of one. Raises `OSError` where there is no file, `ValueError` for one
-        of another kind; nothing in it is executed."""
+        """Read a file written by `write`; without the array `person`, all recordings are attributed to one person.
+        Raises `OSError` if there is no file and `ValueError` if it is of another kind. Nothing in the file is
+        executed."""
         try:
             arrays = npz_arrays(Path(path), *_ARRAYS, otherwise="not a set of gestures")
             if "gesture" in arrays:

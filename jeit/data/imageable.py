@@ -1,16 +1,11 @@
-"""Whether frames can be imaged, and the quality of measurements: noise, reciprocity, dead channels.
+"""Checks of the quality of measurements, and whether frames can be imaged.
 
-Checks of the quality of measurements: noise, reciprocity, dead channels, and the order of electrodes.
+The quality is judged from the voltages alone, without a model of the body: reciprocity, noise, signs that no passive
+body can produce, and the order of electrodes along an edge.
 
-Quality of voltages, computed from themselves alone: reciprocity, noise, and signs that no passive body gives.
-
-Everything here works on one measurement alone; no model of the body is needed.
-
-Check that electrodes on an edge are numbered in the order in which they follow each other along it.
-
-A layout may be numbered in any order. But two exchanged rows of a table of positions look the same, spoil every image,
-and go unnoticed; so such an order is reported, with what the signs of the voltages, which depend on the order, say of
-it.
+Electrodes may be numbered in any order. An order that does not follow the edge is nevertheless reported, because two
+exchanged rows in a table of positions spoil every image without being noticed. The report adds whether the signs of the
+voltages, which depend on the order, agree with it.
 """
 
 from __future__ import annotations
@@ -28,16 +23,16 @@ from jeit.mesh.topology import along
 from jeit.protocol import Protocol
 from jeit.protocol.reciprocity import transfer_between_drives
 
-# Enough frames to judge a recording by; a long one is sampled evenly.
+# Maximum number of frames from which a recording is judged; a longer one is sampled evenly.
 _MOST_FRAMES = 32
 
 
 @dataclass(frozen=True)
 class NoiseEstimate:
-    """The noise of one voltage.
+    """Estimate of the noise in a single voltage.
 
-    - `standard_deviation`: volts (root mean square).
-    - `relative`: the same, over the root mean square of the usable voltages.
+    - `standard_deviation`: standard deviation (root mean square) in volts.
+    - `relative`: standard deviation divided by the root mean square of the usable voltages.
     - `method`: "reciprocity" or "repeated frames".
     """
 
@@ -47,16 +42,16 @@ class NoiseEstimate:
 
 
 def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M"] | None = None) -> float | None:
-    """Relative departure from reciprocity: ‖T - Tᵀ‖ / ‖T‖ with T the transfer between drives.
+    """Relative deviation from reciprocity: ‖T - Tᵀ‖ / ‖T‖, where T is the transfer between drives.
 
-    `deviation` (M,): expected errors of the channels, relative to each other; T is divided by its errors for those. All
-    alike unless given.
+    `deviation` (M,): expected errors of the channels, relative to each other; the entries of T are divided by the
+    errors that follow from them. By default all channels are weighted equally.
 
-    T_ij is what drive pattern i would read while drive j flows, combined from the measured channels (see
-    `jeit.protocol.reciprocity.transfer_between_drives`); it is symmetric for every body, so that what is left is
-    noise, drift and gain error, or a wrong protocol. Independent noise of relative size ε gives about √2 ε.
+    T_ij is the voltage that drive pattern i would read while drive j flows, combined from the measured channels (see
+    `jeit.protocol.reciprocity.transfer_between_drives`). It is symmetric for every body, so an asymmetry is due to
+    noise, drift, gain errors, or a wrong protocol. Independent noise of relative size ε yields about √2 ε.
 
-    Returns None when the protocol ties no two usable channels together.
+    Returns None if no two usable channels are related by reciprocity.
     """
     error, noise, signal = _asymmetry(measurement, deviation)
     if error.size == 0:
@@ -68,7 +63,8 @@ def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M
 
 
 def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F M"]:
-    """(F, M) volts: each voltage minus the value predicted by its reciprocal channel; NaN without one."""
+    """(F, M) volts: each voltage minus the value predicted by its reciprocal channel; NaN for channels without a
+    reciprocal one."""
     pairs, ratio = measurement.protocol.reciprocal_pairs()
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     result = np.full(voltages.shape, np.nan, dtype=voltages.dtype)
@@ -83,14 +79,16 @@ def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F 
 
 
 def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
-    """The noise of one voltage, from reciprocity or else from repeated frames; None without either.
+    """Estimate the noise of a single voltage, from reciprocity or else from repeated frames; None if neither is
+    available.
 
-    - Reciprocity: two channels that must be equal differ by √2 standard deviations; combinations of channels
-      accordingly. Includes drift and gain errors, which cancel in a difference of two frames: estimate the
-      noise of a difference from the difference.
-    - Repeated frames (8 or more, no frame names): differences of successive frames.
+    - Reciprocity: two channels that must be equal differ by √2 standard deviations; combinations of channels are
+      treated likewise. The estimate includes drift and gain errors, which cancel in a difference of two frames: to
+      obtain the noise of a difference, apply the function to the difference.
+    - Repeated frames (8 or more, without frame names): differences of successive frames.
 
-    Robust: 1.4826 times the median absolute value, which half of the channels cannot upset.
+    The estimator is robust: 1.4826 times the median absolute value, unaffected by outliers in up to half of the
+    channels.
     """
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     size = float(np.sqrt(np.mean(np.abs(voltages[mask]) ** 2))) if mask.any() else 0.0
@@ -108,13 +106,13 @@ def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
 
 
 def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " M"]:
-    """(M,) the sign that each voltage has on every passive body; 0 where it depends on the body.
+    """(M,) sign that each voltage has on every passive body; 0 if the sign depends on the body.
 
-    On the boundary of a simply connected sheet the potential falls monotonically from source to sink along
-    both arcs between them: a local extremum elsewhere would contradict the maximum principle, whatever the
-    (positive) conductivity. So a voltage between two electrodes of one arc has a known sign. `order` lists
-    the electrodes as they follow each other along the boundary; channels that drive or measure otherwise than
-    in pairs get 0.
+    On the boundary of a simply connected sheet the potential falls monotonically from source to sink along both arcs
+    between them: a local extremum elsewhere would contradict the maximum principle, whatever the (positive)
+    conductivity. The sign of a voltage between two electrodes of the same arc is therefore known. `order` lists the
+    electrodes as they follow each other along the boundary. Channels that do not drive and measure by pairs of
+    electrodes get 0.
     """
     count = protocol.num_electrodes
     rank = np.empty(count, dtype=int)
@@ -122,7 +120,8 @@ def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.n
     drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     pairs = (np.count_nonzero(drive, axis=1) == 2) & (np.count_nonzero(measurement, axis=1) == 2)
     source = rank[drive.argmax(axis=1)]
-    # Ranks counted from the source: 0 ... sink is the falling arc, sink ... count the rising one.
+    # Ranks counted from the source: the potential falls along the arc from 0 to sink, and rises along the arc from sink
+    # to count.
     sink = (rank[drive.argmin(axis=1)] - source) % count
     plus = (rank[measurement.argmax(axis=1)] - source) % count
     minus = (rank[measurement.argmin(axis=1)] - source) % count
@@ -136,12 +135,12 @@ def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.n
 def impossible_signs(
     measurement: Measurement, order: Int[np.ndarray, " L"] | None = None
 ) -> Float[np.ndarray, " F"] | None:
-    """(F,) fraction of the usable voltages whose sign no passive body gives (real part of complex voltages).
+    """(F,) fraction of the usable voltages whose sign is impossible on a passive body (real part of complex voltages).
 
-    Voltages that are nothing but noise have the wrong sign half the time: the fraction of such channels is
-    about twice the value returned. `order` lists the electrodes as they follow each other along the boundary; by their
-    positions unless given. None when the electrodes are not known to lie around the boundary of an
-    outline, or no channel has a known sign. See `expected_signs`.
+    Voltages that are pure noise have the wrong sign half of the time, so the fraction of noisy channels is about twice
+    the value returned. `order` lists the electrodes as they follow each other along the boundary; by default it is
+    found from their positions. Returns None if the electrodes are not known to lie along the boundary of an outline, or
+    if no channel has a known sign. See `expected_signs`.
     """
     order = boundary_order(measurement) if order is None else order
     if order is None:
@@ -156,8 +155,8 @@ def impossible_signs(
 
 
 def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
-    """(L,) the electrodes as they follow each other along the outer edge, by their positions; None where they are not
-    known to lie on it."""
+    """(L,) the electrodes in their order along the outer edge, from their positions; None if they are not known to lie
+    on it."""
     electrodes, domain = measurement.electrodes, measurement.domain
     if not isinstance(electrodes, BoundaryElectrodes) or domain is None:
         return None
@@ -168,8 +167,8 @@ def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
 
 
 def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M"]) -> float | None:
-    """The noise of channels by reciprocity, in units of `deviation` (M,), their expected errors relative to each other;
-    None where the protocol ties no two usable channels together. Robust, as `estimate_noise` is."""
+    """Noise of the channels estimated from reciprocity, in units of `deviation` (M,), the expected errors of channels
+    relative to each other. Robust like `estimate_noise`. None if no two usable channels are related by reciprocity."""
     error, noise, _ = _asymmetry(measurement, deviation)
     return _robust_deviation(error / noise) if error.size else None
 
@@ -177,10 +176,12 @@ def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M
 def _asymmetry(
     measurement: Measurement, deviation: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Entries of T - Tᵀ (watts); what noise of such `deviation`, or of one volt per channel, adds to them; and what
-    they are compared with: those entries of T and its diagonal, over that noise where `deviation` is given.
+    """Asymmetry of the transfer T between drives. Returns the entries of T - Tᵀ (watts), their standard deviation for
+    noise of the given `deviation` (default: one volt per channel), and the entries of T with its diagonal, to which the
+    asymmetry is compared; the last are divided by their noise if `deviation` is given.
 
-    With the currents that show a change best (`jeit.protocol.optimal`), the change lies in the diagonal alone.
+    The diagonal is included because for the currents that show a change best (`jeit.protocol.optimal`) the change lies
+    in the diagonal alone.
     """
     protocol = measurement.protocol
     frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MOST_FRAMES).round().astype(int))
@@ -202,7 +203,7 @@ def _asymmetry(
         noise = np.hypot(gain[row, column], gain[column, row])
         size = np.sqrt((np.abs(upper) ** 2 + np.abs(lower) ** 2) / 2)
         own = np.flatnonzero(np.diag(known))
-        # In ‖T‖² the diagonal is counted once, and each pair, here one entry, twice.
+        # In ‖T‖² a diagonal entry counts once, and an off-diagonal pair, which is one entry here, counts twice.
         diagonal = np.abs(transfer[:, own, own]) / np.sqrt(2)
         if deviation is not None:
             size, diagonal = size / noise, diagonal / (np.sqrt(2) * gain[own, own])
@@ -217,14 +218,15 @@ def _robust_deviation(values: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(values)))
 
 
-# Electrodes that are listed, at most.
+# Maximum number of electrodes listed in a note.
 _MOST = 40
-# Difference that noise alone makes to the share of impossible signs between two orders.
+# Maximum difference between the fractions of impossible signs of two orders that can be due to noise.
 _CHANCE = 0.01
 
 
 def order_note(measurement: Measurement) -> str | None:
-    """A sentence on electrodes that are not numbered along the edge; None where they are, or do not lie on it."""
+    """A sentence that reports electrodes not numbered in their order along the edge; None if they are, or do not lie on
+    an edge."""
     order = boundary_order(measurement)
     if order is None or len(order) < 4 or follows(order):
         return None
@@ -244,26 +246,28 @@ def order_note(measurement: Measurement) -> str | None:
 
 
 def follows(order: Int[np.ndarray, " L"]) -> bool:
-    """Whether electrodes in this order go up, or down, by one all the way round."""
+    """Whether the numbers of electrodes in this order increase, or decrease, by one all the way round."""
     steps = (np.roll(order, -1) - order) % len(order)
     return bool((steps == 1).all() or (steps == len(order) - 1).all())
 
 
 def _from_the_first(order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
-    """The order from the first electrode on, in the sense in which most numbers increase."""
+    """The order rotated to begin at the first electrode, in the direction in which most numbers increase."""
     steps = (np.roll(order, -1) - order) % len(order)
     if (steps == len(order) - 1).sum() > (steps == 1).sum():
         order = order[::-1]
     return np.roll(order, -int(np.flatnonzero(order == 0)[0]))
 
 
-# A quarter of the signs wrong means that half of the voltages are noise (noise is wrong half the time).
+# Maximum fraction of impossible signs. A quarter means that half of the voltages are noise, as noise has the wrong sign
+# half of the time.
 MOST_IMPOSSIBLE_SIGNS = 0.25
-# Noise has as many right signs as wrong ones: so many wrong ones are not noise.
+# Fraction of impossible signs above which the polarity is reversed: noise alone yields only one half.
 MOST_OPPOSITE_SIGNS = 0.75
-# Reciprocity error r of a difference means noise over signal of r / sqrt(2 - r²): here a half.
+# Maximum reciprocity error of a difference. An error r corresponds to a ratio of noise to signal of r / sqrt(2 - r²),
+# here one half.
 MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
-# Cosine of a frame and its reference, below which one of them has the opposite sign.
+# Cosine of the angle between a frame and its reference below which one of them has the opposite sign.
 _LEAST_COSINE = -0.5
 
 
@@ -271,15 +275,16 @@ _LEAST_COSINE = -0.5
 class FrameQuality:
     """Result of `assess` for one frame and its difference from the reference.
 
-    - `difference`: ‖v - v_reference‖ / ‖v_reference‖ over usable channels.
-    - `difference_noise`: noise of the difference in volts, and relative to it; None when it cannot be estimated.
+    - `difference`: ‖v - v_reference‖ / ‖v_reference‖ over the usable channels.
+    - `difference_noise`: noise of the difference, in volts and relative to the difference; None if it cannot be
+      estimated.
     - `trusted_noise`: noise of the difference in units of `jeit.inverse.relative_noise` of the reference, the expected
-      error of channels relative to each other; None when it cannot be estimated.
+      error of channels relative to each other; None if it cannot be estimated.
     - `difference_reciprocity_error`: relative reciprocity error of the difference, or None.
-    - `impossible_signs`: the larger fraction, of frame and reference, of voltages of a sign that no passive
-      body gives; or None.
-    - `usable_channels`: channels usable in both.
-    - `reason`: why the frame cannot be imaged; empty when it can.
+    - `impossible_signs`: fraction of voltages whose sign is impossible on a passive body, the larger of the fractions
+      of frame and reference; or None.
+    - `usable_channels`: number of channels that are usable in both frame and reference.
+    - `reason`: why the frame cannot be imaged; empty if it can.
     """
 
     difference: float
@@ -292,7 +297,7 @@ class FrameQuality:
 
     @property
     def imageable(self) -> bool:
-        """True when nothing speaks against imaging the frame."""
+        """True if no check rules out imaging the frame."""
         return not self.reason
 
 
@@ -349,24 +354,24 @@ def check_same_setup(measurement: Measurement, reference: Measurement) -> None:
 
 
 def assess(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
-    """Judge each frame of `measurement` for difference imaging against the mean of `reference`'s frames.
+    """Judge each frame of `measurement` for difference imaging against the mean of the frames of `reference`.
 
-    A frame cannot be imaged when
+    A frame cannot be imaged if
 
-    - it, or the reference, has an impossible sign in more than a quarter of its voltages
-      (`impossible_signs`): half of the voltages or more then lie below the instrument's noise or offset;
-    - it, or the reference, breaks reciprocity by more than 0.63, or the difference does: its noise is over half its
-      signal, each channel trusted as images trust it (`jeit.inverse.relative_noise`): driven electrodes read large
-      voltages, mostly of contacts;
-    - its voltages are those of the reference with the opposite sign, nearly: their cosine is less than -0.5, and no
-      change of a passive body turns all of them round;
+    - more than a quarter of its voltages, or of those of the reference, have an impossible sign (`impossible_signs`):
+      at least half of the voltages are then smaller than the noise or the offset of the instrument;
+    - the reciprocity error of the frame, of the reference, or of their difference exceeds 0.63, so that noise exceeds
+      half of the signal. In the difference, channels are weighted as in images (`jeit.inverse.relative_noise`), because
+      driven electrodes read large voltages that are mostly due to contacts;
+    - the cosine of the angle between its voltages and those of the reference is less than -0.5: no change of a passive
+      body reverses all voltages, so one of them has the opposite polarity;
     - it does not differ from the reference at all;
-    - fewer channels than electrodes are usable.
+    - the number of usable channels is smaller than the number of electrodes.
 
-    On the measured sets in reach, usable frames stay below 0.18 and 0.21; a frame measured at too small a
-    current has 0.54 of its signs wrong.
+    In the available measured data sets, usable frames have at most 0.18 impossible signs and a reciprocity error of at
+    most 0.21; a frame measured with too small a current has 0.54 impossible signs.
 
-    Raises `ValueError` when the two are not of one set-up (`check_same_setup`).
+    Raises `ValueError` if the two are not from the same set-up (`check_same_setup`).
     """
     check_same_setup(measurement, reference)
     mean = reference.mean_frame()
@@ -402,7 +407,8 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
 
 
 def check_imageable(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
-    """`assess(measurement, reference)`; raises `ValueError` with the reason for the first bad frame."""
+    """The result of `assess(measurement, reference)`; raises `ValueError` with the reason if a frame cannot be
+    imaged."""
     qualities = assess(measurement, reference)
     for index, quality in enumerate(qualities):
         if not quality.imageable:
@@ -420,7 +426,8 @@ def _reason(
     own: dict[str, float | None],
     alike: float,
 ) -> str:
-    """Why a frame cannot be imaged; `own`: the reciprocity errors of both frames themselves; `alike`: their cosine."""
+    """Why a frame cannot be imaged; empty if it can. `own`: reciprocity errors of frame and reference by name; `alike`:
+    cosine of the angle between them."""
     if usable < electrodes:
         return f"only {counted(usable, 'channel')} usable in both it and its reference, for {electrodes} electrodes."
     if difference < 1e-12:
@@ -454,6 +461,7 @@ def _reason(
 
 
 def _cosine(one: np.ndarray, other: np.ndarray) -> float:
-    """Cosine of the angle between two frames, 1 where they are alike but for their size; 0 where one is zero."""
+    """Cosine of the angle between two frames as vectors: 1 if they differ by a positive factor only, 0 if one is
+    zero."""
     size = float(np.linalg.norm(one) * np.linalg.norm(other))
     return float(np.real(np.vdot(one, other))) / size if size > 0 else 0.0

@@ -1,7 +1,7 @@
-"""Currents that lie in the data file itself, beside voltages of electrodes × patterns × frames.
+"""Current patterns that are stored in the data file, beside voltages indexed by electrode, pattern and frame.
 
-Systems that drive all electrodes at once publish a matrix of the currents that flowed, a column for every pattern, and
-an array of the potentials of all electrodes: `[protocol] kind = "measured"` of a description.
+Systems that drive all electrodes at once publish a matrix of the measured currents, with one column per pattern, and an
+array of the potentials of all electrodes. A description declares this with `[protocol] kind = "measured"`.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from jeit.data.description_tables import MeasuredTable
 
 AXES = ("electrodes", "patterns", "frames")
-"""What the axes of an array of voltages are called; in this order unless a description says otherwise."""
-# Greatest mean of a pattern's potentials where it should have been removed, relative to the largest potential.
+"""Names of the axes of an array of voltages, in their default order; a description can state another order."""
+# Maximum mean of the potentials of a pattern that counts as removed, relative to the largest potential.
 _MOST_MEAN = 0.01
 _UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
 
 
 def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
-    """The protocol whose currents, and if named measurement patterns, lie in the .mat or .npz file at `path`.
+    """The protocol whose currents, and measurement patterns if named, are stored in the .mat or .npz file at `path`.
 
-    Raises `ValueError` where there is no such file or variable, and for matrices that make no protocol.
+    Raises `ValueError` if the file or a variable does not exist, and if the matrices are not a valid protocol.
     """
     keys = (table.drive_key,) if table.measurement_key is None else (table.drive_key, table.measurement_key)
     drive, *own = (_matrix(one, key, path) for one, key in zip(_read(path, keys), keys, strict=True))
@@ -39,7 +39,7 @@ def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
     check_electrodes(path.name, drive.shape[1])
     rows = own[0] if own else measurement_patterns(drive.shape[1], table.measurement, table.reference)
     check_memory(f"{path.name}: the protocol", 64 * len(drive) * len(rows))
-    # Currents that an instrument has measured sum to zero only within its errors.
+    # Currents measured by an instrument sum to zero only within its errors.
     drive = _balanced(drive, table.drive_key, path) * _UNITS[table.current_unit]
     read = table.measurement_key or table.measurement
     name = table.name or f"{len(drive)} measured currents, {read}, {drive.shape[1]} electrodes"
@@ -47,7 +47,8 @@ def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
 
 
 def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[np.ndarray, "F M"]:
-    """Frames (F, M), channels drive by drive, of voltages with these axes; of two axes one frame.
+    """Frames (F, M) of voltages with the given axes, channels ordered drive by drive; an array of two axes is one
+    frame.
 
     Raises `ValueError` for another number of axes.
     """
@@ -61,8 +62,9 @@ def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[n
 
 
 def less_their_mean(frames: Inexact[np.ndarray, "F M"], count: int) -> tuple[Inexact[np.ndarray, "F M"], float]:
-    """Potentials of `count` electrodes less the mean of each pattern, and the largest mean, where any is more than
-    noise: they were against ground, or an electrode. Patterns with NaN stay as they are."""
+    """Subtract from the potentials of `count` electrodes the mean of each pattern, if any mean exceeds noise: the
+    potentials were then measured against ground or an electrode. Returns the frames and the largest mean, 0 if nothing
+    is subtracted. Patterns with NaN are not changed."""
     potentials = frames.reshape(len(frames), -1, count)
     mean = potentials.mean(axis=2, keepdims=True)
     mean = np.where(np.isfinite(mean), mean, 0)
@@ -95,7 +97,7 @@ def _matrix(values: np.ndarray, key: str, path: Path) -> np.ndarray:
 
 
 def _balanced(drive: np.ndarray, key: str, path: Path) -> np.ndarray:
-    """Currents less their mean, which must be small."""
+    """Currents minus their mean; raises `ValueError` if the mean is not small."""
     excess, size = np.abs(drive.sum(axis=1)), np.abs(drive).max(axis=1)
     worst = int(np.argmax(excess - 0.05 * size))
     if excess[worst] > 0.05 * size[worst]:

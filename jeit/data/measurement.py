@@ -1,4 +1,4 @@
-"""A measurement: frames of voltages, with all that is needed to make sense of them."""
+"""Measurements: frames of voltages with protocol, electrodes and body."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from jeit_solvers.engines import as_array, either_engine, has_values, namespace,
 class Measurement(eqx.Module):
     """Frames of measured (or simulated) voltages.
 
-    Build one with `screen`, which looks for bad channels, or with a reader (`jeit.data.read`).
+    Build a measurement with `screen`, which looks for bad channels, or with a reader (`jeit.data.read`).
 
     **Fields**
 
     - `voltages`: (F, M) volts, real or complex; NaN only where masked.
-    - `mask`: (F, M) True where a voltage is usable.
-    - `protocol`: what the M channels are.
-    - `electrodes`: where the electrodes are (an object of `jeit.electrodes`), or None when the file does not
-      say.
-    - `domain`: the body: its outline (`jeit.mesh.Disk` ...), a `jeit.mesh.Solid`, or a mesh (`jeit.mesh.OwnMesh`, or a
-      plain `Mesh`, which is made one); None when the file does not say.
-    - `name`, `source`: what and where it comes from; `frame_names`: one for each frame, or empty.
-    - `notes`: what was assumed, and what was masked and why; one sentence each.
-    - `times`: (F,) seconds at which the frames were measured, rising; None when nothing says.
+    - `mask`: (F, M) True for usable voltages.
+    - `protocol`: drive and measurement patterns of the M channels.
+    - `electrodes`: positions and sizes of the electrodes (an object of `jeit.electrodes`), or None if they are not
+      known.
+    - `domain`: the body: an outline (`jeit.mesh.Disk` ...), a `jeit.mesh.Solid`, or a mesh (`jeit.mesh.OwnMesh`, or a
+      `Mesh`, which is converted to it); None if it is not known.
+    - `name`, `source`: name and origin of the data; `frame_names`: one name per frame, or empty.
+    - `notes`: one sentence for each assumption, and for each reason why voltages were masked.
+    - `times`: (F,) increasing times of the frames in seconds; None if they are not known.
     """
 
     voltages: Inexact[Array, "F M"]
@@ -63,8 +63,8 @@ class Measurement(eqx.Module):
         notes: tuple[str, ...] = (),
         times: ArrayLike | None = None,
     ):
-        """`voltages` and `mask` (F, M), or (M,) for one frame; `times` (F,). Raises `ValueError` where shapes disagree,
-        for times that do not rise, and for what is no body."""
+        """`voltages` and `mask`: (F, M), or (M,) for one frame; `times`: (F,). Raises `ValueError` if shapes disagree,
+        if times do not increase, and if `domain` is not a body."""
         self.voltages = as_array(_frames(voltages))
         self.mask = as_array(_frames(mask))
         self.protocol = protocol
@@ -106,27 +106,28 @@ class Measurement(eqx.Module):
 
     @property
     def num_channels(self) -> int:
-        """Number of channels M in a frame."""
+        """Number of channels M per frame."""
         return self.voltages.shape[1]
 
     @property
     def frame_rate(self) -> float | None:
-        """Frames in a second, over all of them; None where there are no times, or one frame."""
+        """Mean frame rate in frames per second; None if there are no times, or fewer than two frames."""
         if self.times is None or self.num_frames < 2:
             return None
         times = np.asarray(self.times)
         return float((len(times) - 1) / (times[-1] - times[0]))
 
     def at_rate(self, rate: float) -> "Measurement":
-        """The same frames, `rate` of them in a second from time 0. Raises `ValueError` for what is no rate."""
+        """The same frames with times from 0, at `rate` frames per second. Raises `ValueError` unless `rate` is a
+        positive number."""
         if not (is_number(rate) and rate > 0):
             raise ValueError(f"rate must be positive, frames in a second; it is {describe(rate)}.")
         return self._replace(self.voltages, self.mask, times=np.arange(self.num_frames) / float(rate))
 
     def frames(self, which: slice | ArrayLike) -> "Measurement":
-        """Some frames, in the order of time: a slice, numbers from 0 that rise, or a mask (F,).
+        """Selected frames in the order of time, given as a slice, as increasing indices from 0, or as a mask (F,).
 
-        Raises `ValueError` for frames that do not exist, and for none.
+        Raises `ValueError` for frames that do not exist, and if no frame is selected.
         """
         chosen = np.arange(self.num_frames)[which] if isinstance(which, slice) else np.atleast_1d(np.asarray(which))
         if chosen.dtype == bool and chosen.shape == (self.num_frames,):
@@ -141,14 +142,14 @@ class Measurement(eqx.Module):
         return self._frames(chosen)
 
     def frame(self, which: int | str) -> "Measurement":
-        """One frame, by number from 0 (negative from the end) or by name, as a measurement of its own.
+        """A single frame as a measurement, given by its index from 0 (negative from the end) or by its name.
 
         Raises `ValueError` for a frame that does not exist.
         """
         return self._frames(np.array([self.frame_number(which)]))
 
     def frame_number(self, which: int | str) -> int:
-        """The number, from 0, of a frame given as in `frame`. Raises `ValueError` as that does."""
+        """The index, from 0, of a frame given as in `frame`. Raises `ValueError` for a frame that does not exist."""
         if isinstance(which, str):
             if which not in self.frame_names:
                 known = ", ".join(self.frame_names) or "none: give a number"
@@ -160,9 +161,9 @@ class Measurement(eqx.Module):
         return which % self.num_frames
 
     def split_reference(self) -> tuple["Measurement", "Measurement"]:
-        """The frames to image, and the file's own reference frame (the one named "reference").
+        """The frames to image, and the reference frame in the file (the frame named "reference").
 
-        Raises `ValueError` when the file has no frame of that name, or no other.
+        Raises `ValueError` if the file has no frame of that name, or no other frame.
         """
         if "reference" not in self.frame_names or self.num_frames < 2:
             some = "say which (--reference-frames 0-17; measurement.frames(slice(0, 18))), or "
@@ -176,18 +177,18 @@ class Measurement(eqx.Module):
         return self._frames(others), self._frames(np.array([index]))
 
     def mean_frame(self) -> "Measurement":
-        """The mean over frames of the usable voltages; a channel that no frame has stays masked."""
+        """The mean of the usable voltages over all frames; a channel that is usable in no frame stays masked."""
         mean, usable = _mean(self.voltages, self.mask)
         return self._replace(mean, usable, frame_names=(), times=None)
 
     def filled(self, value: float = 0.0) -> Inexact[Array, "F M"]:
-        """(F, M) voltages with `value` in place of what is masked."""
+        """(F, M) voltages with `value` in place of masked ones."""
         return _filled(self.voltages, self.mask, value)
 
     def masked(self, usable: ArrayLike, reason: str) -> "Measurement":
         """The same measurement with fewer usable channels.
 
-        `usable` is boolean, (M,) or (F, M); `reason` goes into the notes. Raises `ValueError` for another shape.
+        `usable`: boolean, (M,) or (F, M); `reason`: added to the notes. Raises `ValueError` for another shape.
         """
         extra = jnp.asarray(usable)
         if extra.dtype != bool or extra.shape not in ((self.num_channels,), self.mask.shape):
@@ -203,15 +204,16 @@ class Measurement(eqx.Module):
         return self._replace(self.voltages, mask, notes=(*self.notes, note))
 
     def without_electrodes(self, electrodes: int | Sequence[int]) -> "Measurement":
-        """Mask channels that drive or measure any of `electrodes` (0-based): missing or broken ones.
+        """Mask the channels that drive or measure any of `electrodes` (counted from 0), e.g. missing or broken ones.
 
-        Raises `ValueError` for electrodes that are not there.
+        Raises `ValueError` for electrodes that do not exist.
         """
         numbers = ", ".join(str(k + 1) for k in np.atleast_1d(electrodes))
         return self.masked(self.protocol.mask_without(electrodes), f"electrodes {numbers} left out.")
 
     def without_driven_channels(self) -> "Measurement":
-        """Mask channels that measure on an electrode carrying current, and so see its contact impedance."""
+        """Mask the channels that measure on an electrode that carries current, because they include its contact
+        impedance."""
         usable = ~self.protocol.channels_on_driven_electrodes()
         return self.masked(usable, "they measure on driven electrodes.")
 
@@ -242,7 +244,7 @@ def _check_times(times: np.ndarray, number: int) -> None:
 
 
 def _frames(values):
-    """Values of one frame (M,) or of many, as (F, M)."""
+    """Values of one frame (M,) or of several frames, as an array (F, M)."""
     return np.atleast_2d(on_host(values)) if has_values(values) else jnp.atleast_2d(values)
 
 

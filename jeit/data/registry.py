@@ -1,4 +1,4 @@
-"""Registry of file formats: `read` recognises the format from the content, or takes the one given."""
+"""Registry of file formats. `read` recognises the format from the content of a file, unless the format is given."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from jeit.arguments import check_name, listed
 from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 
-# Bytes in memory for one of text, at most.
+# Maximum bytes of memory per byte of text.
 _IN_MEMORY = 4
 
 
 @dataclass(frozen=True)
 class Format:
-    """A file format: the module that reads it, the endings of its files, whether a description may go with a file,
-    whether it may borrow that of another measurement, and the bundled description that it always has.
+    """A file format. **Fields**: `module`: name of the module that reads it; `endings`: suffixes of its files;
+    `described`: whether a description may accompany a file; `borrows`: whether a file may use the description of
+    another measurement; `bundled`: name of the bundled description that always applies, or None.
 
-    The module is imported when a file has such an ending.
+    The module is imported only when a file has one of the suffixes.
     """
 
     module: str
@@ -31,16 +32,16 @@ class Format:
 
     @property
     def reader(self) -> Any:
-        """The module, with `DESCRIPTION`, `recognises(path)` and `read(path)`."""
+        """The module that reads the format, with `DESCRIPTION`, `recognises(path)` and `read(path)`."""
         return importlib.import_module(f"jeit.data.formats.{self.module}")
 
     def recognises(self, path: Path) -> bool:
-        """Whether a file is of this format, from its ending and its content."""
+        """Whether a file is of this format, judged by its suffix and its content."""
         return path.suffix.lower() in self.endings and self.reader.recognises(path)
 
 
 _TABLES = (".csv", ".txt", ".dat", ".npy", ".npz")
-# The first that recognises a file reads it. To add a format, write a module like kit4.py and list it here.
+# The first format that recognises a file reads it. To add a format, write a module like kit4.py and list it here.
 FORMATS: dict[str, Format] = {
     "kit4": Format("kit4", (".mat",)),
     "ktc2023": Format("ktc2023", (".mat",)),
@@ -51,7 +52,7 @@ FORMATS: dict[str, Format] = {
     "swisstom": Format("swisstom", (".eit",), described=True),
     "goettingen": Format("goettingen", (".get",), described=True),
     "table": Format("table", _TABLES, described=True, borrows=True),
-    # A table of 208 rows of real and imaginary pairs, with the bundled description: only where it is named.
+    # A table of 208 rows of real and imaginary pairs, with the bundled description; used only if named explicitly.
     "tank6cm": Format("table", (), bundled="tank6cm"),
 }
 
@@ -65,15 +66,15 @@ def read(
 ) -> Measurement:
     """Read a measurement from a file.
 
-    - `path`: the data file; or a folder of Sciospec's, which writes a file for every frame: all, in the order of
-      their names.
+    - `path`: the data file; or a folder of Sciospec files, one per frame, which are read in the order of their names.
     - `format`: a name in `FORMATS` ("kit4", "ktc2023", "eidors", "sciospec", "draeger", "carefusion", "swisstom",
-      "goettingen", "table", "tank6cm"); found from the content if not given.
-    - `description`: a TOML file (or the name of a bundled one) that says what the numbers mean, for a table or an
-      EIDORS file, and what body was measured, for those of instruments; looked for beside the data if not given.
-    - `like`: a measurement of the same sensor, its reference say, which describes a table that nothing else describes.
+      "goettingen", "table", "tank6cm"); by default it is recognised from the content.
+    - `description`: a TOML file, or the name of a bundled one, that states the meaning of the numbers (tables, EIDORS
+      files) or the body measured (files of instruments). By default it is looked for beside the data.
+    - `like`: a measurement of the same sensor, such as the reference, whose description applies to a table that has
+      none.
 
-    Raises `ValueError` when the file is not there, of no known format, or not what its format demands.
+    Raises `ValueError` if the file does not exist, is of no known format, or violates its format.
     """
     file = Path(path)
     if file.is_dir():

@@ -1,6 +1,7 @@
-"""Simulated skins: the voltages of a round piezoresistive skin while it is pressed.
+"""Simulated measurements of a round piezoresistive skin while it is pressed.
 
-No openly licensed measurement of a tactile skin exists; this stands in where one is needed, and says so in its notes.
+No openly licensed measurement of a tactile skin exists; simulated ones replace it, and are marked as such in their
+notes.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from jeit_solvers.engines import either_engine, namespace
 
 
 class RoundSkin(eqx.Module):
-    """A round conductive sheet with electrodes along its edge, read by the neighbouring method.
+    """A round conductive sheet with electrodes along its edge, measured with the adjacent (neighbouring) protocol.
 
     The defaults are those of Chen et al. (2022): a film of 100 mm diameter, 16 electrodes, 208 voltages.
 
     **Fields**: `radius` in metres; `num_electrodes`; `electrode_width` in metres; `contact_impedance` in ohm·m;
-    `conductivity`, sheet conductivity in siemens; `current` in amperes; `num_points`, nodes of the mesh that the
-    simulation runs on, to be chosen finer than that of the reconstruction.
+    `conductivity`: sheet conductivity in siemens; `current` in amperes; `num_points`: number of nodes of the mesh for
+    the simulation, which should be finer than the mesh of the reconstruction.
     """
 
     radius: float = 0.05
@@ -40,13 +41,13 @@ class RoundSkin(eqx.Module):
     num_points: int = eqx.field(static=True, default=4000)
 
     def model(self) -> ForwardModel:
-        """The forward model that simulates the skin."""
+        """The forward model that is used to simulate the skin."""
         electrodes = self.electrodes()
         mesh = Disk(self.radius).mesh(num_points=self.num_points)
         return ForwardModel(mesh, electrodes, adjacent(self.num_electrodes, current=self.current))
 
     def electrodes(self) -> BoundaryElectrodes:
-        """The electrodes, the first at 12 o'clock, then clockwise."""
+        """The electrodes; the first is at 12 o'clock, and the others follow clockwise."""
         position = ring(self.radius, self.num_electrodes, clockwise=True)
         return BoundaryElectrodes(position, self.electrode_width, self.contact_impedance)
 
@@ -57,8 +58,9 @@ def pressed_conductivity(
 ) -> Float[Array, " m"]:
     """Conductivity (m,) at `points` of a sheet pressed by a sphere: σ₀ (1 + strength √(1 - (r / radius)²)).
 
-    The change follows Hertz's pressure under a sphere: `strength` (relative) in the middle of a contact of `radius`
-    metres round `position`, zero at its edge. More pressure, more contact, more conductivity.
+    `background` is σ₀, in siemens. The change has the shape of the Hertzian pressure under a sphere: relative change
+    `strength` in the middle of a contact of `radius` metres around `position`, zero at its edge. The conductivity is
+    assumed to increase with pressure.
     """
     xp = namespace(points, position)
     squared = xp.sum((points - xp.asarray(position)) ** 2, axis=-1) / radius**2
@@ -74,12 +76,12 @@ def simulate_press(
     strength: float = 0.5,
     noise: float = 1e-4,
 ) -> tuple[Measurement, Measurement]:
-    """A frame of the pressed skin and one of the skin at rest, `(pressed, rest)`.
+    """Simulate a frame of the pressed skin and a frame of the skin at rest; returns `(pressed, rest)`.
 
-    `key`: of the random noise (`jax.random.key`). `position` (x, y) of the press and `radius` of its contact, metres.
-    `strength`: greatest relative change of conductivity. `noise`: standard deviation of the noise in each voltage,
-    relative to their root mean square (1e-4: 80 dB). Raises `ValueError` for a press beyond the edge, values that are
-    not positive, and what is no skin or key.
+    `key`: key of the random noise (`jax.random.key`). `position`: (x, y) of the press, and `radius` of its contact, in
+    metres. `strength`: maximum relative change of conductivity. `noise`: standard deviation of the noise in each
+    voltage relative to the root mean square of all voltages (1e-4: 80 dB). Raises `ValueError` for a press beyond the
+    edge, for values that are not positive, and for arguments that are not a skin or a key.
     """
     check_kind("skin", skin, RoundSkin, "a RoundSkin, such as RoundSkin(radius=0.05)")
     where = np.asarray(position, float)

@@ -1,4 +1,4 @@
-"""Screening of raw voltages into a `Measurement`: unusable voltages are masked, and the reason is noted."""
+"""Screening of raw voltages into a `Measurement`: unusable voltages are masked, with the reason in the notes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
 
-# Volts that no instrument reads on electrodes.
+# Maximum plausible voltage on an electrode, in volts.
 _LARGEST = 1000.0
 
 
@@ -32,18 +32,23 @@ def screen(
     frame_names: tuple[str, ...] = (),
     notes: tuple[str, ...] = (),
 ) -> Measurement:
-    """A `Measurement` of raw voltages (M,) or (F, M) in volts: masks what cannot be used, and notes why.
+    """Convert raw voltages (M,) or (F, M), in volts, to a `Measurement`; unusable voltages are masked, with notes on
+    why.
 
-    Noted too are electrodes that are not numbered as they follow each other along the edge.
+    Masked are voltages that
 
-    Masked are: what `mask` (True = usable) excludes; NaN, infinity and more than 1e12 V; saturated voltages (at or
-    beyond `saturation` volts, or, when that is not given, stuck at exactly the same extreme value); drives that read
-    nothing at all, because their current never flowed, and what reads an electrode of which that holds for all its
-    drives; and frames that are all zero.
+    - `mask` (True = usable) excludes;
+    - are NaN, infinite, or larger than 1e12 V;
+    - are saturated: at or beyond `saturation` volts, or, if that is not given, stuck at exactly the same extreme value;
+    - belong to a drive that reads nothing at all because its current did not flow, or read an electrode all of whose
+      drives are of this kind;
+    - belong to a frame that is all zero.
 
-    Raises `ValueError` when the shape does not fit the protocol, or nothing usable is left.
+    A note is also added if electrodes are not numbered in their order along the edge.
+
+    Raises `ValueError` if the shape does not fit the protocol, or no usable voltage is left.
     """
-    name = name.encode("utf-8", "backslashreplace").decode()  # of a file, whose name may be no text
+    name = name.encode("utf-8", "backslashreplace").decode()  # the name of a file may not be valid text
     values = _as_frames(voltages, protocol, name)
     usable = np.ones(values.shape, dtype=bool)
     found = list(notes)
@@ -117,8 +122,8 @@ def _saturated(values: np.ndarray, usable: np.ndarray, limit: float | None) -> B
                 continue
             level, inverse, count = np.unique(row[good], return_inverse=True, return_counts=True)
             for end in (0, len(level) - 1):
-                # Exactly equal extremes also come from a coarse converter or a simulated symmetric body, but
-                # then values in between repeat as often; a rail repeats alone.
+                # A coarse converter or a simulated symmetric body also produces exactly equal extremes, but then values
+                # in between repeat as often; in saturated data only the extreme value repeats.
                 others = np.delete(count, [0, len(level) - 1]) if len(level) > 2 else np.zeros(1)
                 if level[end] != 0 and count[end] >= 4 and count[end] >= 4 * others.max(initial=0):
                     result[frame, np.flatnonzero(good)[inverse == end]] = True
@@ -128,8 +133,8 @@ def _saturated(values: np.ndarray, usable: np.ndarray, limit: float | None) -> B
 def _currents(
     values: np.ndarray, usable: np.ndarray, protocol: Protocol
 ) -> tuple[Bool[np.ndarray, "F S"], Bool[np.ndarray, "F S"]]:
-    """Drives whose voltages are a thousand times smaller than those of the usual drive; and the others. Neither where
-    no voltage is usable."""
+    """Masks (F, S) of the drives without current, whose voltages are a thousand times smaller than those of the median
+    drive, and of the drives with current. Drives without a usable voltage are in neither mask."""
     index = np.asarray(protocol.drive_index)
     largest = np.full((values.shape[0], protocol.num_drives), -1.0)
     np.maximum.at(largest.T, index, np.where(usable, np.abs(values), -1.0).T)

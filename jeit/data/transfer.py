@@ -1,7 +1,8 @@
-"""The transfer impedance of a measurement, and the voltages of the same body under other patterns.
+"""The transfer impedance of a measurement, and the voltages that the same body would give under other patterns.
 
-L electrodes have a symmetric Z (L, L) with rows that sum to zero: L (L - 1) / 2 numbers. Any set of patterns that
-determines it, such as L - 1 independent currents on all electrodes, determines the readings of every other set.
+The transfer impedance Z (L, L) of L electrodes is symmetric with rows that sum to zero, so it has L (L - 1) / 2
+independent entries. Any set of patterns that determines Z, such as L - 1 independent currents on all electrodes,
+therefore determines the voltages of every other set.
 """
 
 from __future__ import annotations
@@ -14,18 +15,18 @@ from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 from jeit.protocol import Protocol
 
-# Share of the largest singular value below which a combination is not measured.
+# Singular values smaller than this fraction of the largest one belong to combinations that were not measured.
 _UNKNOWN = 1e-9
-# Copies of the equations while they are solved.
+# Estimated number of copies of the equations in memory while they are solved.
 _COPIES = 4
 
 
 def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]:
-    """The transfer impedance of every frame, (F, L, L) ohm: potentials of all electrodes, less their mean, for a unit
-    current in each.
+    """The transfer impedance (F, L, L) of every frame, in ohm: potentials of all electrodes, minus their mean, for a
+    unit current into each.
 
-    The symmetric one that fits the usable voltages best by least squares. Raises `ValueError` where they leave some of
-    it open: with too few patterns, or without the voltages of driven electrodes.
+    It is the symmetric matrix that fits the usable voltages in the least-squares sense. Raises `ValueError` if they do
+    not determine it, because there are too few patterns or the voltages of driven electrodes are missing.
     """
     protocol, count = measurement.protocol, measurement.protocol.num_electrodes
     basis = scipy.linalg.null_space(np.ones((1, count)))
@@ -51,9 +52,9 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
 
 
 def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
-    """The reference converted to the protocol of a measurement on the same electrodes, where it was measured with other
-    patterns that determine those readings; else, or where only the size of the currents differs, the reference
-    unchanged."""
+    """The reference converted to the protocol of a measurement on the same electrodes. The reference is returned
+    unchanged if only the amplitude of the currents differs, or if its patterns do not determine the voltages of that
+    protocol."""
     ours, theirs = measurement.protocol, reference.protocol
     if ours.num_electrodes != theirs.num_electrodes or ours.same_patterns(theirs) or _proportional(ours, theirs):
         return reference
@@ -64,7 +65,7 @@ def as_driven(reference: Measurement, measurement: Measurement) -> Measurement:
 
 
 def _proportional(ours: Protocol, theirs: Protocol) -> bool:
-    """Whether both read the same, and every current of one is the same number of times that of the other."""
+    """Whether two protocols have the same measurement patterns, and drive patterns that differ by a common factor."""
     if ours.num_measurements != theirs.num_measurements:
         return False
     first, second = np.asarray(ours.channel_drive), np.asarray(theirs.channel_drive)
@@ -75,11 +76,11 @@ def _proportional(ours: Protocol, theirs: Protocol) -> bool:
 
 
 def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
-    """The same frames as another `protocol` on the same electrodes would have read them.
+    """Convert a measurement to the voltages that another `protocol` on the same electrodes would have measured.
 
-    For a reference that was measured with other currents than the frames. Noise is carried along: it grows where the
-    measured patterns hardly determine what the others read. Raises `ValueError` for another number of electrodes, and
-    as `transfer_impedance`.
+    This is meant for a reference that was measured with other currents than the frames. Noise is amplified where the
+    measured patterns barely determine the new voltages. Raises `ValueError` for another number of electrodes, and as
+    `transfer_impedance`.
     """
     if protocol.num_electrodes != measurement.protocol.num_electrodes:
         raise ValueError(

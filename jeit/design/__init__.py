@@ -2,10 +2,10 @@
 
 For a given layout (the electrodes' positions), sensitivity maps, virtual taxels and scores are computed. Layouts are
 optimised by gradients, within an outline and with minimum spacing, and the most informative measurements are selected.
-Studies of many layouts can be resumed after a crash. This package exports the main functions; the others, such as the
-classes of results, are in the modules.
+Studies of many layouts can be resumed after a crash. This package exports the main functions; other names, such as the
+classes of the results, are in its modules.
 
-Names are imported when first used: the command line shows defaults (`jeit.design.defaults`) without waiting.
+Names are imported when first used, so that the command line shows the defaults (`jeit.design.defaults`) without delay.
 """
 
 from __future__ import annotations

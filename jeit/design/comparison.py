@@ -1,4 +1,4 @@
-"""Compare layouts: the response of a layout to touches, its scores, and differences between two."""
+"""Comparison of layouts: the response of each layout to touches, and the scores of two layouts side by side."""
 
 from __future__ import annotations
 
@@ -21,7 +21,11 @@ from jeit.mesh.geodesic import Triangles
 
 
 class SkinResponse(eqx.Module):
-    """Response of a skin of one `layout` to touches: its `sensitivity`, and its `taxels`."""
+    """Response of a skin to touches.
+
+    **Fields**: `layout`: the layout of its electrodes; `sensitivity`: its sensitivity map; `taxels`: its virtual
+    taxels.
+    """
 
     layout: Layout | SurfaceLayout
     sensitivity: SensitivityMap
@@ -42,13 +46,14 @@ def skin_response(
 
     **Arguments:**
 
-    - `key`: for the taxels' k-means, from `jax.random.key`.
-    - `touched`: the conductivity changes by the touches, `skin.touched_cells(grid.places)` unless given.
-    - `num_taxels`: 90 unless given, at most one per position; `threshold`: as in `find_taxels`.
-    - `linear`: whether to compute linear instead of exact changes of the voltages.
+    - `key`: random key for the k-means clustering of the taxels, from `jax.random.key`.
+    - `touched`: conductivity changes due to the touches, by default `skin.touched_cells(grid.places)`.
+    - `num_taxels`: number of taxels, by default 90 or the number of positions if that is smaller.
+    - `threshold`: cosine similarity threshold, as in `find_taxels`.
+    - `linear`: whether to compute linearised instead of exact voltage changes.
 
-    Raises `ValueError` for more taxels than places, touches of other places, and as `Skin.touched_cells` and
-    `Skin.voltage_changes` do.
+    Raises `ValueError` for more taxels than positions, if `touched` and `grid` have different numbers of positions, and
+    as `Skin.touched_cells` and `Skin.voltage_changes` do.
     """
     check_skin("skin", skin)
     check_grid(grid)
@@ -65,7 +70,7 @@ def skin_response(
 
 
 def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
-    """Number of taxels, as in `skin_response`. Raises `ValueError` for none, or more than positions."""
+    """Number of taxels, as in `skin_response`. Raises `ValueError` unless it is from 1 to the number of positions."""
     if num_taxels is None:
         return min(NUM_TAXELS, len(grid.places))
     if not 1 <= num_taxels <= len(grid.places):
@@ -73,15 +78,16 @@ def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
     return num_taxels
 
 
-# Relative margin below the other's minimum for a blind spot, so that rounding of coordinates makes none.
+# A position is a blind spot if its sensitivity is below the minimum of the other layout by more than this relative
+# margin, so that rounding errors of coordinates do not produce blind spots.
 _ROUNDING = 1e-6
 
 
 class LayoutComparison(eqx.Module):
-    """Sensitivity and virtual taxels of two skins.
+    """Sensitivity and virtual taxels of two skins, from `compare_layouts`.
 
-    **Fields**: `skins`; `responses` of each; `margin`, metres, `places` along a side, `contrast` and `seed` of the
-    touches, as in `compare_layouts`.
+    **Fields**: `skins`: the two skins; `responses`: the response of each; `margin` (metres), `places`, `contrast` and
+    `seed`: the arguments of `compare_layouts`.
     """
 
     skins: tuple[Skin, Skin]
@@ -93,7 +99,7 @@ class LayoutComparison(eqx.Module):
 
     @property
     def figures(self) -> list[dict]:
-        """Figures of each layout, as in `comparison`."""
+        """Scores of each layout, as returned by `comparison`."""
         return comparison(*self.responses)
 
 
@@ -108,27 +114,29 @@ def compare_layouts(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> LayoutComparison:
-    """Compute the responses of two skins of different layouts to touches at a grid of positions; as `jeit layout
-    compare`.
+    """Compute the responses of two skins with different layouts to touches at a grid of positions, like the command
+    `jeit layout compare`.
 
     **Arguments:**
 
-    - `first`, `second`: skins of the same outline, made with `Skin.create`.
-    - `margin`: least distance of touches from the edge, metres, where a touch is partly off the skin; `places`: number
-      of positions along a side.
-    - `contrast`: ratio of the touched part's conductivity to the rest's: 0 for an insulator, above 1 for a conductor.
-    - `num_taxels`: number of virtual taxels, 90 unless given, at most one per position; `seed`: of their k-means.
+    - `first`, `second`: skins with the same outline, created with `Skin.create`.
+    - `margin`: minimum distance of touches from the edge, metres; a touch closer to the edge would lie partly outside.
+    - `places`: number of touched positions along a side.
+    - `contrast`: conductivity of the touched part divided by that of the rest: 0 for an insulator, above 1 for a
+      conductor.
+    - `num_taxels`: number of virtual taxels, by default 90 or the number of positions if that is smaller.
+    - `seed`: random seed for the k-means clustering of the taxels.
     - `progress`: called with the name of each step as it begins.
 
-    Raises `ValueError`, before either is touched, for skins of different outlines, a margin that leaves no place, and
-    as `skin_response` does.
+    Raises `ValueError` for skins with different outlines and for a margin that leaves no position, before any response
+    is computed, and as `skin_response` does.
     """
     check_skin("first", first)
     check_skin("second", second)
     check_same_outline(first.layout, second.layout)
     report = progress or (lambda step: None)
     ready = []
-    # Both are checked before either is touched, so that errors are raised at once.
+    # Both skins are checked before any response is computed, so that errors are raised at once.
     for skin in (first, second):
         grid = touches_away_from_the_edge(skin.outline, margin, places, places)
         number = number_of_taxels(grid, num_taxels)
@@ -142,7 +150,8 @@ def compare_layouts(
 
 
 def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLayout) -> None:
-    """Raise `ValueError` unless both layouts have the same outline, up to a shift of the origin."""
+    """Raise `ValueError` unless both layouts are on skins of the same size: for flat skins, the bounding boxes of the
+    outlines, up to a shift, and their areas must agree; for curved skins, the areas of the surfaces."""
     if isinstance(first, SurfaceLayout) or isinstance(second, SurfaceLayout):
         areas = [_area(layout) for layout in (first, second)]
         if type(first) is not type(second) or abs(areas[0] - areas[1]) > 1e-2 * areas[0]:
@@ -172,11 +181,14 @@ def _area(layout: Layout | SurfaceLayout) -> float:
 
 
 def comparison(one: SkinResponse, other: SkinResponse) -> list[dict]:
-    """Figures of each of two layouts, as plain numbers.
+    """Scores of each of two layouts, as plain numbers.
 
-    `sensitivity_…_V`; `blind_spot_fraction`, the share of the area that is less sensitive than the other layout's least
-    sensitive position; `taxel_count`, the number of taxels with an area above zero, and `taxel_area_cm2`;
-    `taxel_overlap`, the mean number of taxels that cover a position; `two_point_mm`, their mean diameter.
+    - `sensitivity_…_V`: minimum and mean sensitivity, volts; `sensitivity_uniformity`: mean divided by root mean
+      square.
+    - `blind_spot_fraction`: fraction of the area that is less sensitive than the other layout's least sensitive
+      position.
+    - `taxel_count`: number of taxels with an area above zero; `taxel_area_cm2`: mean, standard deviation and maximum.
+    - `taxel_overlap`: mean number of taxels that cover a position; `two_point_mm`: mean diameter of the taxels.
     """
     return [_figures(*pair) for pair in ((one, other), (other, one))]
 

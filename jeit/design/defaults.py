@@ -3,52 +3,55 @@
 The skin and its touches are those of Park et al., Science Robotics 7, eabm7187 (2022), text S4; SI units throughout.
 """
 
-# The hydrogel: a square, where no layout says its outline. Thickness and conductivity scale all voltages, and no
-# ratio of them but those that contact impedances have a part in.
 from __future__ import annotations
 
+# The hydrogel: a square if the layout has no outline. Thickness and conductivity scale all voltages by the same factor,
+# apart from the influence of the contact impedances.
 SIDE = 0.2  # m
 THICKNESS = 10e-3  # m
 CONDUCTIVITY = 1.0  # S/m
-# The paper prints none. That of a disc 6 mm across is then 3.5 ohm, 4 % of the 83 ohm 1/(4σr) that a deep skin of
-# 1 S/m spreads its current against: electrodes that the skin decides on, and the figures of docs/design.md are of it.
+# The paper gives no value. With this one, the contact resistance of an electrode 6 mm in diameter is 3.5 ohm, 4 % of
+# the spreading resistance 1/(4σr) = 83 ohm of a deep skin of 1 S/m, so the skin dominates. The results in
+# docs/design.md are computed with this value.
 CONTACT_IMPEDANCE = 1e-4  # ohm·m²
-# Between the nearest electrodes, two-terminal, as many as the paper's; of all if a skin has fewer.
+# Two-terminal measurements between the nearest electrodes: as many pairs as in the paper, or all if there are fewer.
 PROTOCOL = "two-terminal"
 NUM_PAIRS = 94
 CURRENT = 1e-3  # A
-# 80 dB below the voltages between two electrodes of that skin at that current, 0.18 V in the mean of squares: what a
-# good instrument reaches, and the signal-to-noise ratio of jeit.simulate's skins too.
+# 80 dB below the root mean square, 0.18 V, of the voltages between two electrodes of this skin at this current. A good
+# instrument reaches this signal-to-noise ratio, and the skins of jeit.simulate have it too.
 NOISE = 2e-5  # V
 
-# The touch: the paper's unit deformation, or a ball as in its experiments; an insulator.
+# The touch: the unit deformation of the paper, or a ball as in its experiments. The indenter is an insulator.
 DEPTH = 2.5e-3  # m
 DEVIATION = 7.5e-3  # m
 BALL_DIAMETER = 15e-3  # m
 CONTRAST = 0.0
-# Places touched along a side: the paper's, where one layout is looked at; half of them in a study, which has many.
+# Number of touched positions along a side: as in the paper for a single layout, and half of that in a study, which
+# covers many layouts.
 PLACES = 48
 STUDY_PLACES = 24
-# Least distance from the edge, where a touch is partly off the skin.
+# Minimum distance of a touch from the edge; closer to the edge it would lie partly outside the skin.
 MARGIN = 10e-3  # m
 
-# The mesh: 6 mm electrodes are 1.3 cells across, and the middle of the uppermost layer 0.5 mm below the surface.
+# The mesh: an electrode of 6 mm spans 1.3 cells, and the centroids of the top layer of cells are 0.5 mm below the
+# surface.
 CELL_SIZE = 4.5e-3  # m
 NUM_LAYERS = 5
 
-# Largest contrast of a touch: beyond it exact voltages are not found, and no longer change.
+# Maximum contrast of a touch: above it the exact computation does not converge, and the voltages no longer change.
 MOST_CONTRAST = 1e6
 
-# Virtual taxels: number of clusters and cosine threshold of the paper.
+# Virtual taxels: number of clusters and threshold of the cosine similarity, as in the paper.
 NUM_TAXELS = 90
 THRESHOLD = 0.7
-# Prior correlation length of the amplitudes of touches: two deviations of the touch.
+# Correlation length of the touch amplitudes under the prior: twice the standard deviation of the touch's profile.
 CORRELATION = 15e-3  # m
 # Temperature of the smooth minimum of sensitivity.
 TEMPERATURE = 0.1
 
-# A search for a better layout: on a sheet of so many nodes, about, as each of its steps takes a gradient; and no closer
-# than leaves 2 mm between electrodes 6 mm across.
+# Layout optimisation: approximate number of nodes of the sheet's mesh, kept small since every step computes a gradient;
+# number of steps; and minimum distance of centres, which leaves 2 mm between electrodes of 6 mm.
 NUM_POINTS = 1300
 STEPS = 60
 MINIMUM_SPACING = 8e-3  # m

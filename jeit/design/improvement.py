@@ -1,4 +1,5 @@
-"""Improvement of a sheet's layout: optimised on a coarse mesh, and compared with the given layout on a finer one."""
+"""Improvement of a layout on a sheet: optimisation on a coarse mesh, then comparison with the given layout on a finer
+mesh."""
 
 from __future__ import annotations
 
@@ -20,16 +21,19 @@ from jeit.layout import Layout
 from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.protocol import two_terminal
 
-# Nodes of the mesh for the final scores, relative to the mesh optimised on; and positions along a side.
+# Ratio of the number of nodes of the mesh for the final scores to that of the mesh used in the optimisation; number of
+# touched positions along a side in the optimisation, and for the final scores.
 _FINER, _PLACES, _MORE_PLACES = 4, 16, 24
 
 
 class ImprovedLayout(eqx.Module):
     """Result of `improve_layout`: the optimised layout, with the scores of both layouts.
 
-    **Fields**: `start`, the layout given; `optimisation`, of the `skin` on the mesh optimised on; `before` and `after`,
-    scores of both layouts on a finer mesh, at more places; `space`, `noise` (volts), `seed` and
-    `num_points`, as they were asked for.
+    **Fields**
+
+    - `start`: the given layout; `skin`: its skin on the coarse mesh; `optimisation`: the result of the optimisation.
+    - `before`, `after`: scores of the given and of the optimised layout on a finer mesh, at more positions.
+    - `space`, `noise` (volts), `seed`, `num_points`: the arguments of `improve_layout`.
     """
 
     start: Layout
@@ -61,20 +65,22 @@ def improve_layout(
     callback: Callable[[int, np.ndarray], None] | None = None,
     **material: Any,
 ) -> ImprovedLayout:
-    """Optimise the electrode positions of `layout` for worst sensitivity and mean variance; as `jeit layout optimise`.
+    """Optimise the electrode positions of `layout` for worst sensitivity and mean variance, like the command `jeit
+    layout optimise`.
 
-    All two-terminal pairs of a sheet are measured, so the order of electrodes does not matter.
+    All two-terminal pairs of a sheet are measured, so the order of the electrodes does not matter.
 
     **Arguments:**
 
-    - `space`: the allowed layouts; unless given, all on the skin with electrodes' centres 8 mm apart or more.
+    - `space`: the allowed layouts; by default all layouts on the skin whose centres are at least 8 mm apart.
     - `noise`: standard deviation of a voltage at 1 mA, volts.
-    - `steps`, `starts`, `callback`: as in `optimise_layout`; `seed`: of the random starts.
-    - `num_points`: nodes of the mesh to optimise on, about; results are confirmed on four times as many.
+    - `steps`, `starts`, `callback`: as in `optimise_layout`; `seed`: random seed of the starts.
+    - `num_points`: approximate number of nodes of the mesh used in the optimisation; the final scores are computed on a
+      mesh with four times as many nodes.
     - `progress`: called with the name of each step as it begins.
     - `material`: thickness, conductivity and contact impedance, as in `Skin.create`.
 
-    Raises `ValueError` where no layout satisfies the constraints, and as `Skin.create` and `optimise_layout` do.
+    Raises `ValueError` if no layout satisfies the constraints, and as `Skin.create` and `optimise_layout` do.
     """
     check_layout("layout", layout)
     report = progress or (lambda step: None)

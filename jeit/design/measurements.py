@@ -1,4 +1,4 @@
-"""Measurement selection: candidate measurements, and the choice of the most informative."""
+"""Measurement selection: choice of the most informative among candidate measurements."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from jeit_solvers.engines import has_values
 
 
 class Candidates(eqx.Module):
-    """Sensitivity of each of M candidate measurements, whitened by its noise and by the prior.
+    """Sensitivities of M candidate measurements, whitened by the noise and by the prior.
 
-    **Fields**: `rows` (M, r), f_i of every candidate; `weight` (r, r), the matrix V that sums up a covariance.
+    **Fields**: `rows` (M, r): the whitened sensitivity f_i of each candidate; `weight` (r, r): the matrix V such that
+    tr VC is the weighted sum of posterior variances for a covariance C of the r whitened coefficients.
     """
 
     rows: Float[Array, "M r"]
@@ -30,16 +31,17 @@ class Candidates(eqx.Module):
     def create(
         cls, jacobian: ArrayLike, product: ArrayLike, noise: ArrayLike, *, weights: ArrayLike | None = None
     ) -> "Candidates":
-        """Candidates with these `jacobian` and `noise` under a prior with covariance Γ.
+        """Create the candidates from the Jacobian and a prior with covariance Γ of the conductivities.
 
-        - `jacobian`: J (M, m) of all candidate measurements, as of `ForwardModel.jacobian`.
-        - `product`: ΓJᵀ (m, M), a prior's `covariance_product` times the variance of the conductivity.
-        - `noise`: standard deviation of each measurement, (M,) or one for all, in volts.
-        - `weights`: W (m,) of the cells in "A"; their areas make it an integral. All 1 unless given.
+        - `jacobian`: J (M, m) of all candidate measurements, as from `ForwardModel.jacobian`.
+        - `product`: ΓJᵀ (m, M), the `covariance_product` of a prior times the variance of the conductivity.
+        - `noise`: standard deviation of each measurement (M,), or one value for all, volts.
+        - `weights`: weights (m,) of the cells in criterion "A", all 1 by default; with the areas of the cells as
+          weights, the criterion is an integral over the body.
 
-        Exact for any prior, and meant for up to a few thousand candidates: it takes O(M³) operations. Works under
-        `jit` and `vmap`. Raises `ValueError` for shapes that do not fit, values that are not finite, noise that is
-        not positive and negative weights.
+        Exact for any prior. Takes O(M³) operations, and so suits up to a few thousand candidates. Works under `jit` and
+        `vmap`. Raises `ValueError` for incompatible shapes, values that are not finite, noise that is not positive, and
+        negative weights.
         """
         jacobian, product, noise, weights = _check(jacobian, product, noise, weights, ("cells", "measurements"))
         if product.shape != jacobian.shape[::-1]:
@@ -50,11 +52,12 @@ class Candidates(eqx.Module):
     def from_factor(
         cls, jacobian: ArrayLike, factor: ArrayLike, noise: ArrayLike, *, weights: ArrayLike | None = None
     ) -> "Candidates":
-        """Candidates under a prior with covariance SSᵀ, `factor` S (m, r); the rest as in `create`.
+        """Create the candidates from the Jacobian and a prior with covariance SSᵀ, where `factor` is S (m, r). Other
+        arguments as in `create`.
 
-        For any number of candidates, such as all drives with all measurements. Where S omits small parts of the
-        variance (a prior's `basis`), the information of precise measurements on these parts is omitted too, which
-        overrates the share of few measurements. Raises `ValueError` for shapes or values that do not go together.
+        Suits any number of candidates, such as all drives with all measurements. If S omits small parts of the variance
+        (as the `basis` of a prior does), the information of precise measurements on these parts is omitted too, and the
+        `share` of a few measurements is overestimated. Raises `ValueError` as `create` does.
         """
         jacobian, factor, noise, weights = _check(jacobian, factor, noise, weights, ("cells", "coefficients"))
         return cls(jacobian @ factor / noise[:, None], factor.T @ (weights[:, None] * factor))
@@ -66,7 +69,8 @@ class Candidates(eqx.Module):
 
 
 def _check(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Array, Array, Array, Array]:
-    """Check the arguments of `Candidates` and return them as arrays of matching shapes; `prior` has this `shape`."""
+    """Check the arguments of `Candidates` and return them as arrays of matching shapes. `shape`: names of the axes of
+    `prior`, for error messages."""
     jacobian, prior = jnp.asarray(jacobian, float), jnp.asarray(prior, float)
     noise = jnp.asarray(noise, float)
     if jacobian.ndim != 2 or prior.ndim != 2 or jacobian.shape[1] != prior.shape[0]:
@@ -94,8 +98,8 @@ def _check(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Arr
 
 @jax.jit
 def _from_product(jacobian, product, noise, weights) -> Candidates:
-    """Whitened rows from ΓJᵀ, in coefficients for which the data are independent: S = ΓJᵀ N^-½ U Λ^-½ where N^-½ JΓJᵀ
-    N^-½ = UΛUᵀ, N the noise.
+    """Compute the candidates from ΓJᵀ, with the factor S = ΓJᵀ N^-½ U Λ^-½ of the prior, where N^-½ JΓJᵀ N^-½ = UΛUᵀ
+    and N is the covariance of the noise.
 
     SSᵀ is the part of Γ that the measurements depend on; they are independent of the rest.
     """
@@ -108,18 +112,20 @@ def _from_product(jacobian, product, noise, weights) -> Candidates:
 
 
 Criterion = Literal["D", "A"]
-# Least relative gain of information by a swap; below it rounding errors could cause endless swaps.
+# Minimum relative gain of information by a swap; below it rounding errors could cause endless swaps.
 _WORTH = 1e-9
 
 
 class Selection(eqx.Module):
-    """The chosen measurements, and their information relative to that of all candidates.
+    """The chosen measurements, with their information and that of all candidates.
 
     **Fields**
 
-    - `chosen`: (N,) indices of the candidates, the most informative first; `protocol.subset(chosen)` measures them.
+    - `chosen`: (N,) indices of the candidates, in the order of the greedy choice; `protocol.subset(chosen)` is the
+      protocol that measures them.
     - `gains`: (N,) information added by each greedy choice, before any exchange; non-increasing for "D".
-    - `information`: of the chosen ("D": nats, "A": variance removed), and `total`, of all candidates.
+    - `information`: information of the chosen measurements ("D": in nats, "A": reduction of the variance); `total`:
+      information of all candidates.
     - `swaps`: number of swaps by the exchange; `settled`: whether no further swap increases the information.
     """
 
@@ -132,7 +138,7 @@ class Selection(eqx.Module):
 
     @property
     def share(self) -> Float[Array, ""]:
-        """Information of the chosen over that of all candidates."""
+        """Information of the chosen measurements divided by that of all candidates."""
         return self.information / self.total
 
 
@@ -144,15 +150,15 @@ def select_measurements(
     exchange: bool = True,
     max_swaps: int | None = None,
 ) -> Selection:
-    """Select `number` of the candidates so as to lose the least information.
+    """Select `number` of the candidates so that their information is as large as possible.
 
-    The selection is greedy: each step adds the candidate with the largest gain. Then, with `exchange`, the best swap of
-    a chosen for another candidate is repeated until none helps (Fedorov's exchange) or `max_swaps` (default `number`)
-    are made. Deterministic. The greedy set has at least 1 - 1/e of the best possible "D" (the criterion is submodular);
-    `information_bound` bounds how much better any other set could be. A greedy choice costs O(M r) operations, a swap
-    O(N M r). Works under `jit` and `vmap`: one call for many layouts.
+    The selection is greedy: each step adds the candidate with the largest gain. With `exchange`, the best swap of a
+    chosen candidate for another one is then repeated until no swap increases the information (Fedorov's exchange) or
+    `max_swaps` (by default `number`) have been made. The result is deterministic. For "D", which is submodular, the
+    greedy set has at least 1 - 1/e of the maximum information; `information_bound` gives an upper bound for any set. A
+    greedy choice takes O(M r) operations, a swap O(N M r). Works under `jit` and `vmap`, for many layouts in one call.
 
-    Raises `ValueError` for a number that is not from 1 to M, and another criterion.
+    Raises `ValueError` if `number` is not from 1 to M, and for an unknown criterion.
     """
     _check_number(candidates, number, criterion)
     limit = 0 if not exchange else number if max_swaps is None else max_swaps
@@ -162,9 +168,9 @@ def select_measurements(
 
 
 def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -> Float[Array, "..."]:
-    """Information of sets of candidates: (...,) for sets `chosen` (..., N), of N different candidates each.
+    """Information (...,) of sets of candidates, given by their indices `chosen` (..., N): N different ones per set.
 
-    Raises `ValueError` for numbers that are no candidates.
+    Raises `ValueError` for invalid indices, and for an unknown criterion.
     """
     chosen = jnp.asarray(chosen)
     if chosen.ndim == 0 or not jnp.issubdtype(chosen.dtype, jnp.integer):
@@ -178,24 +184,25 @@ def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -
 def information_bound(
     candidates: Candidates, number: int, *, criterion: Criterion = "D", iterations: int = 50
 ) -> Float[Array, ""]:
-    """Upper bound of the information of any `number` candidates.
+    """Compute an upper bound of the information of any set of `number` candidates.
 
-    If every candidate may be measured in part, 0 ≤ w_i ≤ 1 with Σw_i = N, the information is a concave function of w,
-    and each of its tangents bounds it. The least bound in the iterations of the Frank-Wolfe method towards the maximum
-    is returned; more `iterations` tighten it. The bound is tight where many candidates carry similar information, and
-    loose where the noise is so low that each candidate adds information, since fractions of all then exceed any few.
+    If fractions of candidates may be measured, 0 ≤ w_i ≤ 1 with Σw_i = N, the information is a concave function of w,
+    and each of its tangents is an upper bound. The Frank-Wolfe method maximises the information, and the lowest bound
+    of its iterations is returned; more `iterations` tighten it. The bound is tight if many candidates carry similar
+    information. It is loose if the noise is so low that every candidate adds information: fractions of all candidates
+    then carry more information than any small set.
 
-    Boyd and Vandenberghe, Convex Optimization (2004), section 7.5. Raises `ValueError` for a `number` that is not from
-    1 to that of the candidates, or another criterion.
+    Boyd and Vandenberghe, Convex Optimization (2004), section 7.5. Raises `ValueError` if `number` is not from 1 to the
+    number of candidates, and for an unknown criterion.
     """
     _check_number(candidates, number, criterion)
     return _bound(candidates, number, criterion, iterations)
 
 
 def random_selections(key: Array, num_candidates: int, number: int, count: int) -> Int[Array, "count N"]:
-    """`count` sets of `number` different candidates each, all equally likely: (count, number).
+    """Draw `count` sets of `number` different candidates each, all sets equally likely: indices (count, number).
 
-    Raises `ValueError` for a `number` that is not from 1 to that of the candidates.
+    Raises `ValueError` if `number` is not from 1 to `num_candidates`.
     """
     if not 1 <= number <= num_candidates:
         raise ValueError(f"number must be from 1 to the {num_candidates} candidates; it is {number}.")
@@ -205,19 +212,20 @@ def random_selections(key: Array, num_candidates: int, number: int, count: int) 
 
 
 def nearest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
-    """The `number` shortest of all pairs of electrodes at `centres` (L, d): channels of `two_terminal(L)`.
+    """Find the `number` pairs of electrodes with the shortest distance, as indices of channels of `two_terminal(L)`.
 
-    `lengths` (L, L) between them, metres, in place of distances straight through space: `SurfaceLayout.lengths`. This
-    pattern measures every position from close by. Of pairs of the same length the first are taken. Raises `ValueError`
-    for a number that is not from 1 to L(L - 1)/2.
+    `centres`: (L, d) metres. `lengths`: distances (L, L) between the electrodes, metres, such as those along a surface
+    from `SurfaceLayout.lengths`; by default the straight distances. Every position is then measured by electrodes close
+    to it. Among pairs of equal length the first ones are taken. Raises `ValueError` if `number` is not from 1 to
+    L(L - 1)/2.
     """
     return _by_length(centres, number, 1, lengths)
 
 
 def farthest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
-    """The `number` longest pairs, as in `nearest_pairs`: a pattern that drives current through the whole skin.
+    """Find the `number` pairs of electrodes with the longest distance, which drive current through the whole skin.
 
-    Raises `ValueError` for a number that is not from 1 to L(L - 1)/2.
+    Arguments as in `nearest_pairs`. Raises `ValueError` if `number` is not from 1 to L(L - 1)/2.
     """
     return _by_length(centres, number, -1, lengths)
 
@@ -229,7 +237,7 @@ def _by_length(centres, number: int, sign: int, lengths) -> np.ndarray:
         raise ValueError(
             f"number must be from 1 to the {len(first)} pairs of {len(centres)} electrodes; it is {number}."
         )
-    # Rounded to a nanometre, so that pairs as long as each other are taken in their order.
+    # Lengths are rounded to a nanometre, so that pairs of equal length are taken in their order.
     if lengths is None:
         lengths = np.linalg.norm(centres[:, None] - centres, axis=-1)
     elif np.shape(lengths) != (len(centres), len(centres)):
@@ -269,10 +277,11 @@ def _select(candidates: Candidates, number: int, criterion: Criterion, limit: in
 
 
 def _greedy(candidates: Candidates, number: int, criterion: Criterion):
-    """Greedy choice (N,) and the gain of each: a Cholesky factorisation of I + FFᵀ with the best candidate as the next
-    pivot.
+    """Indices (N,) of the greedy choice and the gain of each. The choice is a Cholesky factorisation of I + FFᵀ, where
+    F are the rows f_i, with the best candidate as the next pivot.
 
-    Choosing p turns C into C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p); the u found so far are the rows of `known`.
+    Choosing candidate p changes the posterior covariance from C to C - uuᵀ with u = C f_p / √(1 + f_pᵀC f_p). The rows
+    of `known` are the vectors u found so far.
     """
     rows, weight = candidates.rows, candidates.weight
 
@@ -286,14 +295,14 @@ def _greedy(candidates: Candidates, number: int, criterion: Criterion):
         direction = covariance(known, rows[best]) / jnp.sqrt(1 + left[best])
         seen = rows @ direction
         if criterion == "A":
-            # f_jᵀCVC f_j with the new C; VC f_j and Cf_j change by multiples of `seen`.
+            # Update f_jᵀCVC f_j to the new C, which changes C f_j by a multiple of `seen`.
             pulled = weight @ direction
             change = rows @ covariance(known, pulled)
             removable = jnp.maximum(removable - 2 * seen * change + (direction @ pulled) * seen**2, 0)
         state = known.at[turn].set(direction), jnp.maximum(left - seen**2, 0), removable, free.at[best].set(False)
         return state, (best, gain[best])
 
-    left = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: the remaining variance of reading j
+    left = jnp.sum(rows**2, axis=1)  # f_jᵀC f_j: remaining variance of measurement j
     removable = jnp.sum((rows @ weight) * rows, axis=1)  # f_jᵀCVC f_j
     known = jnp.zeros((number, rows.shape[1]))
     start = (known, left, removable, jnp.ones(len(rows), bool))
@@ -301,15 +310,17 @@ def _greedy(candidates: Candidates, number: int, criterion: Criterion):
 
 
 def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[Array, "N M"]:
-    """Gain of the set by a swap of its i-th member for candidate j, (N, M); -inf where j is in the set.
+    """Gain (N, M) of information by swapping the i-th member of the set for candidate j; -inf where j is in the set.
 
-    With c_ij = f_iᵀC f_j and b_ij = f_iᵀCVC f_j, C of the present set, a swap multiplies det C⁻¹ by
-    q = (1 + c_jj)(1 - c_ii) + c_ij² and lowers tr VC by ((1 - c_ii) b_jj + 2 c_ij b_ij - (1 + c_jj) b_ii) / q.
+    With c_ij = f_iᵀC f_j and b_ij = f_iᵀCVC f_j, where C is the posterior covariance for the present set, a swap
+    multiplies det C⁻¹ by q = (1 + c_jj)(1 - c_ii) + c_ij² and lowers tr VC by
+    ((1 - c_ii) b_jj + 2 c_ij b_ij - (1 + c_jj) b_ii) / q.
     """
     rows, weight = candidates.rows, candidates.weight
     picked = rows[chosen]
     cross = picked @ rows.T
-    # C F_Tᵀ = F_Tᵀ (I + F_T F_Tᵀ)⁻¹: c_ij and 1 - c_ii come without a difference of large numbers.
+    # F_T: the rows of the set. C F_Tᵀ = F_Tᵀ (I + F_T F_Tᵀ)⁻¹ gives c_ij and 1 - c_ii without differences of large
+    # numbers.
     root = _inverse_root(cross[:, chosen])
     half = root @ cross
     c_j = jnp.maximum(jnp.sum(rows**2, axis=1) - jnp.sum(half**2, axis=0), 0)
@@ -328,7 +339,8 @@ def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[A
 
 
 def _of_set(candidates: Candidates, weighted: Float[Array, "M r"], chosen, criterion: Criterion):
-    """Information of one set, from the N × N system I + F_T F_Tᵀ; `weighted` are the rows times V."""
+    """Information of one set, from the N × N matrix I + F_T F_Tᵀ, where F_T are the rows of the set; `weighted`: the
+    rows of all candidates times V."""
     picked = candidates.rows[chosen]
     root = _inverse_root(picked @ picked.T)
     if criterion == "D":
@@ -343,7 +355,8 @@ def _of_sets(candidates: Candidates, sets, criterion: Criterion):
 
 
 def _tangent(candidates: Candidates, parts: Float[Array, " M"], criterion: Criterion):
-    """Information where candidate i counts `parts[i]` times, and its derivative (M,), from the r × r system C⁻¹."""
+    """Information if candidate i is measured with weight `parts[i]`, and its derivative (M,) with respect to the
+    weights, from the r × r matrix C⁻¹."""
     rows, weight = candidates.rows, candidates.weight
     root = _inverse_root(rows.T @ (parts[:, None] * rows))
     half = root @ rows.T
@@ -355,7 +368,8 @@ def _tangent(candidates: Candidates, parts: Float[Array, " M"], criterion: Crite
 
 
 def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
-    """L⁻¹ of the Cholesky factor of I + `matrix`: matrix products alone, which batch where LAPACK's solves may not."""
+    """Inverse L⁻¹ of the Cholesky factor of I + `matrix`, by matrix products only, since these can always be batched,
+    whereas LAPACK's solvers may not be."""
     return inverse_cholesky(jnp.eye(len(matrix)) + matrix[None])[0]
 
 
@@ -370,5 +384,6 @@ def _bound(candidates: Candidates, number: int, criterion: Criterion, iterations
         return parts + 2 / (turn + 2) * (target - parts), bound
 
     start = jnp.full(candidates.num_candidates, number / candidates.num_candidates)
-    # From turn 2, half a step: the whole one of turn 0 would forget where it began.
+    # The step size is 2 / (turn + 2): from turn 2 it is 1/2 and below, whereas a full step at turn 0 would discard the
+    # start.
     return jax.lax.fori_loop(2, iterations + 2, step, (start, jnp.array(jnp.inf)))[1]

@@ -1,14 +1,15 @@
 """Layout scores: differentiable measures of how precisely a sheet with a given layout detects and locates touches.
 
-A touch at place k of amplitude a_k changes the M voltages by a_k Δv_k, linearly; their noise has standard deviation σ.
-With the prior a = S c of the amplitudes of touches at all places, c independent of unit variance, and voltages y = Aᵀa
-+ noise, the rows of A being the Δv_k, the posterior covariance of the amplitudes is
+A touch of amplitude a_k at position k changes the M voltages by a_k Δv_k, in the linear approximation; their noise has
+standard deviation σ. The prior of the amplitudes at all positions is a = S c, where the entries of c are independent
+with unit variance. The voltages are y = Aᵀa + noise, where the rows of A are the Δv_k. Then the posterior covariance
+of the amplitudes is
 
     C = S (1 + Sᵀ A σ⁻² Aᵀ S)⁻¹ Sᵀ.
 
-The position of a touch of unknown amplitude has the Cramér-Rao bound as its least variance: for the parameters (x, y,
-a) the Fisher information is J_ij = ∂_i(a Δv)ᵀ σ⁻² ∂_j(a Δv), and the variance of the place, tr of the block x, y of
-J⁻¹.
+The Cramér-Rao bound is the minimum variance of an unbiased estimate of the position of a touch of unknown amplitude.
+The parameters (x, y, a) have the Fisher information J_ij = ∂_i(a Δv)ᵀ σ⁻² ∂_j(a Δv), and the variance of the position
+is the trace of the (x, y) block of J⁻¹.
 
 Atkinson, Donev and Tobias, Optimum Experimental Designs (Oxford, 2007), chapter 10; Kay, Fundamentals of Statistical
 Signal Processing: Estimation Theory (1993), chapter 3.
@@ -33,14 +34,15 @@ from jeit.forward.system import cell_conductivity, check_conductivity
 from jeit_solvers.dense import inverse_cholesky
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, undifferentiated
 
-# The largest eigenvalue to ln(r) / 2^k, relative, however close the next.
+# Number k of matrix squarings: the largest eigenvalue of an r × r matrix has a relative error of at most ln(r) / 2^k,
+# however close the second largest is.
 _SQUARINGS = 10
 
 
 class TouchPrior(eqx.Module):
     """Gaussian prior of the amplitudes of touches, with covariance SSᵀ.
 
-    **Fields**: `factor` S (n, r), relative to the touches that voltages are computed for.
+    **Fields**: `factor`: S (n, r). Amplitudes are relative to the touches for which the voltages are computed.
     """
 
     factor: Float[Array, "n r"]
@@ -49,12 +51,13 @@ class TouchPrior(eqx.Module):
     def create(
         cls, places: ArrayLike, *, correlation: float, deviation: float = 1.0, lengths: ArrayLike | None = None
     ) -> "TouchPrior":
-        """Create the prior with covariance deviation² exp(-d² / 2 correlation²) between positions (n, 2) at a distance
-        d, metres; for positions (n, 3) on a curved skin, d is `lengths` (n, n), as from `Geodesics.between`, or the
-        straight distance unless given.
+        """Create the prior with covariance deviation² exp(-d² / 2 correlation²) between positions at a distance of d
+        metres.
 
+        `places`: positions (n, 2), or (n, 3) on a curved skin, metres. `lengths`: distances (n, n) between them,
+        metres, such as those along a curved surface from `Geodesics.between`; by default the straight distances.
         Components with less than a millionth of the largest variance are omitted. Raises `ValueError` for a correlation
-        or deviation that is not positive, and for what are no places.
+        or deviation that is not positive, and for invalid positions.
         """
         if not (0 < correlation < np.inf and 0 < deviation < np.inf):
             raise ValueError(
@@ -71,18 +74,18 @@ class TouchPrior(eqx.Module):
 
 
 class Scores(eqx.Module):
-    """Scores of a layout; after `jax.vmap` the leading axis of every array is that of the layouts.
+    """Scores of a layout. After `jax.vmap`, every array has a leading axis for the layouts.
 
     **Fields**
 
-    - `sensitivity` (n,): Θ = ‖Δv‖₂ of a touch at each place, volts.
-    - `soft_worst`: smooth minimum of Θ, volts, (mean Θ^(-1/T))^(-T); its temperature T → 0 makes it the minimum.
-    - `variance` (n,): of the amplitude at each place after the voltages are read, relative, the diagonal of C.
-    - `log_information`: D-optimality, log det of the information over the prior's, nats.
+    - `sensitivity` (n,): Θ = ‖Δv‖₂ of a touch at each position, volts.
+    - `soft_worst`: smooth minimum (mean Θ^(-1/T))^(-T) of Θ, volts; it tends to the minimum as the temperature T → 0.
+    - `variance` (n,): posterior variance of the relative amplitude at each position, the diagonal of C.
+    - `log_information`: D-optimality, log-determinant of the information divided by that of the prior, nats.
     - `largest_variance`: E-optimality, the largest eigenvalue of C: the variance of the least certain pattern of
       touches.
-    - `localisation_error` (n,): Cramér-Rao bound of the root-mean-square distance of an unbiased estimate of the place
-      of one touch of amplitude 1, metres.
+    - `localisation_error` (n,): Cramér-Rao bound of the root-mean-square error of an unbiased estimate of the position
+      of a single touch of amplitude 1, metres.
     """
 
     sensitivity: Float[Array, "*layouts n"]
@@ -94,17 +97,17 @@ class Scores(eqx.Module):
 
     @property
     def worst(self) -> Float[Array, "*layouts"]:
-        """Least Θ, volts."""
+        """Minimum of Θ, volts."""
         return self.sensitivity.min(axis=-1)
 
     @property
     def mean(self) -> Float[Array, "*layouts"]:
-        """Mean Θ, volts."""
+        """Mean of Θ, volts."""
         return self.sensitivity.mean(axis=-1)
 
     @property
     def uniformity(self) -> Float[Array, "*layouts"]:
-        """Mean Θ over its root mean square, as in `SensitivityMap`."""
+        """Mean of Θ divided by its root mean square, as in `SensitivityMap`."""
         return uniformity(self.sensitivity)
 
     @property
@@ -125,19 +128,21 @@ def layout_scores(
     noise: ArrayLike,
     temperature: float = TEMPERATURE,
 ) -> Scores:
-    """Compute all scores of the layout of a model on a sheet, from one factorisation and the Jacobian.
+    """Compute all scores of the layout of a sheet's model, from one factorisation and the Jacobian.
 
-    Differentiable in the electrodes' positions, radii and contact impedances; for a batch of layouts of L electrodes
-    (the protocol, the places, and so on are the same)::
+    Differentiable with respect to the positions, radii and contact impedances of the electrodes. For a batch of layouts
+    with the same number of electrodes, protocol and touches::
 
         jax.vmap(lambda electrodes: layout_scores(model.with_electrodes(electrodes), …))(stacked_electrodes)
 
-    A protocol of all two-terminal pairs does not depend on the order of the electrodes, and spans all their
-    measurements; one of neighbours depends on their numbers, which lose their meaning once the electrodes move.
+    A protocol of all two-terminal pairs does not depend on the order of the electrodes and determines every other
+    measurement. A protocol of adjacent electrodes depends on their numbering, which becomes meaningless once the
+    electrodes move.
 
-    **Arguments:** `conductivity` of the sheet, siemens; `noise`, standard deviation of the channels, (M,) or one for
-    all, volts; `temperature` of the smooth minimum. Raises `ValueError` for a model that is not of a sheet and for
-    shapes and values that do not fit.
+    **Arguments:** `conductivity`: sheet conductivity, siemens; `touches`, `prior`: touches of the sheet, and prior of
+    their amplitudes; `noise`: standard deviation of the channels (M,), or one value for all, volts; `temperature`:
+    temperature T of the smooth minimum. Raises `ValueError` if the model is not of a sheet, and for incompatible shapes
+    and invalid values.
     """
     conductivity = check_conductivity(model.mesh, conductivity)
     if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):
@@ -190,10 +195,10 @@ def _scores(jacobian, conductivity, touches: SheetTouches, prior: TouchPrior, no
 
 
 def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
-    """Largest eigenvalue of a positive semidefinite matrix, by repeated squaring: matrix products only, which can be
-    batched.
+    """Largest eigenvalue of a positive semidefinite matrix, by repeated squaring, which needs only matrix products and
+    can be batched.
 
-    The derivative of a simple eigenvalue is that of vᵀ(matrix)v with its vector v held.
+    The derivative of a simple eigenvalue is that of vᵀ(matrix)v at a fixed eigenvector v.
     """
     power = undifferentiated(matrix)
     for _ in range(_SQUARINGS):
@@ -204,9 +209,11 @@ def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
 
 
 def _localisation_error(along_a: Float[Array, "n M"], along: Float[Array, "2 n M"]) -> Float[Array, " n"]:
-    """√tr of the 2 × 2 block of the inverse of the information, by its Schur complement; infinite where singular."""
+    """Cramér-Rao bound of the position: square root of the trace of the (x, y) block of the inverse information, from
+    its Schur complement; infinite if it is singular. `along_a`, `along`: derivatives of the whitened voltages with
+    respect to the amplitude, and to x and y."""
     xp, size = namespace(along_a), (along_a**2).sum(axis=1)
-    # The part of the slopes orthogonal to the amplitude; formed before it is squared, for the difference may be small.
+    # Part of the derivatives orthogonal to that of the amplitude, computed before squaring since it may be small.
     x, y = along - ((along * along_a).sum(axis=2) / size)[..., None] * along_a
     xx, yy, xy = (x * x).sum(axis=1), (y * y).sum(axis=1), (x * y).sum(axis=1)
     determinant = xx * yy - xy**2

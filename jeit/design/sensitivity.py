@@ -1,4 +1,4 @@
-"""Sensitivity maps: the norm of the voltage changes of a skin by a touch at each position."""
+"""Sensitivity maps: the norm of the voltage changes due to a touch at each position of a skin."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from jeit_solvers.engines import either_engine, has_values, namespace
 
 @either_engine
 def uniformity(sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*maps"]:
-    """Mean of Θ over n positions divided by its root mean square: 1 where all are equal, less the more they differ."""
+    """Mean of Θ over n positions divided by its root mean square: 1 if all values are equal, and smaller the more they
+    differ."""
     return sensitivity.mean(axis=-1) / namespace(sensitivity).sqrt((sensitivity**2).mean(axis=-1))
 
 
@@ -29,9 +30,10 @@ def _share_below(level, sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*
 
 
 class SensitivityMap(eqx.Module):
-    """Sensitivity Θ of a skin at n places: ‖Δv‖₂ of the voltages' changes Δv by a touch there (Park et al. 2022).
+    """Sensitivity Θ of a skin at n positions: the norm ‖Δv‖₂ of the voltage changes Δv due to a touch at the position
+    (Park et al. 2022).
 
-    - `grid`: the places; `changes`: (n, M) volts, Δv of the protocol's M channels.
+    **Fields**: `grid`: the touched positions; `changes`: Δv (n, M) in the M channels of the protocol, volts.
     """
 
     grid: TouchGrid
@@ -46,23 +48,23 @@ class SensitivityMap(eqx.Module):
     @property
     @either_engine
     def minimum(self) -> Float[Array, ""]:
-        """Least Θ, volts: the worst place."""
+        """Minimum of Θ, at the least sensitive position, volts."""
         return self.values.min(axis=-1)
 
     @property
     @either_engine
     def mean(self) -> Float[Array, ""]:
-        """Mean Θ, volts."""
+        """Mean of Θ, volts."""
         return self.values.mean(axis=-1)
 
     @property
     @either_engine
     def uniformity(self) -> Float[Array, ""]:
-        """Mean Θ divided by its root mean square: 1 where all positions are equal, less the more they differ."""
+        """Mean of Θ divided by its root mean square: 1 if all positions are equal, and smaller the more they differ."""
         return uniformity(self.values)
 
     def blind_spot(self, level) -> Float[Array, ""]:
-        """Share of the area that is less sensitive than `level` (volts), such as another layout's minimum.
+        """Fraction of the area that is less sensitive than `level` (volts), such as the minimum of another layout.
 
         Raises `ValueError` for a level that is negative or not a number.
         """
@@ -71,12 +73,12 @@ class SensitivityMap(eqx.Module):
         return _share_below(level, self.values)
 
     def histogram(self, bins: int | np.ndarray = 40) -> tuple[np.ndarray, np.ndarray]:
-        """Share of the area in each of some bins of Θ, and the bins' edges in volts; `bins` as of `numpy.histogram`."""
+        """Fraction of the area in each bin of Θ, and the edges of the bins in volts; `bins` as in `numpy.histogram`."""
         counts, edges = np.histogram(np.asarray(self.values), bins=bins)
         return counts / self.values.size, edges
 
     def image(self) -> Float[np.ndarray, "rows columns"]:
-        """Θ as an image (rows, columns), row 0 at the least y, NaN off the skin."""
+        """Θ as an image (rows, columns), volts, with row 0 at the smallest y, and NaN outside the skin."""
         return self.grid.raster(self.values)
 
 
@@ -90,10 +92,11 @@ def sensitivity_map(
     contrast: float = CONTRAST,
     linear: bool = False,
 ) -> SensitivityMap:
-    """Compute the sensitivity map of a skin from the voltage changes by touches at every position of `grid`.
+    """Compute the sensitivity map of a skin from the voltage changes due to touches at every position of `grid`.
 
-    `indentation`: the unit deformation of Park et al. 2022 unless given. `thickness` (a sheet's) and `contrast` as in
-    `touched_cells`; `linear` as in `touch_changes`. Raises `ValueError` as they do.
+    `indentation`: shape of the touch, by default the unit deformation `Bell()` of Park et al. 2022. `thickness` (for a
+    sheet) and `contrast` as in `touched_cells`, `conductivity` and `linear` as in `touch_changes`. Raises `ValueError`
+    as these functions do.
     """
     check_model(model)
     check_grid(grid)

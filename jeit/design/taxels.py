@@ -19,11 +19,16 @@ from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 class Taxels(eqx.Module):
     """The k virtual taxels of a layout, from touches at n positions; create them with `find_taxels`.
 
-    **Fields**: `places` (n, 2) metres, on a curved skin (n, 3); `cell_area` (n,), the part of the skin that each place
-    stands for, m²; `clusters`, of the voltage changes of the touches, with their means; `similarity` (k, n), cosine of
-    the angle between the mean change of each taxel and the change of each place; `threshold`, from which on a place
-    belongs to a taxel. After `jax.vmap` all arrays, and what is worked out from them, lead with the axis of the
-    layouts.
+    **Fields**
+
+    - `places`: touched positions (n, 2), on a curved skin (n, 3), metres.
+    - `cell_area` (n,): area of the part of the skin that each position represents, m².
+    - `clusters`: k-means clusters of the voltage changes, with their means.
+    - `similarity` (k, n): cosine of the angle between the mean voltage change of each cluster and the change at each
+      position.
+    - `threshold`: minimum similarity for a position to belong to a taxel.
+
+    After `jax.vmap`, all arrays and properties have a leading axis for the layouts.
     """
 
     places: Float[Array, "*layouts n d"]
@@ -34,19 +39,19 @@ class Taxels(eqx.Module):
 
     @property
     def labels(self) -> Int[Array, "*layouts n"]:
-        """Index of the taxel whose cluster each position is in; every position is in one."""
+        """Index of the cluster that each position belongs to; every position belongs to exactly one cluster."""
         return self.clusters.labels
 
     @property
     @either_engine
     def members(self) -> Bool[Array, "*layouts k n"]:
-        """Mask of the positions that each taxel covers. Taxels overlap, and some positions may be in none."""
+        """Mask of the positions that each taxel covers. Taxels may overlap, and a position may be covered by none."""
         return self.similarity >= self.threshold
 
     @property
     @either_engine
     def positions(self) -> Float[Array, "*layouts k d"]:
-        """The centroid of each cluster's places, metres; on a curved skin in space, somewhat below its surface."""
+        """Centroid of the positions in each cluster, metres; on a curved skin, it lies slightly below the surface."""
         count = self.similarity.shape[-2]
         weight = (self.labels[..., None, :] == np.arange(count)[:, None]) * self.cell_area[..., None, :]
         return weight @ self.places / weight.sum(axis=-1, keepdims=True)
@@ -54,25 +59,25 @@ class Taxels(eqx.Module):
     @property
     @either_engine
     def areas(self) -> Float[Array, "*layouts k"]:
-        """Area that each taxel covers, m²; 0 for a mean change that is like no place's own."""
+        """Area that each taxel covers, m²; 0 if no position has a change similar to the mean change of the cluster."""
         return (self.members * self.cell_area[..., None, :]).sum(axis=-1)
 
     @property
     @either_engine
     def mean_area(self) -> Float[Array, "*layouts"]:
-        """Mean of the `areas`, m²."""
+        """Mean of the taxel `areas`, m²."""
         return self.areas.mean(axis=-1)
 
     @property
     @either_engine
     def std_area(self) -> Float[Array, "*layouts"]:
-        """Standard deviation of the `areas` among the k taxels, m²."""
+        """Standard deviation of the taxel `areas`, m²."""
         return self.areas.std(axis=-1)
 
     @property
     @either_engine
     def max_area(self) -> Float[Array, "*layouts"]:
-        """Largest of the `areas`, m²."""
+        """Maximum of the taxel `areas`, m²."""
         return self.areas.max(axis=-1)
 
     @property
@@ -84,22 +89,24 @@ class Taxels(eqx.Module):
     @property
     @either_engine
     def overlap(self) -> Float[Array, "*layouts"]:
-        """Mean number of taxels that cover a point of the skin: the sum of their areas divided by the skin's."""
+        """Mean number of taxels that cover a point of the skin: the sum of the taxel areas divided by the area of the
+        skin."""
         return self.areas.sum(axis=-1) / self.cell_area.sum(axis=-1)
 
     @property
     @either_engine
     def diameters(self) -> Float[Array, "*layouts k"]:
-        """Diameter of the circle of each taxel's area, 2 √(area / π), metres."""
+        """Diameter of a circle with the area of each taxel, 2 √(area / π), metres."""
         return 2 * namespace(self.areas).sqrt(self.areas / np.pi)
 
     @property
     @either_engine
     def two_point_discrimination(self) -> Float[Array, "*layouts"]:
-        """Least distance at which two touches are distinguishable, metres: the mean of the `diameters`.
+        """Estimate of the minimum distance at which two touches are distinguishable, metres: the mean of the
+        `diameters`.
 
-        The paper's estimate, "average diameter of the virtual taxels". Two touches nearer than that are within one
-        taxel, on average: their changes differ in strength rather than in pattern.
+        This is the estimate of the paper, "average diameter of the virtual taxels". Two touches at a smaller distance
+        are on average within one taxel: their voltage changes differ in magnitude rather than in pattern.
         """
         return self.diameters.mean(axis=-1)
 
@@ -115,12 +122,13 @@ def find_taxels(
     directions: bool = False,
     restarts: int = 10,
 ) -> Taxels:
-    """Find virtual taxels from the voltage `changes` (n, m) by the same touch at `places` (n, 2), on a curved skin (n,
-    3), metres.
+    """Find virtual taxels from the voltage `changes` (n, m) due to the same touch at `places` (n, 2), on a curved skin
+    (n, 3), metres.
 
-    The changes are clustered by k-means; a taxel consists of the positions at which the cosine of the angle between its
-    cluster's mean and the position's change is at least `threshold`. Park et al. 2022, text S4: 48 × 48 places, 90
-    clusters, 0.7. Places whose touches change nothing are in no taxel.
+    The voltage changes are clustered by k-means. A taxel consists of the positions at which the cosine of the angle
+    between the mean change of its cluster and the change at the position is at least `threshold`. Park et al. 2022,
+    text S4, use 48 × 48 positions, 90 clusters and a threshold of 0.7. Positions whose touches change no voltage belong
+    to no taxel.
 
     For a batch of layouts with changes (B, n, m), and `keys` from `jax.random.split(key, B)`::
 
@@ -128,13 +136,14 @@ def find_taxels(
 
     **Arguments:**
 
-    - `cell_area`: of the part of the skin that each place stands for, m²; a number or (n,).
-    - `num_taxels`: k, the number of clusters.
-    - `threshold`: a cosine, more than 0 and less than 1.
-    - `key`: for k-means, from `jax.random.key`.
-    - `directions`: whether to cluster the changes scaled to length 1. Unscaled, as in the paper, positions of low
-      sensitivity fall into one cluster, since their changes are all small; scaled, each cluster has a similar pattern.
-    - `restarts`: of k-means, of which the best is kept.
+    - `cell_area`: area of the part of the skin that each position represents, m²; one value for all, or (n,).
+    - `num_taxels`: number k of clusters.
+    - `threshold`: minimum cosine, between 0 and 1.
+    - `key`: random key for k-means, from `jax.random.key`.
+    - `directions`: whether to scale the changes to length 1 before clustering. Without scaling, as in the paper,
+      positions of low sensitivity fall into one cluster, since all their changes are small. With scaling, the changes
+      in a cluster have a similar pattern.
+    - `restarts`: number of restarts of k-means, of which the best result is kept.
 
     Raises `ValueError` for shapes that disagree, changes that are not finite or all zero, and lengths and areas whose
     units do not fit together.
@@ -155,13 +164,13 @@ def _cosines(vectors: Float[Array, "k m"], unit: Float[Array, "n m"]) -> Float[A
 
 @either_engine
 def _unit(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
-    """Scale vectors to length 1; zero vectors stay zero and have zero derivative."""
+    """Scale vectors to length 1; zero vectors remain zero and have a derivative of zero."""
     xp, square = namespace(vectors), (vectors**2).sum(axis=1, keepdims=True)
     return xp.where(square > 0, vectors / xp.sqrt(xp.where(square > 0, square, 1)), 0)
 
 
 def _check(changes, places, cell_area, num_taxels, threshold) -> None:
-    """Raise `ValueError` for invalid arguments; traced arrays are checked by shape only."""
+    """Raise `ValueError` for invalid arguments; of traced arrays, only the shape is checked."""
     shape = np.shape(changes)
     in_space = np.shape(places) == (*shape[:1], 3) and not (has_values(places) and not np.ptp(places, axis=0).any())
     fits = np.shape(places) == (*shape[:1], 2) or in_space
@@ -192,7 +201,7 @@ def _check_lengths(places: np.ndarray, cell_area: np.ndarray) -> None:
     if not (np.isfinite(cell_area) & (cell_area > 0)).all():
         raise ValueError("cell_area must be positive and finite, in m².")
     box = float(np.prod(np.sort(np.ptp(places, axis=0))[-2:]))
-    # Cells fill about the box round the places; of a factor of 100 the units are to blame.
+    # The cells approximately fill the bounding box of the positions; a factor of 100 indicates wrong units.
     if box > 0 and not 0.01 < cell_area.sum() / box < 100:
         raise ValueError(
             f"cell_area: the cells are {cell_area.sum():.3g} m² together, but the box round the places is {box:.3g} "

@@ -1,4 +1,4 @@
-"""Electrodes: position, size, contact impedance, and their contact integrals.
+"""Electrodes: position, size, contact impedance, and contact integrals.
 
 | where | complete electrodes | point electrodes |
 |---|---|---|
@@ -9,7 +9,7 @@
 | whole facets of a mesh, nodes of a mesh | `FacetElectrodes`, `plates`, `electrodes_from_nodes` | `NodeElectrodes` |
 | several of these at once | `CombinedElectrodes` | |
 
-Where to put them: `jeit.layout`.
+For the placement of electrodes see `jeit.layout`.
 """
 
 from __future__ import annotations

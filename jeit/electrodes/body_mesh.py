@@ -1,4 +1,5 @@
-"""Meshes of bodies with their electrodes, with rectangular patches and facets."""
+"""Meshes of bodies that are refined at their electrodes, checks of electrode positions, and rectangular electrodes
+(`FacePatches`)."""
 
 from __future__ import annotations
 
@@ -27,17 +28,21 @@ from jeit.mesh.geometry import facet_measures
 from jeit.mesh.sizes import size_checked
 from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated, values_at_once
 
-# Distance from a face within which a position lies on it, relative to the body's size; as in the check of electrodes.
+# Distance from a face, relative to the size of the body, within which a position lies on the face; also used in checks
+# of electrodes.
 _ON = 1e-3
-# Places round a patch on a lid that say where it ends.
+# Number of points on the rim of a patch on a horizontal face.
 _ROUND = 16
 
 
 @size_checked()
 def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None = None) -> Mesh:
-    """A mesh of about `num_points` nodes, finer where electrodes are, their edges in faces of its cells where they are
-    rectangles on a box, or on the wall of a cylinder; of a body that comes as a mesh, that. Raises `ValueError` where
-    `num_points` is missing, and where it has no effect."""
+    """Mesh a body with about `num_points` nodes, refined at the electrodes.
+
+    The edges of rectangular electrodes on a box, and their upper and lower edges on the wall of another solid, coincide
+    with cell faces. A body that is given as a mesh is not remeshed. Raises `ValueError` if `num_points` is missing, or
+    if it is given for a body that is a mesh.
+    """
     if isinstance(body, OwnMesh):
         if num_points is not None:
             raise ValueError(
@@ -72,16 +77,16 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
 
 
 def _ends(place: Float[np.ndarray, " L"], half: Float[np.ndarray, " L"], some) -> Float[np.ndarray, " e"]:
-    """Places where some electrodes begin and end along an axis."""
+    """Positions along an axis where the selected electrodes begin and end."""
     return np.concatenate([(place - half)[some], (place + half)[some]])
 
 
 def _rim(outline, place, half, flat: bool) -> Float[np.ndarray, "p 2"]:
-    """Places where an electrode ends, seen from above: all round on a horizontal face, at its two ends on the wall."""
+    """Points on the rim of an electrode, seen from above: around it on a horizontal face, its two ends on a wall."""
     if flat:
         angle = 2 * np.pi * np.arange(_ROUND) / _ROUND
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        # For a rectangle, the points where rays meet its sides.
+        # For a rectangle, the points where rays from its centre meet its sides.
         return place[:2] + circle * half / np.abs(circle).max(axis=1, keepdims=True)
     nearest = np.asarray(outline.nearest(place[None, :2]))[0]
     step = 1e-3 * half[0]
@@ -91,14 +96,15 @@ def _rim(outline, place, half, flat: bool) -> Float[np.ndarray, "p 2"]:
     return np.asarray(outline.nearest(np.stack([place[:2] - half[0] * tangent, place[:2] + half[0] * tangent])))
 
 
-# Distance within which two electrodes are at the same place, as a share of their smaller size.
+# Distance between two electrodes, divided by the smaller size, below which they are at the same position.
 _SAME = 1e-3
 
 Distance = Callable[[Float[np.ndarray, "L 3"]], Float[np.ndarray, " L"]]
 
 
 def check_on_surface(position: Float[np.ndarray, "L 3"], allowed: Float[np.ndarray, " L"], off: Distance) -> None:
-    """Raise `ValueError` for the first of electrodes that is more than `allowed` metres `off` a body's surface."""
+    """Raise `ValueError` for the first electrode whose distance from the surface of the body exceeds `allowed` metres;
+    `off` computes these distances."""
     far = off(position)
     for number in np.flatnonzero(far > allowed)[:1]:
         hint = "give a place on it."
@@ -113,12 +119,14 @@ def check_on_surface(position: Float[np.ndarray, "L 3"], allowed: Float[np.ndarr
 
 
 def _all_on(position, allowed, off: Distance) -> bool:
-    """Whether all lie on the surface, and not all in one place of it, as wherever the origin is."""
+    """Whether all positions lie on the surface and are spread over it. Positions that nearly coincide do not count,
+    since they may lie on the surface by chance."""
     return bool((np.ptp(position, axis=0).max() > allowed).all() and (off(position) <= allowed).all())
 
 
 def check_apart(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"]) -> None:
-    """Raise `ValueError` for the first two electrodes at the same place; `size`: the smaller of each one's, metres."""
+    """Raise `ValueError` for the first two electrodes at the same position. `size`: smaller dimension of each
+    electrode, metres."""
     apart = np.linalg.norm(position[:, None] - position, axis=-1)
     same = np.argwhere(np.triu(apart < _SAME * np.minimum(size[:, None], size), 1))
     for first, second in same[:1]:
@@ -129,8 +137,8 @@ def check_apart(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"
 
 
 def check_size(name: str, sizes: Float[np.ndarray, " L"], most: float, of: str) -> None:
-    """Raise `ValueError`, about the argument `name`, for the first electrode of more than `most` metres, the length
-    `of` what it lies on."""
+    """Raise `ValueError` with the argument's `name` for the first electrode larger than `most` metres, the size of the
+    object that it lies on; `of` names that object."""
     for number in np.flatnonzero(sizes > (1 + _SAME) * most)[:1]:
         size = float(sizes[number])
         hint = IN_MILLIMETRES if 10 * most < size <= 1000 * most else "give the size of what lies on it."
@@ -140,7 +148,7 @@ def check_size(name: str, sizes: Float[np.ndarray, " L"], most: float, of: str) 
 
 
 def check_placed(electrodes: AbstractPlacedElectrodes, mesh: Mesh) -> None:
-    """Raise `ValueError` for patches of which a mesh has little: off its surface, or larger than it."""
+    """Raise `ValueError` for patches that lie off the surface of the mesh, or are larger than it."""
     sizes = {name: np.asarray(one) for name, one in electrodes.geometry().items() if name in ("width", "height")}
     points = np.asarray(mesh.points)
     from jeit.mesh.geodesic import Triangles
@@ -157,21 +165,22 @@ def _length_text(metres: float) -> str:
     return f"{1e3 * metres:.3g} mm" if metres < 1 else f"{metres:.3g} m"
 
 
-# Patches that do not overlap and can reach one triangle that is not larger than they are.
+# Maximum number of non-overlapping patches that can reach a triangle no larger than they are.
 _MOST_AT_ONCE = 8
-# A triangle in place of those that a patch does not reach.
+# Triangle that replaces those that a patch does not reach.
 _UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
 
 class FacePatches(AbstractPlacedElectrodes):
-    """Complete electrodes that are rectangles on the surface of a 3-D mesh, free of its nodes.
+    """Complete electrodes that are rectangles on the surface of a 3-D mesh, independent of its nodes.
 
-    A patch lies in the tangent plane at its position: its width runs horizontally (perpendicular to z) and its
-    height up the surface; on a horizontal face width runs along x and height along y. On a curved face it covers what
-    lies beneath that rectangle: round a cylinder of radius R a plate of arc length a has the width 2 R sin(a / 2 R).
+    A patch lies in the tangent plane at its position: its width is horizontal (perpendicular to z), its height runs up
+    the surface; on a horizontal face, width is along x and height along y. On a curved face the patch covers the
+    projection of that rectangle: on a cylinder of radius R, an electrode of arc length a has the width 2 R sin(a / 2
+    R).
 
-    **Fields**: `position` (L, 3) metres, on the surface; `width`, `height` (L,) metres; `contact_impedance` (L,)
-    ohm·m².
+    **Fields**: `position` (L, 3): points on the surface, metres; `width`, `height` (L,): metres; `contact_impedance`
+    (L,): ohm·m².
     """
 
     position: Float[Array, "L 3"]
@@ -180,7 +189,8 @@ class FacePatches(AbstractPlacedElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, width: ArrayLike, height: ArrayLike, contact_impedance: ArrayLike):
-        """Sizes and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        """Sizes and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
+        values."""
         self.position = as_positions(position, (3,))
         self.width = as_electrode_values("width", width, len(self.position), unit="metres")
         self.height = as_electrode_values("height", height, len(self.position), unit="metres")
@@ -193,7 +203,7 @@ class FacePatches(AbstractPlacedElectrodes):
         return {"position": self.position, "width": self.width, "height": self.height}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Rectangles on horizontal faces, dots elsewhere."""
+        """Draw rectangles on horizontal faces, dots elsewhere."""
         places, flat = np.asarray(self.position), seen_flat(mesh, self.position)
         sizes = np.asarray(self.width), np.asarray(self.height)
         for place, width, height, whole in zip(places, *sizes, flat, strict=True):
@@ -203,7 +213,7 @@ class FacePatches(AbstractPlacedElectrodes):
                 pen.dot(place)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """None: they are not of a plane mesh."""
+        """Empty, because the electrodes do not lie on a plane mesh."""
         return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
@@ -212,17 +222,18 @@ class FacePatches(AbstractPlacedElectrodes):
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Contact integrals over what the patches cover of boundary triangles, seen along their normals: exact."""
+        """Contact integrals over the parts of boundary triangles within the patches, as seen along the patches'
+        normals; exact."""
         xp = namespace(self, mesh)
         area, half_size = facet_measures(mesh), xp.stack([self.width, self.height], axis=-1) / 2
         normal, across, up = _frames(mesh, self.position)
         corners = mesh.points[mesh.facets]
-        near, reached = _reached(mesh, self.position, half_size, (normal, across, up))
+        near, reached = _reaching_patches(mesh, self.position, half_size, (normal, across, up))
         some = reached.any(axis=1).nonzero()[0] if xp is np else np.arange(len(area))
         near, reached = near[some], reached[some]
         offset = corners[some][:, None] - self.position[near][:, :, None]  # (q, k, 3, 3)
         place = xp.stack([(offset * axis[near][:, :, None]).sum(axis=-1) for axis in (across, up)], axis=-1)
-        # A triangle seen from its edge covers nothing, and has nothing to divide by.
+        # A triangle perpendicular to the patch has no projected area; replace it to avoid a division by zero.
         place = xp.where(reached[..., None, None], place, _UNIT)
         once, twice = covered_moments(place, half_size[near])
         current = xp.where(reached, area[some][:, None] / self.contact_impedance[near], 0)
@@ -246,7 +257,7 @@ class FacePatches(AbstractPlacedElectrodes):
         check_apart(electrodes.position, np.minimum(electrodes.width, electrodes.height))
         touched = electrodes.contact(mesh).load * electrodes.contact_impedance
         share = touched.sum(axis=0) / (electrodes.width * electrodes.height)
-        # A patch bent round a wall is longer than its chord, by a tenth at 80° of arc.
+        # A patch on a curved wall is longer than its chord: by a tenth at 80° of arc.
         wrong = np.flatnonzero((share < 0.8) | (share > 1.25))
         if wrong.size:
             check_placed(electrodes, mesh)
@@ -261,10 +272,11 @@ class FacePatches(AbstractPlacedElectrodes):
             raise ValueError(f"Electrodes {first + 1} and {second + 1} overlap; move them apart.")
 
 
-def _reached(mesh: Mesh, position, half_size, frames):
-    """Patches (b, k) that may cover a part of each boundary triangle, the nearest first, and whether they do.
+def _reaching_patches(mesh: Mesh, position, half_size, frames):
+    """Patches (b, k) that may cover a part of each boundary triangle, nearest first, and whether they do.
 
-    On the same side of the body: facing as the patch does, and no deeper than it is large. Not differentiated.
+    Triangles must lie on the same side of the body as the patch: have a similar normal, and a smaller depth than the
+    size of the patch. Not differentiated.
     """
     xp = namespace(mesh, position)
     corners = mesh.points[mesh.facets]
@@ -285,7 +297,8 @@ def _reached(mesh: Mesh, position, half_size, frames):
 
 
 def _frames(mesh: Mesh, position):
-    """Unit vectors (L, 3) at each electrode: normal of the nearest facet, across, and up. Not differentiated."""
+    """Unit vectors (L, 3) at each electrode: normal of the nearest facet, horizontal and upward direction. Not
+    differentiated."""
     xp = namespace(mesh, position)
     normal = facet_normals(mesh)[nearest_facets(mesh, position)]
     horizontal = abs(normal[:, 2:]) > 0.9

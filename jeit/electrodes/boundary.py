@@ -30,14 +30,15 @@ from jeit_solvers.engines import (
 
 
 class BoundaryElectrodes(AbstractMovableElectrodes):
-    """Complete electrodes that cover arcs of the boundary of a 2-D mesh, free of its nodes.
+    """Complete electrodes that cover arcs of the boundary of a 2-D mesh, independent of its nodes.
 
-    Electrode l covers the points of the boundary within `width[l]` / 2 of `position[l]`, measured along the
-    boundary polygon. Its integrals over partly covered edges are polynomials in its two end points, so they are
-    exact and differentiable in position and width at once.
+    Electrode l covers the points of the boundary within `width[l]` / 2 of `position[l]`, measured along the boundary
+    polygon. The integrals over partly covered edges are polynomials in the two end points of the electrode, so they are
+    exact and differentiable in position and width.
 
-    **Fields**: `position` (L, 2) metres, projected to the nearest boundary edge; `width` (L,) metres;
-    `contact_impedance` (L,) ohm·m (sheet: contact impedance in ohm·m² over the sheet's thickness).
+    **Fields**: `position` (L, 2): metres, projected to the nearest boundary edge; `width` (L,): metres;
+    `contact_impedance` (L,): ohm·m (for a sheet, the contact impedance in ohm·m² divided by the thickness of the
+    sheet).
     """
 
     position: Float[Array, "L 2"]
@@ -45,7 +46,8 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, width: ArrayLike, contact_impedance: ArrayLike):
-        """`width` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        """`width` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
+        values."""
         self.position = as_positions(position, (2,))
         self.width = as_electrode_values("width", width, len(self.position), unit="metres")
         self.contact_impedance = as_electrode_values(
@@ -57,15 +59,17 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         return {"position": self.position, "width": self.width}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Arcs of the boundary of `mesh`."""
+        """Draw the arcs of the boundary of `mesh` that the electrodes cover."""
         for place, width in zip(np.asarray(self.position), np.asarray(self.width), strict=True):
             pen.lines([_arc(mesh, place, width)], place)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """A quarter of the size of cells at their ends, where the current is densest: without bounds, if z is zero.
+        """Refine cells to a quarter of their size at the ends of the electrodes, where the current density is largest
+        (unbounded for zero contact impedance z).
 
-        Of 32 electrodes that cover 0.73 of a disk, z·σ = 1e-4 radii, 2,000 nodes miss adjacent voltages by 3 %, and by
-        57 % with half the size at their middles.
+        Example: with 32 electrodes that cover a fraction of 0.73 of a disk's boundary, z·σ = 1e-4 radii and 2,000
+        nodes, the error of adjacent voltages is 3 %; with cells of half the size at the middles of the electrodes
+        instead, it is 57 %.
         """
         edge = body.loops(720)[0]
         middle, half = along(np.asarray(self.position), np.asarray(edge)), np.asarray(self.width) / 2
@@ -73,7 +77,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         return (Refine(np.asarray(ends), factor=4.0),)
 
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
-        """Along the boundary of `mesh`, counter-clockwise."""
+        """Unit tangents of the boundary of `mesh` at the electrodes, counter-clockwise."""
         start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
         place = np.asarray(self.position)
         nearest = np.argmin(np.linalg.norm(place[:, None] - (start + end) / 2, axis=-1), axis=1)
@@ -88,16 +92,17 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
     def contact(self, mesh: Mesh) -> Contact:
         """Contact integrals over the boundary edges of `mesh`, exact for P1 basis functions."""
         xp = namespace(self, mesh)
-        start, end = _covered(self.position, self.width, mesh)
+        start, end = _covered_intervals(self.position, self.width, mesh)
         length = facet_measures(mesh)[:, None]
-        # Basis functions on an edge are φ_1 = t / length and φ_0 = 1 - φ_1. Simpson's rule is exact for their products
-        # over [start, end], and sums nothing but positive terms: what an electrode hardly covers keeps all its digits.
+        # The basis functions on an edge are φ_1 = t / length and φ_0 = 1 - φ_1. Simpson's rule is exact for their
+        # products over [start, end] and sums only positive terms, so it is accurate also for edges that an electrode
+        # hardly covers.
         after = xp.stack([start, (start + end) / 2, end]) / length
         before = 1 - after
         share = (end - start) * np.array([1.0, 4.0, 1.0], start.dtype)[:, None, None, None] / 6
 
-        # The sum over the turns, (b, L), is written out: XLA makes a slow matrix product of a sum over so short an
-        # axis.
+        # The sum over the turns, (b, L), is explicit, because XLA converts a sum over such a short axis into a slow
+        # matrix product.
         def integral(values):
             values = share[0] * values[0] + share[1] * values[1] + share[2] * values[2]
             return values[0] + values[1] + values[2]
@@ -111,12 +116,12 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for electrodes off the boundary, wider than it, or overlapping."""
+        """Raise `ValueError` for electrodes that lie off the boundary, are wider than it, or overlap."""
         check_dimension("BoundaryElectrodes", mesh, 2)
         if not has_values(self.position, self.width, mesh):
             return
         position, width, mesh = on_host((self.position, self.width, mesh))
-        distance, (start, end) = _project(position, mesh)[2], _covered(position, width, mesh)
+        distance, (start, end) = _project(position, mesh)[2], _covered_intervals(position, width, mesh)
         far = np.flatnonzero(distance > np.maximum(0.5 * width, 2e-3 * np.ptp(mesh.points, axis=0).max()))
         if far.size:
             raise ValueError(
@@ -141,7 +146,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
 
 
 def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of electrodes that cover a common piece of an edge, given intervals (3, b, L) along each edge."""
+    """Pairs of electrodes that cover a common part of an edge, given the covered intervals (3, b, L) of each edge."""
     start, end = start.transpose(2, 1, 0), end.transpose(2, 1, 0)
     pairs = []
     for first in range(start.shape[0]):
@@ -155,14 +160,14 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
 
 
 def _arc(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
-    """Points (k, 2) of the piece of outline of length `width` in metres round the point nearest to `centre`."""
+    """Points (k, 2) of the arc of the boundary with length `width` in metres around the point nearest to `centre`."""
     points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
     ends = points[facets]
     along = ends[:, 1] - ends[:, 0]
     squared = np.sum(along**2, axis=1)
     fraction = np.clip(np.sum((centre - ends[:, 0]) * along, axis=1) / squared, 0, 1)
     nearest = np.argmin(np.sum((ends[:, 0] + fraction[:, None] * along - centre) ** 2, axis=1))
-    # The loop that holds this edge, unrolled into vertices by arc length from its beginning.
+    # The loop that contains this edge, as vertices with their arc length from the start of the loop.
     loop = np.cumsum(np.concatenate([[0], facets[1:, 0] != facets[:-1, 1]]))
     edges = np.flatnonzero(loop == loop[nearest])
     length = np.sqrt(squared[edges])
@@ -177,11 +182,12 @@ def _arc(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
 
 @either_engine
 def _project(position, mesh: Mesh):
-    """Nearest boundary facet (L,) of each position, how far along it the foot point lies (L,), and its distance (L,).
+    """Nearest boundary facet (L,) of each position, arc length (L,) of the foot point along it, and distance (L,).
 
-    The foot point p(t) on an edge is where the offset is perpendicular to the tangent interpolated between the edge's
-    corners, τ(t) = (1-t)τ_0 + tτ_1, each the bisector of the two edges that meet there. On the edge itself that is the
-    ordinary projection; and unlike that one it has a continuous derivative where an electrode slides over a corner.
+    The foot point p(t) on an edge is where the offset is perpendicular to the tangent τ(t) = (1-t)τ_0 + tτ_1,
+    interpolated between the corners of the edge; the tangent at a corner bisects those of the two edges that meet
+    there. For positions on the edge this is the ordinary projection, but its derivative is continuous where an
+    electrode slides across a corner.
     """
     xp = namespace(position, mesh)
     corners = mesh.points[mesh.facets]
@@ -199,7 +205,8 @@ def _project(position, mesh: Mesh):
     before, middle, after = (_normalised(corners[:, 1] - corners[:, 0])[index] for index in (before, facet, after))
     first, second = _normalised(before + middle), _normalised(middle + after)
     offset = position - corners[facet, 0]
-    # (offset - t along)·τ(t) = 0 is constant + linear t + quadratic t² = 0; the root that is regular as quadratic → 0.
+    # (offset - t along)·τ(t) = 0 reads constant + linear t + quadratic t² = 0; take the root that is regular as
+    # quadratic → 0.
     constant = _dot(offset, first)
     linear = _dot(offset, second - first) - _dot(along, first)
     quadratic = -_dot(along, second - first)
@@ -208,7 +215,8 @@ def _project(position, mesh: Mesh):
 
 
 def _dot(first, second):
-    """Products of vectors in the plane, written out: XLA makes a slow matrix product of a sum over so short an axis."""
+    """Dot products of plane vectors, as an explicit sum, because XLA converts a sum over such a short axis into a slow
+    matrix product."""
     return first[..., 0] * second[..., 0] + first[..., 1] * second[..., 1]
 
 
@@ -217,10 +225,11 @@ def _normalised(vectors):
 
 
 @either_engine
-def _covered(position, width, mesh: Mesh):
-    """Interval of each edge that each electrode covers: start and end (3, b, L), zero ≤ start ≤ end ≤ length.
+def _covered_intervals(position, width, mesh: Mesh):
+    """Interval of each edge that each electrode covers: start and end (3, b, L), with 0 ≤ start ≤ end ≤ length.
 
-    The first axis goes round the loop: an electrode may lie across the point where arc length begins.
+    The first axis counts turns around the loop, because an electrode may extend across the point where arc length
+    starts.
     """
     xp = namespace(position, width, mesh)
     length = facet_measures(mesh)

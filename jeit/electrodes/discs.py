@@ -1,4 +1,4 @@
-"""Disc electrodes inside a sheet, and on surfaces in space."""
+"""Disc electrodes inside a sheet, on faces of a 3-D body, and on surfaces in space."""
 
 import equinox as eqx
 import jax
@@ -22,14 +22,15 @@ from jeit.mesh.geodesic import Triangles, unfold
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, host, namespace, on_host, sum_into, undifferentiated, values_at_once
 
-# Half-width of a window's edge, as a share of the local cell size. Smaller is closer to the sharp electrode, until
-# the edge falls between the quadrature points; see tests/electrodes for its convergence.
+# Half-width of the smooth edge of a disc's window, relative to the local cell size. Smaller values approximate the
+# sharp electrode better, until the edge falls between quadrature points; see tests/electrodes for the convergence.
 EDGE = 0.5
 _MOST_AT_ONCE = 8
 
 
 def triangle_quadrature(order: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Jacobi rule on a triangle: barycentric points (order², 3) and weights (order²,) that sum to one.
+    """Gauss-Jacobi rule on a triangle: barycentric coordinates of points (order², 3), and weights (order²,) that sum to
+    one.
 
     Exact for polynomials of degree 2·order - 1 (the collapsed-square rule; Stroud 1971).
     """
@@ -43,20 +44,21 @@ def triangle_quadrature(order: int = 5) -> tuple[np.ndarray, np.ndarray]:
 
 
 def smooth_step(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Rises from 0 at x ≤ -1 to 1 at x ≥ 1 with two continuous derivatives; odd about (0, 1/2)."""
+    """Smooth step from 0 at x ≤ -1 to 1 at x ≥ 1, with two continuous derivatives; odd about (0, 1/2)."""
     t = namespace(x).clip((x + 1) / 2, 0, 1)
     return t**3 * (10 - 15 * t + 6 * t**2)
 
 
 def nearest_electrodes(middles, position, radius) -> Int[Array, "q k"]:
-    """Electrodes (q, k) that can reach the triangles with these `middles` (q, d), k being 8 unless there are fewer.
+    """Indices (q, k) of the electrodes that may reach each of the triangles with centroids `middles` (q, d); k is 8, or
+    the number of electrodes if smaller.
 
-    Of round electrodes, `position` (L, d) and `radius` (L,), that do not overlap, no more than that reach a triangle,
-    unless it is so much larger than they are that the mesh is refused. Not differentiated.
+    At most 8 non-overlapping round electrodes, with `position` (L, d) and `radius` (L,), reach a triangle, unless it is
+    so much larger than they are that the mesh is rejected. Not differentiated.
     """
     xp = namespace(middles, position, radius)
     distance = xp.sum((middles[:, None] - position) ** 2, axis=-1) - radius**2
-    distance = undifferentiated(distance).astype(np.float32)  # the order of the farthest does not matter
+    distance = undifferentiated(distance).astype(np.float32)  # the order of distant ones does not matter
     number = min(_MOST_AT_ONCE, len(radius))
     if xp is np:
         return host.argsort(distance, axis=1, kind="stable")[:, :number]
@@ -73,7 +75,7 @@ def window_contact(
 ) -> Contact:
     """Contact integrals from window values at the p quadrature points of q triangles.
 
-    `measure`: areas of the triangles; `window`: share that each `electrode` covers of each quadrature point.
+    `measure`: areas of the triangles; `window`: covered fraction of each quadrature point, for each `electrode`.
     """
     barycentric, weights = triangle_quadrature()
     current = measure[:, None, None] * weights * window / contact_impedance[electrode][..., None]
@@ -94,7 +96,7 @@ class AbstractDiscs(AbstractPlacedElectrodes):
         return {"position": self.position, "radius": self.radius}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Discs, and dots for those on walls."""
+        """Draw discs, or dots for electrodes on walls."""
         flat = seen_flat(mesh, self.position)
         for place, radius, whole in zip(np.asarray(self.position), np.asarray(self.radius), flat, strict=True):
             if whole:
@@ -104,12 +106,12 @@ class AbstractDiscs(AbstractPlacedElectrodes):
 
 
 class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
-    """Complete electrodes that are discs inside a sheet (2-D mesh), free of its nodes.
+    """Complete electrodes that are discs inside a sheet (2-D mesh), independent of its nodes.
 
-    The disc's indicator function is replaced by a smooth window whose edge is half a cell wide, so integrals are
-    differentiable in position and radius and converge to the sharp disc as the mesh is refined.
+    The indicator function of the disc is replaced by a smooth window whose edge is half a cell wide, so that the
+    integrals are differentiable in position and radius and converge to those of the sharp disc as the mesh is refined.
 
-    **Fields**: `position` (L, 2) metres; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
+    **Fields**: `position` (L, 2): metres; `radius` (L,): metres; `contact_impedance` (L,): ohm·m².
     """
 
     position: Float[Array, "L 2"]
@@ -117,16 +119,17 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
-        """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
+        values."""
         self.position, self.radius, self.contact_impedance = as_discs(position, 2, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Cells of 0.7 of the smallest radius on them."""
+        """Refine cells on the electrodes to 0.7 times the smallest radius."""
         radius = np.asarray(self.radius)
         return (Refine(np.asarray(self.position), cell_size=0.7 * radius.min(), distance=float(radius.max())),)
 
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
-        """Along x and along y."""
+        """Unit vectors along x and along y."""
         return np.broadcast_to(np.eye(2), (self.num_electrodes, 2, 2))
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
@@ -146,19 +149,20 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         return window_contact(mesh.cells, area, window, near, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for discs off the sheet, overlapping, or too small for the mesh."""
+        """Raise `ValueError` for discs that lie off the sheet, overlap, or are too small for the mesh."""
         check_dimension("SheetDiscs", mesh, 2)
         check_discs(self, mesh, measures(mesh))
 
 
 class FaceDiscs(AbstractDiscs):
-    """Complete electrodes that are discs on flat or curved faces of a 3-D mesh, free of its nodes.
+    """Complete electrodes that are discs on flat or curved faces of a 3-D mesh, independent of its nodes.
 
-    On a curved face a disc covers what lies within `radius` of its position in a straight line, as cut out by a ball.
-    With a radius of curvature R its rim is then, along the surface, radius² / 24 R² farther out: 0.3 % for a disc of
-    R / 4, 1 % of R / 2. Discs up to R are covered whole.
+    On a curved face a disc covers the points within a straight distance `radius` of its position, as cut out by a ball.
+    On a face with radius of curvature R, its radius measured along the surface is then larger by the fraction radius² /
+    24 R²: 0.3 % for a radius of R / 4, 1 % for R / 2. Discs with radii up to R are covered completely.
 
-    **Fields**: `position` (L, 3) metres, on the surface; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
+    **Fields**: `position` (L, 3): points on the surface, metres; `radius` (L,): metres; `contact_impedance` (L,):
+    ohm·m².
     """
 
     position: Float[Array, "L 3"]
@@ -166,11 +170,12 @@ class FaceDiscs(AbstractDiscs):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
-        """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
+        values."""
         self.position, self.radius, self.contact_impedance = as_discs(position, 3, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """None: they are not of a plane mesh."""
+        """Empty, because the electrodes do not lie on a plane mesh."""
         return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
@@ -193,33 +198,33 @@ class FaceDiscs(AbstractDiscs):
         )
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for discs off the surface, overlapping, or too small for the mesh."""
+        """Raise `ValueError` for discs that lie off the surface, overlap, or are too small for the mesh."""
         check_dimension("FaceDiscs", mesh, 3)
         check_discs(self, mesh, facet_measures(mesh))
 
 
 def as_discs(position, dimension: int, radius, contact_impedance):
-    """Positions (L, d) and radii (L,) in metres and contact impedances (L,) in ohm·m², checked."""
+    """Check and convert positions (L, d) and radii (L,) in metres and contact impedances (L,) in ohm·m²."""
     position = as_positions(position, (dimension,))
     radius = as_electrode_values("radius", radius, len(position), unit="metres")
     return position, radius, as_electrode_values("contact_impedance", contact_impedance, len(position), unit="ohm·m²")
 
 
 def disc_window(points, position, radius, edge):
-    """Share (q, k, p) that discs at `position` (q, k, d) with `radius` (q, k) cover of quadrature points (q, p, d);
-    `edge` (q,) is the half-width of theirs."""
+    """Fraction (q, k, p) of quadrature points (q, p, d) covered by discs at `position` (q, k, d) with `radius` (q, k);
+    `edge` (q,) is the half-width of the smooth edge."""
     return window_within(squared_distances(points, position), radius, edge)
 
 
 def squared_distances(points, position):
-    """Squared distances of quadrature points (q, p, d) from `position` (q, k, d): (q, k, p), m²."""
+    """Squared distances (q, k, p), m², of quadrature points (q, p, d) from `position` (q, k, d)."""
     return sum((points[:, None, :, i] - position[..., None, i]) ** 2 for i in range(points.shape[-1]))
 
 
 def window_within(squared, radius, edge):
-    """The window of points whose distances have these squares (q, k, p), m²."""
+    """Window of a disc at points with squared distances (q, k, p), m², from its centre."""
     radius = radius[..., None]
-    # r² - ρ² = (r - ρ)(r + ρ) spares the square root, whose derivative does not exist at the centre.
+    # r² - ρ² = (r - ρ)(r + ρ) avoids the square root, which is not differentiable at the centre.
     return smooth_step((radius**2 - squared) / (2 * radius * edge[:, None, None]))
 
 
@@ -232,7 +237,7 @@ def facet_normals(mesh: Mesh) -> Float[Array, "b 3"]:
 
 
 def seen_flat(mesh: Mesh, position: Float[Array, "L d"]) -> Bool[np.ndarray, " L"]:
-    """Whether what lies at each position is seen at its full size from above: in a sheet, and on horizontal faces."""
+    """Whether the surface at each position appears undistorted from above: in a sheet, and on horizontal faces."""
     if mesh.dimension == 2:
         return np.ones(len(position), bool)
     centres, normals = np.asarray(mesh.points)[np.asarray(mesh.facets)].mean(axis=1), np.asarray(facet_normals(mesh))
@@ -240,15 +245,17 @@ def seen_flat(mesh: Mesh, position: Float[Array, "L d"]) -> Bool[np.ndarray, " L
 
 
 def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " L"]) -> Float[Array, "b L"]:
-    """1 for boundary triangles of the face that an electrode lies on, round an edge of the body too, 0 for others.
+    """Matrix (b, L): 1 for boundary triangles on the face of an electrode, also around an edge of the body, otherwise
+    0.
 
-    Keeps an electrode on a thin layer from reaching through to the other face. On a face with a radius of curvature R,
-    triangles at the rim of a disc, a chord r away, have planes that pass r² / 2R from its centre, and are turned by
-    2 arcsin(r / 2R): half of r, and 60°, where the disc is as large as R. Not differentiated.
+    This keeps an electrode on a thin layer from reaching through to the opposite face. On a face with radius of
+    curvature R, the plane of a triangle at the rim of a disc of radius r passes r² / 2R from the disc's centre and is
+    rotated by 2 arcsin(r / 2R); for r = R these are r / 2 and 60°. Not differentiated.
     """
     normal, corner = facet_normals(mesh), mesh.points[mesh.facets[:, 0]]
     height = abs(normal @ position.T - (normal * corner).sum(axis=1)[:, None])
-    # Beside an edge of the body the nearest triangle may be round it, but its plane is not.
+    # Near an edge of the body the nearest triangle may lie on the adjacent face; its plane, however, is far from the
+    # position.
     own = nearest_facets(mesh, position, 100 * height.T**2)
     facing = normal @ normal[own].T
     curved = (height < 0.55 * radius) & (facing > 0.45)
@@ -258,19 +265,20 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " 
 def nearest_facets(
     mesh: Mesh, position: Float[Array, "L 3"], handicap: Float[Array, "L b"] | float = 0.0
 ) -> Int[Array, " L"]:
-    """The boundary triangle with the nearest middle to each position; of equally near ones the first.
+    """Boundary triangle with the nearest centroid to each position; among equally near triangles, the first.
 
-    `handicap` (L, b): what is added to the squares of distances, m².
+    `handicap` (L, b): m², added to the squared distances.
     """
     xp = namespace(mesh, position)
     centres = mesh.points[mesh.facets].mean(axis=1)
     apart = xp.sum((position[:, None] - centres) ** 2, axis=-1) + handicap
-    # Equally near, whatever the unit of length rounds to.
+    # A tolerance for ties, so that the result does not depend on rounding in the unit of length.
     return xp.argmax(apart <= (1 + 1e-9) * apart.min(axis=1, keepdims=True), axis=1)
 
 
 def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
-    """Raise `ValueError` unless every disc lies on the mesh, apart from the others, and spans enough cells."""
+    """Raise `ValueError` unless every disc lies on the mesh, separate from the others, and is large enough for the
+    cells."""
     if not has_values(electrodes, mesh):
         return
     electrodes, mesh = on_host((electrodes, mesh))
@@ -299,21 +307,23 @@ def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
             raise ValueError(f"radius: {where} is too small for the mesh there; refine the mesh around it.")
 
 
-# Cosine of the angle between normals: a disc as large as the surface's radius of curvature turns by one radian.
+# Minimum cosine of the angle between normals within a disc: the normal turns by one radian along a radius equal to the
+# radius of curvature.
 _FACING = float(np.cos(1.0))
 
 
 class SurfaceDiscs(AbstractDiscs):
-    """Complete electrodes that are discs in a curved sheet, a surface of triangles in space, free of its nodes.
+    """Complete electrodes that are discs in a curved sheet, a surface of triangles in space, independent of its nodes.
 
-    `SheetDiscs` of curved sheets. Where the surface round its middle can be laid flat without stretching, as bent
-    sheets and tubes can, a disc is the part of the surface within its radius along the surface: exactly, so that
-    bending changes nothing. Elsewhere the ways by which triangles can be laid into a plane disagree, and a disc is the
-    part of the surface within its radius straight through space that faces as its middle does: with a radius of
-    curvature R longer along the surface by a part radius² / 24 R², and nothing of what lies opposite. Differentiable in
-    position, of which only moves along the surface count: a move off it changes nothing to first order.
+    These are the `SheetDiscs` of curved sheets. Where the surface around the centre is developable, as in bent sheets
+    and tubes, a disc consists exactly of the points within a geodesic distance of its radius, so bending does not
+    change the integrals. Elsewhere a disc consists of the points within a straight distance of its radius whose normals
+    point to the same side as at its centre; with radius of curvature R, its radius along the surface is larger by the
+    fraction radius² / 24 R². Differentiable in position along the surface; a displacement off it has no first-order
+    effect.
 
-    **Fields**: `position` (L, 3) metres, on the surface; `radius` (L,) metres; `contact_impedance` (L,) ohm·m².
+    **Fields**: `position` (L, 3): points on the surface, metres; `radius` (L,): metres; `contact_impedance` (L,):
+    ohm·m².
     """
 
     position: Float[Array, "L 3"]
@@ -321,11 +331,12 @@ class SurfaceDiscs(AbstractDiscs):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, position: ArrayLike, radius: ArrayLike, contact_impedance: ArrayLike):
-        """`radius` and `contact_impedance` may be one number for all electrodes. Raises `ValueError`."""
+        """`radius` and `contact_impedance` may each be one number for all electrodes. Raises `ValueError` for invalid
+        values."""
         self.position, self.radius, self.contact_impedance = as_discs(position, 3, radius, contact_impedance)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """None: they are not of a plane mesh."""
+        """Empty, because the electrodes do not lie on a plane mesh."""
         return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
@@ -356,8 +367,8 @@ class SurfaceDiscs(AbstractDiscs):
         return window_contact(mesh.cells, area, window, near, self.contact_impedance, mesh.num_points)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for discs off the surface, over its edge, as large as its radius of curvature,
-        overlapping, or too small for the mesh."""
+        """Raise `ValueError` for discs that lie off the surface, extend over its border, are as large as its radius of
+        curvature, overlap, or are too small for the mesh."""
         if not mesh.is_surface:
             raise ValueError("SurfaceDiscs live on a surface in space, and this mesh is none; see jeit.mesh.tube.")
         if not has_values(self, mesh):
@@ -368,8 +379,8 @@ class SurfaceDiscs(AbstractDiscs):
 
 
 def check_on_surface(position, radius, surface: Triangles) -> None:
-    """Raise `ValueError` for discs at `position` (L, 3) of `radius` (L,), metres, farther off the surface than they are
-    large, over its edge, and as large as its radius of curvature."""
+    """Raise `ValueError` for discs at `position` (L, 3) with `radius` (L,), metres, that are farther from the surface
+    than their radius, extend over its border, or are as large as its radius of curvature."""
     position, radius = np.asarray(position), np.asarray(radius)
     at = surface.nearest(position)
     border = surface.distance_to_border(at.points)

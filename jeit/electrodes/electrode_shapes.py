@@ -1,4 +1,4 @@
-"""Electrodes by the shapes they have in a description, and electrodes of several kinds together."""
+"""Combination of several kinds of electrodes, and shapes of electrodes as polygons for drawing."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from jeit_solvers.engines import namespace, values_at_once
 
 
 class CombinedElectrodes(AbstractCompleteElectrodes):
-    """Complete electrodes of several kinds, numbered one kind after the other.
+    """Complete electrodes of several kinds, numbered consecutively from one kind to the next.
 
-    **Fields**: `parts`, electrodes none of which is a point electrode.
+    **Fields**: `parts`: the electrodes of each kind, not including point electrodes.
     """
 
     parts: tuple[AbstractElectrodes, ...]
 
     def __init__(self, *parts: AbstractElectrodes):
-        """Raises `ValueError` for no parts, or for point electrodes, which have no contact to combine."""
+        """Raises `ValueError` if there are no parts, or for point electrodes, which have no contact to combine."""
         if not parts:
             raise ValueError("CombinedElectrodes needs at least one set of electrodes.")
         for part in parts:
@@ -48,7 +48,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         return namespace(self).concatenate([part.contact_impedance for part in self.parts])
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """The same electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError`."""
+        """Copy with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for invalid values."""
         values = as_electrode_values("contact_impedance", contact_impedance, self.num_electrodes, unit="ohm·m²")
         pieces = jnp.split(values, np.cumsum([part.num_electrodes for part in self.parts])[:-1])
         return CombinedElectrodes(
@@ -56,7 +56,7 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         )
 
     def geometry(self) -> dict[str, Any]:
-        """Every part's own description."""
+        """Descriptions of all parts."""
         return {"parts": [part.describe() for part in self.parts]}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
@@ -65,16 +65,16 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
             part.draw(mesh, pen)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Refinement of all parts."""
+        """Refinements of all parts."""
         return tuple(refine for part in self.parts for refine in part.refinement(body))
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """The facets and cells of all parts."""
+        """Nodes of the facets and cells of all parts."""
         return tuple(nodes for part in self.parts for nodes in part.contact_nodes(mesh))
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """Contact integrals of all parts, side by side."""
+        """Contact integrals of all parts, concatenated."""
         contacts = [part.contact(mesh) for part in self.parts]
         return Contact(
             tuple(nodes for contact in contacts for nodes in contact.nodes),
@@ -83,22 +83,23 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
         )
 
     def check(self, mesh: Mesh) -> None:
-        """Check every part on its own; raises `ValueError` as they do."""
+        """Check every part on its own. Raises `ValueError` as the parts do."""
         for part in self.parts:
             part.check(mesh)
 
 
 _ROUND, _SIDE = 32, 8
-# Triangles of a surface near a corner among which it is laid on one.
+# Number of triangles near a point, by nearest centroids, that are searched when it is projected onto the surface.
 _NEAR = 24
 
 
 @dataclass(frozen=True)
 class ElectrodeShapes:
-    """Polygons that electrodes are drawn as, one or more each.
+    """Polygons for drawing electrodes, one or more per electrode.
 
-    **Fields**: `corners` (q, d) metres, of all polygons one after the other, counter-clockwise seen from outside in
-    space; a dot has one; `sizes` (p,), how many are each polygon's; `electrode` (p,), whose it is, from 0.
+    **Fields**: `corners` (q, d): corners of all polygons in turn, metres, in space counter-clockwise as seen from
+    outside; a dot has a single corner; `sizes` (p,): number of corners of each polygon; `electrode` (p,): index of the
+    electrode that each polygon belongs to.
     """
 
     corners: Float[np.ndarray, "q d"]
@@ -111,7 +112,7 @@ class ElectrodeShapes:
         return int(self.electrode.max()) + 1 if len(self.electrode) else 0
 
     def polygons(self) -> list[Float[np.ndarray, "k d"]]:
-        """The corners of each."""
+        """Corners of each polygon."""
         return np.split(self.corners, np.cumsum(self.sizes)[:-1])
 
     def middles(self) -> Float[np.ndarray, "L d"]:
@@ -122,7 +123,7 @@ class ElectrodeShapes:
 
 
 def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
-    """The polygons of `electrodes` on `mesh`: a solid, a surface in space or a plane mesh."""
+    """Polygons of `electrodes` on `mesh`: a solid, a surface in space or a plane mesh."""
     polygons: list[np.ndarray] = []
     owner: list[int] = []
     for number, of_one in enumerate(_all_polygons(mesh, electrodes)):
@@ -132,7 +133,7 @@ def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
 
 
 def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.ndarray]]:
-    """The polygons of each electrode."""
+    """Polygons of each electrode."""
     points = np.asarray(mesh.points)
     if points.shape[1] == 2:
         pen = _PlanePen()
@@ -174,12 +175,12 @@ def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.nd
 
 
 def surface_triangles(mesh: Mesh) -> Int[np.ndarray, "m 3"]:
-    """The boundary of a solid, or the cells of a surface in space."""
+    """Boundary triangles of a solid, or cells of a surface in space."""
     return np.asarray(mesh.facets if mesh.cells.shape[1] == 4 else mesh.cells)
 
 
 class Draped:
-    """A surface of triangles that flat shapes are laid on: `points` (n, 3), `triangles` (m, 3)."""
+    """A surface of triangles onto which flat shapes are projected: `points` (n, 3), `triangles` (m, 3)."""
 
     def __init__(self, points: Float[np.ndarray, "n 3"], triangles: Int[np.ndarray, "m 3"]):
         self._corners = points[triangles]
@@ -188,11 +189,11 @@ class Draped:
         self._tree = KDTree(self._corners.mean(axis=1))
 
     def normals(self, places: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3"]:
-        """Outward normals of the nearest triangle."""
+        """Outward normals of the triangle nearest to each point."""
         return self._normal[self._tree.query(places)[1]]
 
     def frames(self, places: Float[np.ndarray, "L 3"]) -> Float[np.ndarray, "L 3 3"]:
-        """Unit vectors at each place: outward, across (horizontal) and up, as `FacePatches` have them."""
+        """Unit vectors at each point: outward, horizontal and upward, as in `FacePatches`."""
         normal = self.normals(places)
         upward = np.where(np.abs(normal[:, 2:]) > 0.9, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
         across = np.cross(upward, normal)
@@ -200,7 +201,8 @@ class Draped:
         return np.stack([normal, across, np.cross(normal, across)], axis=1)
 
     def laid_on(self, places: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
-        """Places moved along the normal onto the triangle that they meet first, as far as they meet one."""
+        """Project points along the normal onto the nearest triangle in that direction; points that meet no triangle are
+        returned unchanged."""
         near = self._tree.query(places, k=min(_NEAR, len(self._corners)))[1].reshape(len(places), -1)
         corners = self._corners[near]
         edge, other = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
@@ -222,7 +224,7 @@ class Draped:
 
 
 class _PlanePen:
-    """Draws electrodes of a plane mesh as polygons: arcs as lines of two corners."""
+    """Pen that collects the electrodes of a plane mesh as polygons; arcs become segments with two corners."""
 
     def __init__(self):
         self.drawn: list[list[np.ndarray]] = []

@@ -15,17 +15,17 @@ from jeit_solvers.engines import as_array, has_values, namespace
 
 
 class Contact(eqx.Module):
-    """The contact integrals of a set of L electrodes on a mesh, divided by contact impedance.
+    """Contact integrals of a set of L electrodes on a mesh, divided by contact impedance.
 
-    In the complete electrode model every electrode l adds the energy (1/z_l) ∫_l (u - U_l)²; with P1 basis
-    functions φ that needs three things:
+    In the complete electrode model every electrode l adds the energy (1/z_l) ∫_l (u - U_l)². With P1 basis functions φ
+    it is determined by:
 
-    - `mass`: Σ_l (1/z_l) ∫ φ_i φ_j over the q facets or cells of k nodes that electrodes may touch, (q, k, k) in
-      siemens, and their `nodes` (q, k); one pair of arrays for each kind of electrode;
-    - `load` (n, L): (1/z_l) ∫ φ_i, in siemens, whose column sums are |e_l| / z_l.
+    - `mass` (q, k, k), in siemens: Σ_l (1/z_l) ∫ φ_i φ_j over the q facets or cells, with k nodes each, that electrodes
+      may touch, and `nodes` (q, k): their nodes; one pair of arrays for each kind of electrode;
+    - `load` (n, L), in siemens: (1/z_l) ∫ φ_i, with column sums |e_l| / z_l.
 
-    Point electrodes have no contact energy: `load` holds φ_i at the electrode, without unit, and `nodes` only names the
-    node that the forward model grounds, with zero mass.
+    Point electrodes have no contact energy: `load` contains φ_i at the electrode, dimensionless; `mass` is zero, and
+    `nodes` only contains the node that the forward model grounds.
     """
 
     nodes: tuple[Int[Array, "q k"], ...]
@@ -34,26 +34,28 @@ class Contact(eqx.Module):
 
 
 class ElectrodePen(Protocol):
-    """Interface to draw electrodes, as seen from above: one stroke each, round its middle (d,), all in metres."""
+    """Interface to draw electrodes as seen from above, with one stroke per electrode; `middle` (d,) is its centre. All
+    lengths are in metres."""
 
     def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
-        """An electrode on the edge of a sheet, which covers these lines (k, 2) of it."""
+        """Draw an electrode on the edge of a sheet, which covers the polylines `pieces`, each (k, 2)."""
 
     def disc(self, middle: np.ndarray, radius: float) -> None:
-        """A disc."""
+        """Draw a disc."""
 
     def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
-        """A rectangle, its sides along x and y."""
+        """Draw a rectangle with sides along x and y."""
 
     def dot(self, middle: np.ndarray) -> None:
-        """An electrode without a size, or one whose shape is not seen from above."""
+        """Draw an electrode without a size, or one whose shape is not visible from above."""
 
 
 class AbstractElectrodes(eqx.Module):
-    """Base of all electrodes, which compute contact integrals on a mesh."""
+    """Base of all electrodes; they compute contact integrals on a mesh."""
 
     contact_impedance: eqx.AbstractVar[Float[Array, " L"]]
-    """(L,) ohm·m² (ohm·m for arcs on the edge of a sheet). Point electrodes have none: `AttributeError`."""
+    """Contact impedances (L,), ohm·m² (ohm·m for arcs on the edge of a sheet). Raises `AttributeError` for point
+    electrodes, which have none."""
 
     @property
     @abc.abstractmethod
@@ -67,7 +69,8 @@ class AbstractElectrodes(eqx.Module):
 
     @abc.abstractmethod
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """Nodes of the facets or cells that may carry contact mass, as in `Contact.nodes`; the mesh alone decides."""
+        """Nodes of the facets or cells that may have contact mass, as in `Contact.nodes`; they depend on the mesh
+        only."""
 
     @abc.abstractmethod
     def contact(self, mesh: Mesh) -> Contact:
@@ -75,38 +78,38 @@ class AbstractElectrodes(eqx.Module):
 
     @abc.abstractmethod
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` where these electrodes do not fit `mesh`. Does nothing on traced values."""
+        """Raise `ValueError` if the electrodes do not fit `mesh`. Traced values are not checked."""
 
     @abc.abstractmethod
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> "AbstractElectrodes":
-        """The same electrodes with other contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
+        """Copy with other contact impedances, one number or (L,), ohm·m² (ohm·m for arcs).
 
-        Raises `ValueError` for point electrodes, which have none.
+        Raises `ValueError` for point electrodes, which have no contact impedance.
         """
 
     @abc.abstractmethod
     def geometry(self) -> dict[str, Any]:
-        """Positions and sizes of the electrodes: names and values of the fields, metres."""
+        """Positions and sizes of the electrodes in metres, by the names of the fields."""
 
     @abc.abstractmethod
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Draw every electrode on `mesh` in one stroke, in their order, as seen from above."""
+        """Draw the electrodes on `mesh` in order, as seen from above, with one stroke each."""
 
     @abc.abstractmethod
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Refinement of a plane mesh made for the electrodes; empty where it is not known."""
+        """Refinement of a plane mesh for the electrodes; empty if unknown."""
 
     def describe(self) -> dict[str, Any]:
-        """Kind, number, places and sizes in metres."""
+        """Kind, number, positions and sizes; lengths in metres."""
         return {"kind": type(self).__name__, "number": self.num_electrodes, **self.geometry(), "unit": "m"}
 
 
 class AbstractCompleteElectrodes(AbstractElectrodes):
-    """Base of electrodes of the complete model: they have a size, and a contact impedance for each."""
+    """Base of complete electrodes, each of which has a size and a contact impedance."""
 
     @property
     def is_point(self) -> bool:
-        """False."""
+        """False: complete electrodes have a size."""
         return False
 
     @property
@@ -116,12 +119,12 @@ class AbstractCompleteElectrodes(AbstractElectrodes):
 
 
 class AbstractPlacedElectrodes(AbstractCompleteElectrodes):
-    """Base of complete electrodes at positions of their own, whatever the nodes of the mesh."""
+    """Base of complete electrodes whose positions are independent of the nodes of the mesh."""
 
     position: eqx.AbstractVar[Float[Array, "L d"]]
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """The same electrodes with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError`."""
+        """Copy with other contact impedances, ohm·m² (ohm·m for arcs). Raises `ValueError` for invalid values."""
         return replace_contact_impedance(self, contact_impedance)
 
 
@@ -130,7 +133,7 @@ class AbstractMovableElectrodes(AbstractPlacedElectrodes):
 
     @abc.abstractmethod
     def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
-        """Unit vectors (L, a, 2) of the a ways in which each electrode can move on `mesh`."""
+        """Unit vectors (L, a, 2) along the a directions in which each electrode can move on `mesh`."""
 
 
 class AbstractPointElectrodes(AbstractElectrodes):
@@ -138,33 +141,33 @@ class AbstractPointElectrodes(AbstractElectrodes):
 
     @property
     def is_point(self) -> bool:
-        """True."""
+        """True: point electrodes have no size."""
         return True
 
     @property
     def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Raises `AttributeError`: there is none."""
+        """Raises `AttributeError`: point electrodes have no contact impedance."""
         raise AttributeError(f"{type(self).__name__} have no contact impedance.")
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractElectrodes:
-        """Raises `ValueError`: there is none."""
+        """Raises `ValueError`: point electrodes have no contact impedance."""
         raise ValueError(f"{type(self).__name__} have no contact impedance.")
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
-        """Node 0, where the potential is grounded: point electrodes have no contact mass."""
+        """Node 0, where the potential is grounded; point electrodes have no contact mass."""
         return (namespace(mesh).zeros((1, 1), mesh.cells.dtype),)
 
 
 def replace_contact_impedance(
     electrodes: AbstractCompleteElectrodes, contact_impedance: ArrayLike
 ) -> AbstractCompleteElectrodes:
-    """Electrodes whose field `contact_impedance` (L,) is another, one number or (L,). Raises `ValueError`."""
+    """Copy electrodes with another `contact_impedance`, one number or (L,). Raises `ValueError` for invalid values."""
     values = as_electrode_values("contact_impedance", contact_impedance, electrodes.num_electrodes, unit="ohm·m²")
     return eqx.tree_at(lambda each: each.contact_impedance, electrodes, values)
 
 
 def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) -> Float[Array, " L"]:
-    """Broadcast a positive scalar or (L,) argument to (L,) floats; `ValueError` if it cannot be that."""
+    """Broadcast a positive number or array (L,) to floats (L,). Raises `ValueError` if that is impossible."""
     if has_values(values):
         values = real_array(
             name, values, f"one number for all electrodes or one for each of the {num_electrodes}, in {unit}"
@@ -188,7 +191,8 @@ def as_electrode_values(name: str, values, num_electrodes: int, *, unit: str) ->
 
 
 def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
-    """Check and convert electrode positions (L, d) in metres, d one of `dimensions`; `ValueError`."""
+    """Check and convert electrode positions (L, d) in metres; `dimensions` contains the allowed d. Raises `ValueError`
+    for other shapes, NaN and infinity."""
     position = as_array(position, float)
     if position.ndim != 2 or position.shape[1] not in dimensions or position.shape[0] == 0:
         wanted = " or ".join(f"(L, {d})" for d in dimensions)
@@ -200,7 +204,7 @@ def as_positions(position, dimensions: tuple[int, ...]) -> Float[Array, "L d"]:
 
 
 def check_dimension(electrodes: str, mesh: Mesh, dimension: int) -> None:
-    """Raise unless the mesh is of the kind that these electrodes live on, in as many coordinates as `dimension`."""
+    """Raise `ValueError` for a surface in space, and for a mesh of another dimension than `dimension`."""
     if mesh.is_surface:
         raise ValueError(
             f"{electrodes} do not live on a surface in space; PointElectrodes and NodeElectrodes do, plates along its "

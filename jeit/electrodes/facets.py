@@ -1,10 +1,12 @@
-"""Electrodes as groups of boundary facets, and integrals over what a rectangle covers of triangles.
+"""Electrodes that consist of boundary facets, and integrals over the part of a triangle that a rectangle covers.
 
-Integrals of P1 functions over what a rectangle covers of triangles: exact, and differentiable in both.
+The integrals of P1 functions over the intersection of a triangle and a rectangle are exact, and differentiable in the
+coordinates of both.
 
-A triangle is cut by moving the parts beyond a side of the rectangle onto the line of that side. The closed line of its
-edges stays closed: it goes once round the part within, and to and fro along the side, which adds nothing. So every
-triangle becomes a polygon of as many corners, in one array, whose integrals follow from its corners.
+The triangle is clipped by moving the parts beyond a side of the rectangle onto the line of that side. Its closed
+outline remains closed: it surrounds the intersection once and otherwise runs back and forth along the side, which
+contributes nothing. Every triangle thus becomes a polygon with the same number of corners, which fit into one array,
+and the integrals follow from the corners.
 """
 
 from __future__ import annotations
@@ -27,22 +29,24 @@ from jeit.mesh import Body, Mesh, Refine
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, namespace, sum_into, undifferentiated, values_at_once
 
-# Covered share of a triangle that counts as none: it has few correct digits, which would matter for the best contacts.
+# Covered fraction of a triangle below which it counts as zero: it has few correct digits, which would matter for small
+# contact impedances.
 _TOUCHED = 1e-12
 
 
 def covered_moments(
     corners: Float[Array, "*q 3 2"], half_size: Float[Array, "*q 2"]
 ) -> tuple[Float[Array, "*q 3"], Float[Array, "*q 3 3"]]:
-    """∫φ_i and ∫φ_iφ_j over the part of triangles within rectangles |x| ≤ a, |y| ≤ b, relative to the triangle's area.
+    """∫φ_i and ∫φ_iφ_j over the part of triangles within rectangles |x| ≤ a, |y| ≤ b, relative to the area of the
+    triangle.
 
-    `corners`: of the triangles, in the rectangle's own coordinates, metres; `half_size`: (a, b), metres. A triangle
-    that has no area gives numbers without meaning.
+    `corners`: corners of the triangles in the coordinates of the rectangle, metres; `half_size`: (a, b), metres.
+    Results for triangles of zero area are meaningless.
     """
     xp = namespace(corners, half_size)
     outline = corners
     for axis in range(2):
-        outline = _pushed_within(outline, axis, half_size[..., axis])
+        outline = _clip_to_band(outline, axis, half_size[..., axis])
     # Barycentric coordinates of the second and third corner, in which the triangle is (0, 0), (1, 0), (0, 1).
     first, second = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
     offset = outline - corners[..., :1, :]
@@ -50,7 +54,8 @@ def covered_moments(
     place = xp.stack([_cross(offset, second[..., None, :]), _cross(first[..., None, :], offset)], axis=-1)
     place = place / double[..., None]
     following = xp.roll(place, -1, axis=-2)
-    # A fan of triangles from the first corner, whose areas count with their signs; twice, for the triangle's is 1/2.
+    # Signed areas of a fan of triangles from the first corner, doubled, since the area of the reference triangle is
+    # 1/2.
     weight = _cross(place, following)
     ends = [xp.concatenate([1 - one.sum(axis=-1, keepdims=True), one], axis=-1) for one in (place, following)]
     total = ends[0] + ends[1] + np.array([1.0, 0.0, 0.0]).astype(place.dtype)
@@ -58,16 +63,17 @@ def covered_moments(
     corner = np.zeros((3, 3))
     corner[0, 0] = 1
     twice = (twice + weight.sum(axis=-1)[..., None, None] * corner.astype(place.dtype)) / 12
-    # Of what is only touched, rounding is left, which good contacts would make much of: it goes, but not what it grows
-    # by. And each mass has to be the sum of its products to the last digit, for where contacts are good their
-    # difference drives currents.
+    # For triangles that are barely touched, only rounding errors remain, which small contact impedances would amplify:
+    # set the value to zero, but keep its derivative. The load is computed as the sum of the mass, since for small
+    # contact impedances any difference between them would drive currents.
     twice = twice - undifferentiated(xp.where(twice.sum(axis=(-1, -2), keepdims=True) > _TOUCHED, 0, twice))
     twice = (twice + xp.swapaxes(twice, -1, -2)) / 2
     return twice.sum(axis=-1), twice
 
 
-def _pushed_within(outline: Float[Array, "*q k 2"], axis: int, half: Float[Array, "*q"]) -> Float[Array, "*q l 2"]:
-    """Closed lines (…, k, 2) with what is beyond ± `half` along an axis moved there: three corners for each."""
+def _clip_to_band(outline: Float[Array, "*q k 2"], axis: int, half: Float[Array, "*q"]) -> Float[Array, "*q l 2"]:
+    """Move the parts of closed polygons (…, k, 2) beyond ± `half` along an axis to ± `half`; each corner becomes
+    three."""
     xp = namespace(outline, half)
     step = xp.roll(outline, -1, axis=-2) - outline
     along, half = step[..., axis], half[..., None]
@@ -75,7 +81,7 @@ def _pushed_within(outline: Float[Array, "*q k 2"], axis: int, half: Float[Array
     meets = [xp.clip((side * half - outline[..., axis]) / slope, 0, 1) for side in (-1, 1)]
     share = xp.stack([xp.zeros_like(along), xp.minimum(*meets), xp.maximum(*meets)], axis=-1)
     corners = outline[..., None, :] + share[..., None] * step[..., None, :]
-    corners = corners.reshape(*corners.shape[:-3], 3 * corners.shape[-3], 2)  # of no triangle too
+    corners = corners.reshape(*corners.shape[:-3], 3 * corners.shape[-3], 2)  # also if there are no triangles
     own = xp.clip(corners[..., axis], -half, half)
     other = corners[..., 1 - axis]
     return xp.stack([own, other] if axis == 0 else [other, own], axis=-1)
@@ -88,8 +94,8 @@ def _cross(a: Float[Array, "*q 2"], b: Float[Array, "*q 2"]) -> Float[Array, "*q
 class FacetElectrodes(AbstractCompleteElectrodes):
     """Complete electrodes that cover whole boundary facets of a mesh; exact.
 
-    **Fields**: `covers` (b, L), 1 where electrode l covers boundary facet f and 0 elsewhere; `contact_impedance`
-    (L,) ohm·m² (ohm·m in 2-D). Build them from facet indices, from tags (`plates`), or from nodes
+    **Fields**: `covers` (b, L): 1 where electrode l covers boundary facet f, otherwise 0; `contact_impedance` (L,):
+    ohm·m² (ohm·m in 2-D). Create them from facet indices, from tags (`plates`), or from nodes
     (`electrodes_from_nodes`).
     """
 
@@ -97,7 +103,8 @@ class FacetElectrodes(AbstractCompleteElectrodes):
     contact_impedance: Float[Array, " L"]
 
     def __init__(self, mesh: Mesh, facets: Sequence, contact_impedance: ArrayLike):
-        """`facets`: for each electrode the indices into `mesh.facets` that it covers. Raises `ValueError`."""
+        """`facets`: for each electrode, the indices into `mesh.facets` of the facets that it covers. Raises
+        `ValueError` for invalid indices and overlapping electrodes."""
         if not facets:
             raise ValueError("facets is empty; give one list of facet indices for each electrode.")
         num_facets = mesh.facets.shape[0]
@@ -122,7 +129,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         )
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractCompleteElectrodes:
-        """The same electrodes with other contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError`."""
+        """Copy with other contact impedances, ohm·m² (ohm·m in 2-D). Raises `ValueError` for invalid values."""
         return replace_contact_impedance(self, contact_impedance)
 
     def geometry(self) -> dict[str, Array]:
@@ -130,7 +137,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         return {}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """The facets of a plane mesh; dots in their middle on a solid one."""
+        """Draw the facets of a plane mesh; for a solid, a dot in the middle of each electrode."""
         ends, covers = np.asarray(mesh.points)[np.asarray(mesh.facets)], np.asarray(self.covers)
         middles = covers.T @ ends.mean(axis=1) / covers.sum(axis=0)[:, None]
         for covered, middle in zip(covers.T, middles, strict=True):
@@ -140,7 +147,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
                 pen.dot(middle)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """None: they have a mesh."""
+        """Empty, because the electrodes belong to an existing mesh."""
         return ()
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
@@ -162,7 +169,7 @@ class FacetElectrodes(AbstractCompleteElectrodes):
         return Contact((mesh.facets,), (mass,), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` if made for a mesh with another number of boundary facets."""
+        """Raise `ValueError` if the electrodes were made for a mesh with another number of boundary facets."""
         if self.covers.shape[0] != mesh.facets.shape[0]:
             raise ValueError(
                 f"These electrodes were made for a mesh of {self.covers.shape[0]} boundary facets, and this one has "
@@ -171,10 +178,10 @@ class FacetElectrodes(AbstractCompleteElectrodes):
 
 
 def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> FacetElectrodes:
-    """Electrodes that cover whole named faces of a mesh, such as `plates(box(…), ["left", "right"], 0.01)`.
+    """Electrodes that cover whole tagged faces of a mesh, for example `plates(box(…), ["left", "right"], 0.01)`.
 
-    `tags`: names in `mesh.tags`, one for each electrode. `contact_impedance`: ohm·m² (2-D: ohm·m), one number or
-    (L,). Raises `ValueError` for a name the mesh does not have.
+    `tags`: names in `mesh.tags`, one for each electrode. `contact_impedance`: ohm·m² (2-D: ohm·m), one number or (L,).
+    Raises `ValueError` for an unknown name.
     """
     for tag in tags:
         if tag not in mesh.tags:
@@ -185,10 +192,10 @@ def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> Fac
 
 
 def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance: ArrayLike) -> FacetElectrodes:
-    """Complete electrodes that cover the boundary facets whose nodes all belong to them.
+    """Complete electrodes given by nodes: each covers the boundary facets whose nodes all belong to it.
 
-    `nodes`: for each electrode its node indices, counted from 0. `contact_impedance` as in `FacetElectrodes`.
-    For electrodes of one node each use `NodeElectrodes`. Raises `ValueError` where no facet is covered.
+    `nodes`: for each electrode, its node indices, counted from 0. `contact_impedance` as in `FacetElectrodes`. For
+    electrodes with one node each use `NodeElectrodes`. Raises `ValueError` if an electrode covers no facet.
     """
     if not has_values(mesh.facets):
         raise ValueError("electrodes_from_nodes needs a mesh with values, not one that is being traced.")

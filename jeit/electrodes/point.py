@@ -27,10 +27,10 @@ from jeit_solvers.engines import (
 class PointElectrodes(AbstractPointElectrodes):
     """Point electrodes at any position in a mesh, on its boundary, or on a surface in space.
 
-    Current enters and voltage is read by P1 interpolation in the cell that holds the position. The potential of
-    a point source is singular, so voltages at driven electrodes depend on the mesh.
+    Current is injected, and voltage is measured, by P1 interpolation in the cell that contains the position. The
+    potential of a point source is singular, so voltages at driven electrodes depend on the mesh.
 
-    **Fields**: `position` (L, d) metres.
+    **Fields**: `position` (L, d): metres.
     """
 
     position: Float[Array, "L d"]
@@ -45,28 +45,28 @@ class PointElectrodes(AbstractPointElectrodes):
         return self.position.shape[0]
 
     def geometry(self) -> dict[str, Array]:
-        """Positions."""
+        """Positions of the electrodes."""
         return {"position": self.position}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Dots."""
+        """Draw dots."""
         for place in np.asarray(self.position):
             pen.dot(place)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """Half the size of cells at their places, seen from above."""
+        """Halve the cell size at the positions, seen from above."""
         return (Refine(np.asarray(self.position)[:, :2], factor=2.0),)
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """`load` (n, L): values of the basis functions at the electrodes; no mass."""
+        """Values of the basis functions at the electrodes as `load` (n, L), with zero mass."""
         cell, weights, _ = _locate(self.position, mesh)
         index = mesh.cells[cell], np.arange(self.num_electrodes)[:, None]
         load = sum_into((mesh.num_points, self.num_electrodes), index, weights)
         return _point_contact(self.contact_nodes(mesh), load)
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for electrodes outside the mesh, or two at one place."""
+        """Raise `ValueError` for electrodes outside the mesh, or two at the same position."""
         if self.position.shape[1] != mesh.space_dimension:
             raise ValueError(
                 f"position has {self.position.shape[1]} coordinates and the mesh is in {mesh.space_dimension}-D."
@@ -95,9 +95,9 @@ class PointElectrodes(AbstractPointElectrodes):
 
 
 class NodeElectrodes(AbstractPointElectrodes):
-    """Point electrodes at nodes of a mesh, as imported models have them; exact.
+    """Point electrodes at nodes of a mesh, as in imported models; exact.
 
-    **Fields**: `nodes` (L,) indices into `mesh.points`.
+    **Fields**: `nodes` (L,): indices into `mesh.points`.
     """
 
     nodes: Int[Array, " L"]
@@ -121,23 +121,23 @@ class NodeElectrodes(AbstractPointElectrodes):
         return {}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Dots."""
+        """Draw dots."""
         for place in np.asarray(mesh.points)[np.asarray(self.nodes)]:
             pen.dot(place)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """None: they have a mesh."""
+        """Empty, because the electrodes belong to an existing mesh."""
         return ()
 
     @values_at_once
     def contact(self, mesh: Mesh) -> Contact:
-        """`load` (n, L): one at each electrode's node; no mass."""
+        """`load` (n, L) with 1 at the node of each electrode, and zero mass."""
         ones = namespace(self, mesh).ones(self.num_electrodes, mesh.points.dtype)
         index = self.nodes, np.arange(self.num_electrodes)
         return _point_contact(self.contact_nodes(mesh), sum_into((mesh.num_points, self.num_electrodes), index, ones))
 
     def check(self, mesh: Mesh) -> None:
-        """Raise `ValueError` for a node the mesh does not have."""
+        """Raise `ValueError` for a node index out of range."""
         if has_values(self.nodes) and int(self.nodes.max()) >= mesh.num_points:
             raise ValueError(
                 f"nodes: index {int(self.nodes.max())} is out of range for a mesh of {mesh.num_points} nodes; indices "
@@ -151,14 +151,15 @@ def _point_contact(nodes, load) -> Contact:
 
 @either_engine
 def _locate(position, mesh: Mesh):
-    """The cell of each position, its barycentric coordinates there, and how far inside (negative: outside) it is."""
+    """Cell that contains each position, barycentric coordinates in it, and the smallest of these, which is negative
+    outside."""
     xp = namespace(position, mesh)
     corners = mesh.points[mesh.cells]  # (m, d + 1, d)
-    # Basis functions are linear: their value at a position follows from their gradients.
+    # Basis functions are linear, so their values at a position follow from their gradients.
     local = xp.einsum("mij,lmj->lmi", gradients(mesh)[:, 1:], position[:, None] - corners[:, 0])
     barycentric = xp.concatenate([1 - local.sum(axis=-1, keepdims=True), local], axis=-1)
     inside = undifferentiated(barycentric).min(axis=-1)
-    if mesh.is_surface:  # a position may lie above or below many triangles: that next to it counts
+    if mesh.is_surface:  # a position may project into many triangles: prefer the closest
         off = xp.einsum("mi,lmi->lm", normals(mesh), position[:, None] - corners[:, 0])
         inside = xp.minimum(inside, 0) - abs(undifferentiated(off)) / xp.sqrt(2 * undifferentiated(measures(mesh)))
     cell = xp.argmax(inside, axis=1)
@@ -167,9 +168,10 @@ def _locate(position, mesh: Mesh):
 
 
 class IntegratedElectrodes(AbstractElectrodes):
-    """The contact integrals of other electrodes on one mesh; nothing about the electrodes can be changed any more.
+    """Precomputed contact integrals of other electrodes on a mesh; the electrodes cannot be changed afterwards.
 
-    **Fields**: `integrals`, of the electrodes on the mesh they were made for.
+    **Fields**: `integrals`: contact integrals of the electrodes on that mesh; `point`: whether they are point
+    electrodes.
     """
 
     integrals: Contact
@@ -185,7 +187,7 @@ class IntegratedElectrodes(AbstractElectrodes):
 
     @property
     def is_point(self) -> bool:
-        """As the electrodes they were made of."""
+        """Whether the integrals were computed for point electrodes."""
         return self.point
 
     @property
@@ -195,32 +197,32 @@ class IntegratedElectrodes(AbstractElectrodes):
 
     @property
     def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Raises `AttributeError`: it is in the integrals."""
+        """Raises `AttributeError`: the contact impedance is part of the integrals."""
         raise AttributeError("IntegratedElectrodes hold integrals only; ask the electrodes that they were made of.")
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractElectrodes:
-        """Raises `ValueError`: it is in the integrals."""
+        """Raises `ValueError`: the contact impedance is part of the integrals."""
         raise ValueError("IntegratedElectrodes cannot be changed; change the electrodes and integrate them anew.")
 
     def geometry(self) -> dict[str, Any]:
-        """Empty: positions and sizes are not kept."""
+        """Empty, because positions and sizes are not stored."""
         return {}
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
-        """Raises `ValueError`: where they are is not known any more."""
+        """Raises `ValueError`: positions are not stored."""
         raise ValueError("IntegratedElectrodes do not say where they are; draw the electrodes that they were made of.")
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
-        """None: they have a mesh."""
+        """Empty, because the electrodes belong to an existing mesh."""
         return ()
 
     def contact_nodes(self, mesh: Mesh):
-        """As the electrodes they were made of."""
+        """Nodes of the original electrodes' contact integrals."""
         return self.integrals.nodes
 
     def contact(self, mesh: Mesh) -> Contact:
-        """The integrals, as they are."""
+        """The precomputed integrals; `mesh` is ignored."""
         return self.integrals
 
     def check(self, mesh: Mesh) -> None:
-        """Was done when they were made."""
+        """Does nothing; check the original electrodes instead."""

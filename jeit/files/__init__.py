@@ -1,8 +1,8 @@
 """Safe reading and writing of files: files from any source are read within limits, as plain numbers and text, and files
-are written whole or not at all.
+are written either completely or not at all.
 
-Nothing that a file holds is executed, and nothing in it decides how much memory is taken before its size has been
-checked: see `jeit/files/limits.py` for how much, and how to allow more.
+Nothing in a file is executed, and its size is checked before memory is allocated for its content: see
+`jeit/files/limits.py` for the limits, and how to raise them.
 """
 
 from __future__ import annotations

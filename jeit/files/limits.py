@@ -1,4 +1,5 @@
-"""Limits of what is read: sizes, counts and text."""
+"""Limits on files that are read: memory, number of electrodes, nesting; and readers of text, TOML and JSON within
+them."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 MOST_ELECTRODES = 1024
-"""Electrodes that a file may describe: the channels of a protocol grow with their square."""
+"""Maximum number of electrodes that a file may describe: the number of channels of a protocol grows with its square."""
 
 _VARIABLE, _USUAL = "JEIT_FILE_GB", 1.0
 
@@ -22,9 +23,10 @@ class TooLarge(ValueError):
 
 
 def check_memory(name: str, size: float) -> None:
-    """Raise `TooLarge`, a `ValueError`, where what is in the file `name` would take more than a gigabyte: `size` bytes.
+    """Raise `TooLarge`, a `ValueError`, if the content of the file `name` needs more memory than allowed: `size` is in
+    bytes.
 
-    More is allowed by the environment variable JEIT_FILE_GB, in gigabytes.
+    The limit is a gigabyte, or the value of the environment variable JEIT_FILE_GB, in gigabytes.
     """
     most = _most()
     if size > 1e9 * most:
@@ -35,7 +37,7 @@ def check_memory(name: str, size: float) -> None:
 
 
 def check_electrodes(name: str, number: int) -> None:
-    """Raise `ValueError` where the file `name` describes more than `MOST_ELECTRODES`."""
+    """Raise `ValueError` if the file `name` describes more than `MOST_ELECTRODES`."""
     if number > MOST_ELECTRODES:
         raise ValueError(
             f"{name} describes {number} electrodes, more than {MOST_ELECTRODES}, whose {MOST_ELECTRODES**2 // 10**6} "
@@ -44,12 +46,13 @@ def check_electrodes(name: str, number: int) -> None:
 
 
 def most_bytes() -> float:
-    """Bytes of memory that a file may take, as the environment says. Raises `ValueError` where it says no number."""
+    """Maximum memory in bytes for the content of a file, from the environment. Raises `ValueError` if the variable is
+    not a positive number."""
     return 1e9 * _most()
 
 
 def _most() -> float:
-    """Gigabytes, as the environment says."""
+    """Maximum memory in gigabytes for the content of a file, from the environment."""
     try:
         most = float(os.environ.get(_VARIABLE, _USUAL))
     except ValueError:
@@ -60,21 +63,21 @@ def _most() -> float:
 
 
 KEY = 40
-"""Letters of a key in a message, at most."""
-# Greatest number of letters of a whole message, of faults reported in sentences, and of further faults named by their
-# keys.
+"""Maximum number of characters of a key in a message."""
+# Maximum number of characters of a message, of faults that are described in sentences, and of further faults that are
+# listed by their keys.
 _LONGEST, _FAULTS, _KEYS = 390, 4, 10
 ALL = "; there are "
-"""What goes before all the words that there are."""
+"""Text that precedes a list of all valid words in a message."""
 
 
 def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) -> str:
-    """One message of several `sentences` about the file `origin`: the first, and more as far as there is room beside
-    the `keys` that the others are about, of which up to ten are named."""
+    """Combine several faults in the file `origin` into one message: the first of the `sentences` in any case, further
+    ones as far as there is room, and up to ten of the `keys` of the others."""
     first = cut(f"{cut(origin, 2 * KEY)}: {sentences[0]}", _LONGEST - 20)
     shown = 1
     for number in range(min(len(sentences), _FAULTS), 0, -1):
-        # Where there is a word that is likely meant, the list of all has to make room first.
+        # If a message proposes a valid word, its list of all valid words is omitted first to save room.
         rest = [f"{one.split(ALL)[0]}." if "?)" + ALL in one else one for one in sentences[1:number]]
         for others in (sentences[1:number], rest):
             message = " ".join([first, *others, *_more(keys[number:], len(sentences) - number, _KEYS)])
@@ -86,14 +89,14 @@ def faults_message(origin: str, sentences: list[str], keys: Sequence[str] = ()) 
 
 
 def _more(keys: Sequence[str], number: int, most: int) -> list[str]:
-    """Text about a `number` of faults that there is no room for, of which at most so many are named by key."""
+    """Text about `number` further faults, of which at most `most` are named by their keys."""
     named = keys[:most]
     said = [f"Wrong too: {', '.join(named)}."] if named else []
     return [*said, f"And {number - len(named)} more."] if number > len(named) else said
 
 
 def cut(text: str, most: int) -> str:
-    """A text of so many letters, its end left out where it is longer."""
+    """Shorten a text to `most` characters, with an ellipsis at its end."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
@@ -102,39 +105,39 @@ _LONGEST_REASON = 120
 
 @contextmanager
 def read_as(said: str) -> Iterator[None]:
-    """Context for reading by other packages: whatever they raise becomes a `ValueError`, `said` (such as "not a
-    readable WAV file") with their reason in brackets; errors that there is no such file, or that it may not be read,
-    are passed on.
+    """Context for reading files with other packages: their errors become a `ValueError` with the text `said`, such as
+    "not a readable WAV file", and the reason in brackets. Errors about a missing file or missing permission are passed
+    on.
 
-    Warnings of the packages are not shown: a file that can be read is as it should be.
+    Warnings of the packages are suppressed, since a file that can be read counts as valid.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
-    except Exception as error:  # of any kind: packages that read formats raise what they stumble over
+    except Exception as error:  # of any type, since the readers of other packages do not check content
         if isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError):
             raise
         raise ValueError(f"{said} ({reason(error)}).") from None
 
 
 def reason(error: Exception) -> str:
-    """Message of an error, in one short line: its type where it has no message."""
+    """Message of an error in one short line; the type of the error if it has no message."""
     text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return text if len(text) <= _LONGEST_REASON else f"{text[: _LONGEST_REASON - 1]}…"
 
 
-# Bytes of a file that a person writes, at most; bytes of memory for each of a text's.
+# Maximum size in bytes of a hand-written file; bytes of memory per byte of text.
 _MOST_WRITTEN, _TEXT = 2**22, 4
-# Parts of a key.
+# Maximum number of parts of a dotted key.
 _DEEPEST = 32
 
 
 def read_text(path: str | Path, *, encoding: str = "utf-8", most: int | None = None) -> str:
-    """The text of a file of at most `most` bytes, or of what may be in memory (`check_memory`).
+    """Read the text of a file of at most `most` bytes, or at most what fits in memory (`check_memory`).
 
-    Raises `ValueError`, with the file's name, for larger ones, `UnicodeError`, which is one too, for what is no text,
-    and `OSError` where there is none.
+    Raises `ValueError`, with the file's name, for larger files, `UnicodeError`, which is a `ValueError`, for files that
+    are not text, and `OSError` if the file does not exist.
     """
     path = Path(path)
     check_size(path, most)
@@ -146,7 +149,8 @@ def read_text(path: str | Path, *, encoding: str = "utf-8", most: int | None = N
 
 
 def check_size(path: Path, most: int | None = None) -> None:
-    """Raise `ValueError` for a file of more than `most` bytes, or of more than may be in memory (`check_memory`)."""
+    """Raise `ValueError` for a file of more than `most` bytes, or whose content exceeds the memory limit
+    (`check_memory`)."""
     size = path.stat().st_size
     if most is not None and size > most:
         raise ValueError(f"{path.name} has {size} bytes, and a file of its kind {most} at most: is it the right one?")
@@ -154,13 +158,13 @@ def check_size(path: Path, most: int | None = None) -> None:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """The tables of a TOML file that a person wrote. Raises `ValueError`, with its name and line, for what is none, and
-    `OSError` where there is no such file."""
+    """Read the tables of a hand-written TOML file. Raises `ValueError`, with the file's name and the line, for invalid
+    TOML, and `OSError` if the file does not exist."""
     return parsed_toml(read_text(path, most=_MOST_WRITTEN), Path(path).name)
 
 
 def parsed_toml(text: str, name: str) -> dict[str, Any]:
-    """The same of a `text` from the file `name`. Raises `ValueError` for what is none."""
+    """Parse `text` from the TOML file `name`. Raises `ValueError` for invalid TOML."""
     if any(_dots(line) > _DEEPEST for line in text.splitlines()):
         raise ValueError(f"{name} has a key of more than {_DEEPEST} parts; none is of so many.")
     try:
@@ -172,7 +176,7 @@ def parsed_toml(text: str, name: str) -> dict[str, Any]:
 
 
 def _dots(line: str) -> int:
-    """Most dots in a key of a line of TOML: such make the parser slow, with their square."""
+    """Maximum number of dots in a key on a line of TOML: the parser's time grows with its square."""
     if "=" not in line:
         return line.count(".") if line.lstrip().startswith("[") and "," not in line else 0
     before = [part.rpartition("{")[2].rpartition(",")[2] for part in line.split("=")[:-1]]
@@ -180,8 +184,8 @@ def _dots(line: str) -> int:
 
 
 def read_json(path: str | Path, *, most: int = 2**26) -> Any:
-    """Content of a JSON file of at most `most` bytes. Raises `ValueError`, with its name and place, for what is none,
-    and `OSError` where there is no such file."""
+    """Read a JSON file of at most `most` bytes. Raises `ValueError`, with the file's name and the position, for invalid
+    JSON, and `OSError` if the file does not exist."""
     path = Path(path)
     try:
         return json.loads(read_text(path, most=most))

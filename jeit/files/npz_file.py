@@ -1,5 +1,5 @@
-"""Arrays of NPZ and NPY files: plain numbers and text, nothing that would be executed, no larger than their headers
-say."""
+"""Safe reading of NPZ and NPY files: only numbers and text, never objects that could be executed, and no more data than
+the headers declare."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ import numpy as np
 from jeit.files.limits import TooLarge, check_memory, reason
 
 _COPIES = 2
-# Bytes of a member that is no array, such as a head of JSON.
+# Maximum size in bytes of an archive member that is not an array, such as a JSON header.
 _MOST_TEXT = 2**24
 _ARRAY, _ARCHIVE = b"\x93NUM", b"PK\x03\x04"
-# Errors that NumPy, and zipfile beneath it, raise for files that are broken, encrypted, or compressed in unknown ways.
+# Errors that NumPy and zipfile raise for files that are damaged, encrypted, or compressed by an unknown method.
 FAULTS = (
     ValueError,
     EOFError,
@@ -28,7 +28,7 @@ FAULTS = (
     SyntaxError,
     OverflowError,
     LookupError,
-    RuntimeError,  # NotImplementedError and RecursionError are
+    RuntimeError,  # includes NotImplementedError and RecursionError
     MemoryError,
     tokenize.TokenError,
     struct.error,
@@ -40,10 +40,12 @@ FAULTS = (
 def npz_arrays(
     path: Path, *keys: str, otherwise: str = "not an NPZ file", every: bool = False
 ) -> dict[str, np.ndarray]:
-    """The arrays named, or `every` one, as far as an NPZ file has them, and under "" the names of all that it holds.
+    """Read the arrays `keys`, or `every` array, of an NPZ file, omitting missing ones. The entry "" contains the names
+    of all arrays in the file.
 
-    What is not asked for is not read. Raises `ValueError` for other files (`otherwise` says which), broken ones, arrays
-    of objects, and those that would not fit in memory (`check_memory`); `OSError` where there is no such file.
+    Other arrays are not read. Raises `ValueError` for files that are not NPZ files (with the text `otherwise`), damaged
+    files, arrays of objects, and arrays that exceed the memory limit (`check_memory`); `OSError` if the file does not
+    exist.
     """
     with path.open("rb") as file:
         start = file.read(4)
@@ -66,13 +68,14 @@ def npz_arrays(
                         arrays[name] = _read(member)
         except TooLarge:
             raise
-        except (*FAULTS, OSError) as error:  # members may say that they lie before the file's beginning
+        except (*FAULTS, OSError) as error:  # a member may claim to lie before the start of the file
             raise _unreadable("NPZ file of plain arrays", error) from None
     return {"": np.array([*members], dtype=str), **arrays}
 
 
 def npy_array(path: Path) -> np.ndarray:
-    """The array of an NPY file. Raises `ValueError` as `npz_arrays`, `OSError` where there is no such file."""
+    """Read the array of an NPY file. Raises `ValueError` as `npz_arrays` does, and `OSError` if the file does not
+    exist."""
     with path.open("rb") as file:
         try:
             header = _header(file)
@@ -89,8 +92,8 @@ def npy_array(path: Path) -> np.ndarray:
 
 
 def check_archive(path: Path) -> None:
-    """Raise `ValueError` for an archive of members, of numbers and of text, that would not fit in memory
-    (`check_memory`), or in which arrays say to be larger than they are; and for what is no archive."""
+    """Raise `ValueError` for a file that is not an archive, and for an archive of arrays and text whose content exceeds
+    the memory limit (`check_memory`), or in which an array is smaller than its header declares."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
@@ -107,7 +110,7 @@ def check_archive(path: Path) -> None:
 
 
 def need(arrays: dict[str, np.ndarray], *keys: str) -> None:
-    """Raise `ValueError` where an array is missing, with the names of those that are there."""
+    """Raise `ValueError` if one of the arrays `keys` is missing; the message lists the arrays of the file."""
     missing = [key for key in keys if key not in arrays]
     if missing:
         held = ", ".join(str(name)[:40] for name in arrays[""][:12]) or "nothing"
@@ -120,12 +123,12 @@ class _Header(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes of the numbers."""
+        """Size of the data in bytes."""
         return math.prod(self.shape) * self.dtype.itemsize
 
     @property
     def memory(self) -> int:
-        """Bytes that they take when they are used: in double precision, and once more."""
+        """Memory in bytes for two copies of the data in double precision."""
         return _COPIES * math.prod(self.shape) * max(self.dtype.itemsize, 8)
 
 
@@ -144,7 +147,7 @@ def _header(file: IO[bytes]) -> _Header:
 
 
 def _member_header(archive: zipfile.ZipFile, name: str, member: zipfile.ZipInfo) -> _Header:
-    """Read the header of a member of an archive, and check that the archive holds as much."""
+    """Read the header of an archive member, and check that the member is as large as the header declares."""
     if not member.filename.endswith(".npy"):
         raise ValueError(f"'{name[:40]}' in it is a file of another kind")
     with archive.open(member) as file:

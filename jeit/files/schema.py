@@ -1,14 +1,14 @@
-"""Validation of hand-written files: tables of keys with types, ranges and units, whose faults are reported all at once.
+"""Validation of hand-written files: tables of keys with types, ranges and units. All faults are reported at once.
 
-A table is a class derived from `Table`, a line for each key:
+A table is defined by a class derived from `Table`, with one line per key:
 
     class SkinTable(Table):
         what = "a skin"
         model: Literal["sheet", "layer"] = "sheet"
         width_mm: Annotated[float, Number(5, 5000, "mm")]
 
-and `validated` makes one of what TOML or JSON hold. This module brings pydantic with it: readers import it when they
-read, not before.
+`validated` creates an instance from the content of a TOML or JSON file. This module imports pydantic, so readers import
+it only when they read a file.
 """
 
 from __future__ import annotations
@@ -29,30 +29,29 @@ from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, cor
 from jeit.arguments import IN_MILLIMETRES, describe, did_you_mean
 from jeit.files.limits import ALL, KEY, cut, faults_message
 
-# Characters of names listed in a message, at most.
+# Maximum number of characters of a list of names in a message.
 _NAMES = 160
-# Keys that are named with what is likely meant.
+# Keys of sizes that a message mentions along with the shape that is probably meant.
 _SIZES = ("radius", "width", "depth", "height", "vertices", "tags")
 _LARGEST = sys.float_info.max
-# Keys of a table that are looked at though they are not known.
+# Maximum number of unknown keys of a table that are examined.
 _UNKNOWN = 100
 
 
 class Table(BaseModel):
-    """Base of tables of keys: only the keys named are allowed, and neither text nor a truth value in place of a
-    number."""
+    """Base of tables of keys: unknown keys are rejected, and so are text and booleans in place of numbers."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True, defer_build=True)
 
     what: ClassVar[str] = "the file"
-    """What it describes, for messages: "a study"."""
+    """Name in messages of the thing that the table describes, such as "a study"."""
 
     @model_validator(mode="wrap")
     @classmethod
     def _in_words(cls, given: Any, made: Callable[[Any], Any]) -> Any:
-        """Say what is wrong as a sentence that begins with the key."""
+        """Convert each fault to a sentence that begins with the key."""
         if isinstance(given, Mapping) and len(given) > len(cls.model_fields) + _UNKNOWN:
-            # Each of a million would be reported.
+            # Otherwise each of possibly a million unknown keys would be reported.
             unknown = itertools.islice((key for key in given if key not in cls.model_fields), _UNKNOWN)
             given = {key: given[key] for key in [*(key for key in cls.model_fields if key in given), *unknown]}
         try:
@@ -103,21 +102,24 @@ class Table(BaseModel):
 T = TypeVar("T", bound=Table)
 
 Word = Annotated[str, Field(min_length=1, max_length=200)]
-"""Text of a line."""
+"""One line of text."""
 Words = Annotated[list[Word], FailFast()]
-"""A list of it."""
+"""A list of lines of text."""
 
 
 def fault(said: str, key: str = "") -> PydanticCustomError:
-    """Error that a check of a table raises: the message `said` about the `key` in it, or about the table, whose name
-    goes before."""
+    """Error for checks of a table to raise: the message `said` about the `key` in the table, or about the table itself.
+    The name is put before the message."""
     return PydanticCustomError("fault", "{said}", {"said": said, "key": key})
 
 
 @dataclass(frozen=True)
 class Number:
-    """Annotation of a key that is a number from `low` to `high`: whole, where its type is int. Where its type is a list
-    it is swept: one number, or a list of them, each once. `beyond`: message about larger numbers."""
+    """Annotation of a key whose value is a number from `low` to `high`, an integer if the key has type int.
+
+    If the type is a list, the key can be swept: its value is a number, or a list of distinct numbers. `beyond`: message
+    about numbers that are too large.
+    """
 
     low: float
     high: float
@@ -130,7 +132,7 @@ class Number:
 
         def read(given: Any) -> Any:
             if swept:
-                return [self.read(one, whole, " or a list of them") for one in _listed(given)]
+                return [self.read(one, whole, " or a list of them") for one in _swept_values(given)]
             if isinstance(given, list):
                 raise fault("takes one value, not a list: it cannot be swept.")
             return self.read(given, whole)
@@ -138,7 +140,7 @@ class Number:
         return core_schema.no_info_plain_validator_function(read)
 
     def read(self, given: Any, whole: bool = False, otherwise: str = "") -> float:
-        """The number. Raises `fault`."""
+        """Check and convert a number. Raises `fault` for invalid values."""
         if not _is_number(given, whole):
             wanted = "a whole number" if whole else "a number"
             raise fault(f"must be {wanted}{otherwise}, {self.span}; it is {describe(given)}.")
@@ -152,14 +154,14 @@ class Number:
 
     @property
     def span(self) -> str:
-        """The range and the unit, in words."""
+        """The range and the unit, as text."""
         low = "above 0" if 0 < self.low < 1e-300 else f"from {_plain(self.low)}"
         high = " up" if low[0] == "f" else ""
         high = high if math.isinf(self.high) else f" to {_plain(self.high)}"
         return f"{low}{high}{f' {self.unit}' if self.unit else ''}"
 
     def _hint(self, given: float) -> str:
-        """Hint at the correct value of a number that is off by a factor of 1000."""
+        """Propose a value for a number that is off by a factor of 1000."""
         if not self.unit or math.isinf(self.high) or abs(given) > 1e100:
             return ""
         for larger, metric in ((True, "metres"), (False, "micrometres")):
@@ -174,10 +176,10 @@ class Number:
 
 @dataclass(frozen=True)
 class Numbers:
-    """Annotation of a key that is an array of numbers from `low` to `high`, or of whole numbers or truth values, as
-    `kind` says.
+    """Annotation of a key whose value is an array of numbers from `low` to `high`, of integers, or of booleans; `kind`
+    is the type.
 
-    `axes`: how many along each axis, at least and at most. `single`: one number for all will do as well.
+    `axes`: minimum and maximum length of each axis. `single`: whether one number for all is accepted, too.
     """
 
     axes: tuple[tuple[int, float], ...]
@@ -235,12 +237,13 @@ class Numbers:
 
 
 class Swept:
-    """Annotation of a key that is a list, each item in it once; a value that is no list stands for a list of one."""
+    """Annotation of a key whose value is a list of distinct items; a value that is not a list counts as a list of
+    one."""
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         def read(given: Any, inner: Callable[[list], list]) -> list:
             if isinstance(given, list):
-                return inner(_listed(given))
+                return inner(_swept_values(given))
             try:
                 return inner([given])
             except ValidationError as error:
@@ -253,13 +256,15 @@ class Swept:
 
 Item = TypeVar("Item")
 Several = Annotated[list[Item], FailFast(), Swept()]
-"""A list of things, each once, or one of them."""
+"""A list of distinct items, or a single item."""
 
 
 class OneOf:
-    """Annotation of a key that is one of several tables, chosen by the word under `key` in it; without that word the
-    table that has a default for it is chosen, and `other` where there is `mark`. `meant`: other words that people
-    write, and the valid word that each likely means."""
+    """Annotation of a key whose value is one of several tables, chosen by the word under `key` in it.
+
+    Without that word, the table with a default for `key` is chosen. If the key `mark` is present, the table `other` is
+    chosen. `meant`: other words that users may write, and the valid word that each probably means.
+    """
 
     def __init__(
         self,
@@ -292,7 +297,7 @@ class OneOf:
         return self.tables[word].model_validate(given)
 
     def _likely(self, word: Any) -> str:
-        """The word that is likely meant by another word that people write, with the sizes that it needs."""
+        """Text that proposes the valid word that is probably meant by `word`, with the sizes that it needs."""
         meant = self.meant.get(word.lower().rstrip("s")) if isinstance(word, str) else None
         if meant is None:
             return ""
@@ -301,8 +306,8 @@ class OneOf:
 
 
 def validated(table: type[T], given: Any, origin: str) -> T:
-    """Check `given` as a whole, and return the table. Raises one `ValueError` that begins with `origin`, the file's
-    name, and has a sentence on each key at fault, or on some of them, in 400 characters at most."""
+    """Validate `given` and return the table. Raises one `ValueError` of at most 400 characters that begins with
+    `origin`, the file's name, and has a sentence on each faulty key, or on as many as there is room for."""
     try:
         return table.model_validate(given)
     except ValidationError as error:
@@ -313,7 +318,7 @@ def validated(table: type[T], given: Any, origin: str) -> T:
 
 
 def not_among(given: Any, words: Iterable[str], likely: str = "") -> str:
-    """Message about a word that is none of `words`; `likely`: the one that is meant, if that is known."""
+    """Message about a word that is not one of `words`; `likely`: text that proposes a word, if known."""
     known = [*words]
     meant = likely or did_you_mean(given[:KEY] if isinstance(given, str) else given, known)
     return f"must be one of {_few(known)}; it is {describe(given)}{meant}."
@@ -326,7 +331,7 @@ def _steps(one: Any) -> tuple[int | str, ...]:
 
 
 def _place(steps: tuple[int | str, ...]) -> str:
-    """The key that a fault is about, as it would be asked for: microphones[3].b."""
+    """Full name of the key that a fault is about, such as microphones[3].b."""
     said = ""
     for step in steps:
         said += f"[{step}]" if isinstance(step, int) else f"{'.' if said else ''}{_key(step)}"
@@ -338,8 +343,8 @@ def _key(name: str) -> str:
     return short if re.fullmatch(r"[\w.-]+…?", short) else repr(short)
 
 
-def _listed(given: Any) -> list:
-    """A swept key's values."""
+def _swept_values(given: Any) -> list:
+    """Values of a swept key as a list."""
     if not isinstance(given, list):
         return [given]
     if not given:

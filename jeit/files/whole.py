@@ -1,4 +1,5 @@
-"""Atomic writing of files: a new file is written beside the old one, and replaces it when all of it is on the disk."""
+"""Atomic writing of files: a new file is written beside the old one, and replaces it once it is completely on the
+disk."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from typing import BinaryIO
 
 
 def boot() -> str:
-    """Identifier of this run of the system: containers with names of their own share it; "" where it is not known."""
+    """Identifier of the current boot of the system, which containers share; "" if unknown."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -22,7 +23,7 @@ def boot() -> str:
 
 
 def is_alive(pid: object) -> bool:
-    """Whether a process of this machine lives; True where that is not known."""
+    """Whether a process of this machine is running; True if unknown."""
     if os.name != "posix" or not isinstance(pid, int) or isinstance(pid, bool) or pid <= 0:
         return True
     try:
@@ -39,9 +40,10 @@ _UNFINISHED = re.compile(r"\.jeit-([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.part")
 
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[BinaryIO]:
-    """A file that takes the place of `path` when all of it is on the disk: one killed before leaves what was there.
+    """Context that yields a file to write to, which replaces `path` once it is completely on the disk. If the process
+    is killed before, the old file remains.
 
-    A link at `path` is replaced, not followed. Raises `OSError` where it cannot be written.
+    A link at `path` is replaced, not followed. Raises `OSError` if the file cannot be written.
     """
     path = Path(path)
     clear_unfinished(path.parent)
@@ -58,9 +60,9 @@ def written_whole(path: str | Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def whole_files(folder: Path) -> Iterator[Path]:
-    """A folder to write several files to, which take their places in `folder` when all are written: all or none.
+    """Context that yields a folder to write several files to, which are moved to `folder` once all of them are written.
 
-    Links at their places are replaced, not followed. Raises `OSError` where they cannot be written.
+    Links in `folder` with the same names are replaced, not followed. Raises `OSError` if the files cannot be written.
     """
     clear_unfinished(folder)
     beside = folder / _unfinished()
@@ -77,7 +79,7 @@ def whole_files(folder: Path) -> Iterator[Path]:
 
 
 def clear_unfinished(folder: Path) -> None:
-    """Take away what processes of this machine that were killed have left unfinished in a folder."""
+    """Remove unfinished files that killed processes of this machine have left in a folder."""
     with suppress(OSError):
         for one in folder.iterdir():
             made = _UNFINISHED.fullmatch(one.name)
@@ -90,5 +92,5 @@ def _unfinished() -> str:
 
 
 def _machine() -> str:
-    """This run of this machine, in eight letters; no process of another can be asked after."""
+    """Hash of the current boot of this machine, eight characters; processes of other machines cannot be checked."""
     return f"{zlib.crc32(boot().encode()):08x}"

@@ -1,4 +1,5 @@
-"""The forward problem: P1 assembly, the electrode model, and `ForwardModel` with its derivative rule."""
+"""The forward problem: finite elements of first order (P1), electrode models, and `ForwardModel` with its
+derivatives."""
 
 from __future__ import annotations
 

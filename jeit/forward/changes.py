@@ -1,9 +1,8 @@
-"""Derivatives of voltages along conductivity changes in few cells, and along contact impedances.
+"""Derivatives of voltages with respect to conductivity changes in a few cells, and to contact impedances.
 
-How electrode potentials change with contact impedance: the energy in each contact, from fields that are known.
-
-At fixed fields F the energy of electrode l is E_l(F, F) = (1/z_l) ∫_l (F - Z_l)², so that, F being stationary
-(`jeit.forward.transfer`),
+At fixed fields F the energy in the contact of electrode l is E_l(F, F) = (1/z_l) ∫_l (F - Z_l)². As F is stationary
+(`jeit.forward.transfer`), the derivative of the transfer impedance with respect to the contact impedance needs no
+further solve:
 
     ∂Z / ∂ log z_l = E_l(F, F).
 """
@@ -26,20 +25,21 @@ from jeit.mesh import Mesh
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
-# Cells at a time, whose products of gradients stay near the processor.
+# Number of cells processed at a time, so that their products of gradients stay in the cache.
 _CELLS = 256
 
 
 class Change(NamedTuple):
-    """Change of conductivity by q coefficients: by `slope` (k, q), S/m (2-D: S), in `cells` (k,), not elsewhere; in all
-    cells where `cells` is None."""
+    """Linear change of conductivity by q coefficients. **Fields**: `cells`: (k,) the cells that change, or None for all
+    cells; `slope`: (k, q) change of each cell per unit coefficient, in S/m (2-D: S)."""
 
     cells: Any
     slope: Float[np.ndarray, "k q"]
 
 
 class SolvedFields(NamedTuple):
-    """**Fields**: `mesh` and `protocol` of a model; `fields` F (n, L) and `impedance`, ohms; all in NumPy."""
+    """Fields of a model, in NumPy. **Fields**: `mesh`, `protocol`: those of the model; `fields`: F (n, L) in ohms;
+    `impedance`: impedance of the electrodes in ohms."""
 
     mesh: Mesh
     protocol: Protocol
@@ -48,18 +48,18 @@ class SolvedFields(NamedTuple):
 
     @property
     def voltages(self) -> Float[np.ndarray, " M"]:
-        """Voltages of the channels (M,)."""
+        """Voltages (M,) of the channels."""
         return channel_voltages(self.protocol, self.impedance)  # pyright: ignore[reportReturnType]
 
     def derivatives(self, changes: Sequence[Change]) -> Float[np.ndarray, "M n"]:
-        """Their derivatives by the coefficients of all `changes`: each -∫ dσ ∇u_drive · ∇u_measure, worked out for
-        pairs of electrodes."""
+        """Derivatives of the voltages with respect to the coefficients of all `changes`: -∫ dσ ∇u_drive · ∇u_measure,
+        computed from the values for pairs of electrodes."""
         energy = np.concatenate([self._energy(*change) for change in changes])
         return np.stack([-select_channels(self.protocol, one) for one in energy], axis=1)  # pyright: ignore
 
     def _energy(self, cells, slope) -> Float[np.ndarray, "q L L"]:
-        """∫ dσ ∇F_k · ∇F_l for every coefficient: where all cells change by the matrix of stiffness, which nodes know;
-        where some do by the gradients in these."""
+        """∫ dσ ∇F_k · ∇F_l for every coefficient: from the stiffness matrix if all cells change, else from the
+        gradients in the cells that change."""
         fields: Any = self.fields
         if cells is None:
             return np.stack([self._energy_everywhere(one) for one in slope.T])
@@ -81,13 +81,13 @@ class SolvedFields(NamedTuple):
 
 
 def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) -> SolvedFields:
-    """The fields of a model for a `conductivity` per cell, S/m (2-D: S); checks nothing."""
+    """The fields of a model for a `conductivity` per cell, in S/m (2-D: S), which is not checked."""
     fields, impedance = evaluate(model, fields_and_impedance_of, conductivity)
     return SolvedFields(*on_host((model.mesh, model.protocol, fields, impedance)))
 
 
 def _energy(gradient, slope) -> Float[np.ndarray, "q L L"]:
-    """∫ dσ ∇F_k · ∇F_l for every coefficient."""
+    """Matrices ∫ dσ ∇F_k · ∇F_l (q, L, L), one per coefficient."""
     number = gradient.shape[-1]
     energy = np.zeros((slope.shape[1], number**2), np.result_type(gradient, slope))
     for start in range(0, len(slope), _CELLS):
@@ -97,7 +97,7 @@ def _energy(gradient, slope) -> Float[np.ndarray, "q L L"]:
     return energy.reshape(-1, number, number)
 
 
-# Ohm·m² beyond which an electrode carries nothing beside one of unit impedance.
+# Contact impedance in ohm·m² beyond which an electrode carries no current, compared with one of unit impedance.
 _OPEN = 1e30
 
 
@@ -107,7 +107,8 @@ class _Piece(NamedTuple):
 
 
 class ContactSensitivity:
-    """∂Z/∂ log z of every electrode, on one mesh; `electrodes` of the complete model, whose places and sizes hold."""
+    """Derivative ∂Z/∂ log z of the transfer impedance with respect to each contact impedance, on one mesh.
+    `electrodes`: electrodes of the complete model; their positions and sizes are fixed."""
 
     def __init__(self, mesh: Mesh, electrodes: AbstractElectrodes):
         self._pieces: list[list[_Piece]] = []
@@ -126,7 +127,7 @@ class ContactSensitivity:
     def __call__(
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance
     ) -> Float[np.ndarray, "L L L"]:
-        """∂Z/∂ log z_l (l, L, L) in ohms, from F and Z at these contact impedances (L,)."""
+        """∂Z/∂ log z_l (l, L, L) in ohms, from F and Z at the contact impedances (L,) given."""
         return (
             np.stack([self._energy(electrode, fields, impedance) for electrode in range(len(impedance))])
             / (np.asarray(contact_impedance)[:, None, None])

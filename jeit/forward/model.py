@@ -1,4 +1,4 @@
-"""ForwardModel: conductivity in, electrode voltages and their Jacobian out."""
+"""`ForwardModel`: electrode voltages and their Jacobian for a given conductivity."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from jeit.protocol import Protocol
 from jeit_solvers import SparseCholesky, in_turn
 from jeit_solvers.engines import Recent, gather, has_values, host, namespace, on_device, on_host, sum_into
 
-# Numbers of a Jacobian at a time, where it is made in pieces: so many stay in a core's cache.
+# Maximum number of entries of a block of the Jacobian, so that the block fits in the cache of a core.
 _BLOCK = 250_000
-# Cells at a time whose fields stay in a core's cache.
+# Number of cells processed at a time, so that their fields fit in the cache of a core.
 _CELLS = 4000
 
 
 class ForwardModel(eqx.Module):
     """Electrode voltages of a body of given conductivity: ∇·(σ∇u) = 0 with the complete (or point) electrode model.
 
-    Every method takes a conductivity: a scalar, one value per cell (m,), one per node (n,), or symmetric tensors
-    (m, d, d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. One of
-    another shape, not positive or not finite raises `ValueError`. Called as it is, a method answers at once, in NumPy;
-    inside `jax.jit`, `jax.vmap` or a derivative it is compiled, once, and two to four times as fast from then on. All
-    are differentiable in the conductivity and in every field of the model (`model.electrodes.position`,
-    `.contact_impedance`, `model.mesh.points`, …).
+    Every method takes a conductivity: a scalar, one value per cell (m,), one per node (n,), or symmetric tensors (m, d,
+    d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. A conductivity of
+    another shape, or one that is not positive or not finite, raises `ValueError`. A method called directly runs at
+    once, in NumPy. Inside `jax.jit`, `jax.vmap` or a derivative it is compiled once, and is two to four times as fast
+    afterwards. All methods are differentiable with respect to the conductivity and every field of the model
+    (`model.electrodes.position`, `.contact_impedance`, `model.mesh.points`, …).
 
-    **Fields**: `mesh`, `electrodes`, `protocol`; `system`, the sparsity pattern and linear solver; `at_once`, whether
-    NumPy answers where it can.
+    **Fields**: `mesh`, `electrodes`, `protocol`; `system`: sparsity pattern and linear solver; `at_once`: whether
+    methods run in NumPy where possible.
     """
 
     mesh: Mesh
@@ -58,22 +58,22 @@ class ForwardModel(eqx.Module):
         *,
         solver: str | lx.AbstractLinearSolver = "auto",
     ):
-        """`solver`: "auto" (chosen by size; `model.system.solver` says which and why), "cholesky", "cg", or any lineax
-        solver; one that is asked for is always compiled. Raises `ValueError` if electrodes, mesh and protocol do not
-        fit together.
-        """
+        """`solver`: "auto" (chosen by size; `model.system.solver` states which solver and why), "cholesky", "cg", or
+        any lineax solver. With any value but "auto" the methods are always compiled. Raises `ValueError` if electrodes,
+        mesh and protocol do not fit together."""
         _check(mesh, electrodes, protocol)
         self.mesh = mesh
         self.electrodes = electrodes
         self.protocol = protocol
-        with jax.ensure_compile_time_eval():  # a model may be made inside jit, of a mesh that is known
+        with jax.ensure_compile_time_eval():  # a model may be made inside jit, with a known mesh
             self.system = System.create(mesh, electrodes, solver)
-        # Conjugate gradients for a system too large to factorise are compiled; and a solver that was asked for is used.
+        # Models are compiled with conjugate gradients, for systems too large to factorise, and with any solver that the
+        # user chose.
         self.at_once = isinstance(solver, str) and solver == "auto" and isinstance(self.system.solver, SparseCholesky)
 
     def with_electrodes(self, electrodes: AbstractElectrodes) -> "ForwardModel":
-        """The same model with other electrodes of the same kind, as many; works under jit. Raises `ValueError` for
-        others, and for electrodes that do not fit the mesh."""
+        """The same model with other electrodes of the same kind and number; works under jit. Raises `ValueError` for
+        electrodes of another kind or number, and for electrodes that do not fit the mesh."""
         if type(electrodes) is not type(self.electrodes):
             raise ValueError(
                 f"with_electrodes needs {type(self.electrodes).__name__}, not {type(electrodes).__name__}; make a new "
@@ -83,48 +83,51 @@ class ForwardModel(eqx.Module):
         return eqx.tree_at(lambda model: model.electrodes, self, electrodes)
 
     def with_protocol(self, protocol: Protocol) -> "ForwardModel":
-        """The same model with another protocol; `ValueError` unless it is for as many electrodes."""
+        """The same model with another protocol. Raises `ValueError` unless it has the same number of electrodes."""
         _check(self.mesh, self.electrodes, protocol)
         return eqx.tree_at(lambda model: model.protocol, self, protocol)
 
     def voltages(self, conductivity: ArrayLike) -> Inexact[Array, " M"]:
-        """Voltages (M,) of the protocol's channels, in volts. `conductivity` in S/m (2-D: S); raises `ValueError`."""
+        """Voltages (M,) of the protocol's channels, in volts.
+
+        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
+        """
         return evaluate(self, voltages_of, check_conductivity(self.mesh, conductivity))
 
     def transfer_impedance(self, conductivity: ArrayLike) -> Inexact[Array, "L L"]:
-        """Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
+        """Transfer impedance Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
         """
         return evaluate(self, transfer_impedance_of, check_conductivity(self.mesh, conductivity))
 
     def fields(self, conductivity: ArrayLike) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
-        """Potentials F (n, L) of the nodes for a unit current into each electrode that leaves evenly through all, in
-        ohms, and the transfer impedance Z (L, L).
+        """Potentials F (n, L) of the nodes, in ohms, for a unit current into each electrode that leaves through all
+        electrodes in equal parts; and the transfer impedance Z (L, L).
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
         """
         return evaluate(self, fields_of, check_conductivity(self.mesh, conductivity))
 
     def potentials(self, conductivity: ArrayLike) -> Inexact[Array, "S n"]:
-        """Potential at the nodes for every drive pattern, in volts; the mean over the electrodes is zero.
+        """Potentials (S, n) at the nodes for every drive pattern, in volts; the mean over the electrodes is zero.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid.
         """
         return evaluate(self, potentials_of, check_conductivity(self.mesh, conductivity))
 
     def jacobian(self, conductivity: ArrayLike) -> Inexact[Array, "M m"]:
-        """∂(voltage)/∂(conductivity), volts per siemens per metre (2-D: per siemens).
+        """Jacobian ∂(voltage)/∂(conductivity), in volts per siemens per metre (2-D: volts per siemens).
 
-        With respect to the cells (M, m); with respect to the nodes (M, n) if `conductivity` is given per node. Raises
-        `ValueError` for a bad conductivity, and for tensors.
+        Its shape is (M, m), with respect to the cells, or (M, n), with respect to the nodes, if `conductivity` is given
+        per node. Raises `ValueError` for a conductivity that is not valid, and for tensors.
         """
         return self.voltages_and_jacobian(conductivity)[1]
 
     def voltages_and_jacobian(self, conductivity: ArrayLike) -> tuple[Inexact[Array, " M"], Inexact[Array, "M m"]]:
-        """`voltages` and `jacobian` from one factorisation and one solve per electrode.
+        """The results of `voltages` and `jacobian` from a single factorisation and one solve per electrode.
 
-        `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one, and for tensors.
+        `conductivity` in S/m (2-D: S). Raises `ValueError` if it is not valid, and for tensors.
         """
         conductivity = check_conductivity(self.mesh, conductivity)
         if conductivity.ndim == 3:
@@ -136,9 +139,9 @@ class ForwardModel(eqx.Module):
 
 
 def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) -> Any:
-    """A `quantity` of a model: at once where all values are at hand, compiled where anything is traced.
+    """Evaluate a `quantity` of a model: in NumPy if all values are known, in a compiled program if any array is traced.
 
-    `conductivity` as an array, S/m (2-D: S). It is not looked at: one that is not positive or not finite gives NaN.
+    `conductivity`: an array in S/m (2-D: S). It is not checked: values that are not positive or not finite yield NaN.
     """
     if not has_values(model):
         return _COMPILED[quantity](model, conductivity)
@@ -152,7 +155,7 @@ def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) ->
 
 
 def check_model(model: ForwardModel) -> None:
-    """Raise `ValueError` for what is no `ForwardModel`."""
+    """Raise `ValueError` unless `model` is a `ForwardModel`."""
     check_kind("model", model, ForwardModel, "a ForwardModel(mesh, electrodes, protocol)")
 
 
@@ -172,12 +175,13 @@ def _check(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol) -> No
             f"There are {electrodes.num_electrodes} electrodes, and protocol '{protocol.name}' is for "
             f"{protocol.num_electrodes}; make both for the same number."
         )
-    with jax.ensure_compile_time_eval():  # a model may be made inside jit, of values that are known
+    with jax.ensure_compile_time_eval():  # a model may be made inside jit, with known values
         electrodes.check(mesh)
 
 
 def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
-    """Voltages of the channels: entries of measurement · Z · driveᵀ, or they alone where that is less work."""
+    """Voltages of the channels: entries of measurement · Z · driveᵀ. The full matrix is computed only where that is
+    less work than computing the entries one by one."""
     measured, driven = protocol.measurement, protocol.drive
     each, every = protocol.num_measurements * len(impedance), len(measured) * (len(impedance) + len(driven))
     if each < every:
@@ -188,46 +192,49 @@ def select_channels(protocol: Protocol, impedance) -> Inexact[Array, " M"]:
 
 
 def channel_voltages(protocol: Protocol, impedance: ElectrodeImpedance) -> Inexact[Array, " M"]:
-    """Voltages of the channels; what contacts add, only where current is read that goes through them."""
+    """Voltages of the channels. The contribution of a contact is added only to channels that measure an electrode
+    carrying current."""
     across = select_channels(protocol, namespace(impedance.contact).diag(impedance.contact))
     return select_channels(protocol, impedance.body) + across
 
 
 def transfer_impedance_of(model: ForwardModel | IntegratedModel, conductivity):
-    """Z (L, L) in ohms, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    """Transfer impedance Z (L, L) in ohms, for a `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
     return impedance_parts(model.mesh, conductivity, model.electrodes, model.system).transfer
 
 
 def voltages_of(model: ForwardModel | IntegratedModel, conductivity):
-    """Voltages (M,) of the channels, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    """Voltages (M,) of the channels, for a `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
     impedance = impedance_parts(model.mesh, conductivity, model.electrodes, model.system)
     return channel_voltages(model.protocol, impedance)
 
 
 def fields_of(model: ForwardModel | IntegratedModel, conductivity):
-    """F (n, L) and Z (L, L) in ohms, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    """Fields F (n, L) and transfer impedance Z (L, L) in ohms, for a `conductivity` in S/m (2-D: S); a quantity for
+    `evaluate`."""
     return electrode_fields(model.mesh, conductivity, model.electrodes, model.system)
 
 
 def fields_and_impedance_of(model: ForwardModel | IntegratedModel, conductivity):
-    """F (n, L) in ohms, against a reference near the body, and the `ElectrodeImpedance`, of a `conductivity` in S/m
-    (2-D: S); for `evaluate`."""
+    """Fields F (n, L) in ohms, relative to a reference near the body, and the `ElectrodeImpedance`, for a
+    `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
     solved = solved_system_of(model, conductivity)
     return solved.fields()[0], solved.impedance()
 
 
 def solved_system_of(model: ForwardModel | IntegratedModel, conductivity):
-    """The system solved for the electrodes' loads, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    """The system solved for the electrodes' loads, for a `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
     return solved_system(model.mesh, conductivity, model.electrodes, model.system)
 
 
 def potentials_of(model: ForwardModel | IntegratedModel, conductivity):
-    """Potentials (S, n) in volts, of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    """Potentials (S, n) in volts, for a `conductivity` in S/m (2-D: S); a quantity for `evaluate`."""
     return model.protocol.drive @ fields_of(model, conductivity)[0].T
 
 
 def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity):
-    """Voltages (M,) and their Jacobian (M, m), of a `conductivity` in S/m (2-D: S); for `evaluate`."""
+    """Voltages (M,) and their Jacobian (M, m), or (M, n) for a conductivity per node, for a `conductivity` in S/m (2-D:
+    S); a quantity for `evaluate`."""
     mesh, protocol = model.mesh, model.protocol
     fields, impedance = fields_and_impedance_of(model, conductivity)
     if namespace(conductivity, mesh) is np:
@@ -247,8 +254,9 @@ def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity
 def jacobian_blocks(
     mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"]
 ) -> Iterator[tuple[slice, Inexact[Array, "M b"]]]:
-    """The Jacobian of the channels in the conductivity of cells, V m/S (2-D: V/S), some cells after others: of a solid
-    body it is too large to be held, and what is made of it is not. In NumPy; `fields` as of `fields_of`, ohms."""
+    """Jacobian of the channels with respect to the conductivity of cells, in V m/S (2-D: V/S), as blocks of consecutive
+    cells, because the whole Jacobian of a solid does not fit in memory. Computed in NumPy; `fields` from `fields_of`,
+    in ohms."""
     gradient = field_gradients(mesh, fields)
     size = max(1, _BLOCK // protocol.num_measurements)
     for start in range(0, mesh.num_cells, size):
@@ -257,8 +265,9 @@ def jacobian_blocks(
 
 
 def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[slice, Inexact[np.ndarray, "f b"]]]:
-    """∫_e ∇u_a · ∇u_b of the electrodes' fields for a ≤ b, rows as of `np.triu_indices`, some cells after others: what
-    the Jacobian of any channel is a sum of. In NumPy; `fields` as of `fields_of`, ohms."""
+    """Integrals ∫_e ∇u_a · ∇u_b of the electrodes' fields for a ≤ b, rows in the order of `np.triu_indices`, as blocks
+    of consecutive cells. The Jacobian of any channel is a sum of them. Computed in NumPy; `fields` from `fields_of`,
+    in ohms."""
     gradient: Any = field_gradients(mesh, fields)
     count = gradient.shape[-1]
     starts = np.cumsum([0, *range(count, 0, -1)])
@@ -274,9 +283,9 @@ def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[
 
 
 def _of_cells(protocol: Protocol, gradient: Inexact[Array, "d b L"]) -> Inexact[Array, "M b"]:
-    """∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, axis by axis, from the fields' gradients in cells."""
+    """Jacobian ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, summed axis by axis from the gradients of the fields in cells."""
     xp, jacobian = namespace(gradient), host.zeros(())
-    # One product for all patterns and axes: it also keeps XLA from computing the gradients anew for every channel.
+    # A single product for all patterns and axes also keeps XLA from recomputing the gradients for every channel.
     patterns = xp.concatenate([-protocol.drive, protocol.measurement])
     rows = patterns @ gradient.reshape(-1, gradient.shape[-1]).T
     for component in xp.split(rows, len(gradient), axis=1):
@@ -298,7 +307,7 @@ _COMPILED = {
 
 
 class IntegratedModel(NamedTuple):
-    """The parts of a forward model, with the integrals in place of the electrodes."""
+    """Parts of a forward model, with the integrals over the electrodes in place of the electrodes."""
 
     mesh: Mesh
     electrodes: IntegratedElectrodes
@@ -307,17 +316,17 @@ class IntegratedModel(NamedTuple):
 
 
 def _integrated(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol, system: System) -> IntegratedModel:
-    with jax.ensure_compile_time_eval():  # or what is kept would belong to the program that is being traced
+    with jax.ensure_compile_time_eval():  # otherwise the cached arrays would belong to the program being traced
         return IntegratedModel(mesh, IntegratedElectrodes(electrodes, mesh), protocol, system)
 
 
 def _on_host(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol, system: System) -> IntegratedModel:
-    # Electrodes of a user's own may work their integrals out in JAX.
+    # Electrodes defined by a user may compute their integrals in JAX.
     return on_host(_integrated(*on_host((mesh, electrodes, protocol, system))))
 
 
-# A model is asked for one thing after another, and its electrodes may change while its mesh stays.
+# A model is usually evaluated many times, and its electrodes may change while its mesh stays the same.
 integrated_model = Recent(_integrated)
-"""The `IntegratedModel` of a mesh, electrodes, a protocol and a system that all have values."""
+"""The `IntegratedModel` of a mesh, electrodes, a protocol and a system whose values are all known."""
 host_model = Recent(_on_host)
-"""The same in NumPy, for what is asked outside compiled code: no call waits for a compiler."""
+"""The same in NumPy, for calls outside compiled code, which then do not wait for a compiler."""

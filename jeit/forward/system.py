@@ -1,4 +1,4 @@
-"""The finite-element system: assembly of the stiffness of cells, and of the electrodes."""
+"""The finite-element system: assembly of the stiffness of the cells and of the contributions of the electrodes."""
 
 from __future__ import annotations
 
@@ -31,10 +31,11 @@ from jeit_solvers.engines import gather, has_values, namespace, undifferentiated
 
 
 def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
-    """Conductivity per cell, (m,) or tensor (m, d, d), from a per-cell, per-node or tensor one, S/m (2-D: S).
+    """Conductivity per cell, (m,) or tensors (m, d, d), from values per cell, values per node, or tensors, in S/m (2-D:
+    S).
 
-    A conductivity given per node is linear in each cell; as P1 gradients are constant there, its mean over the
-    cell's nodes is exact.
+    A conductivity given per node is linear in each cell. Because gradients of P1 functions are constant there, its mean
+    over the nodes of the cell is exact.
     """
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
         return gather(conductivity, mesh.cells).mean(axis=1)
@@ -42,15 +43,15 @@ def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
 
 
 def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
-    """Convert `conductivity` to an array and raise `ValueError` if it has the wrong shape or is not positive.
+    """Convert `conductivity` to an array, and raise `ValueError` if it has the wrong shape or is not positive.
 
-    Accepts a scalar, which comes back as (m,), (m,) per cell, (n,) per node or (m, s, s) symmetric tensors, s being the
-    dimension of space; siemens per metre (in a 2-D sheet, siemens). Of tensors (m, 3, 3) on a surface in space only the
-    part in each triangle's plane counts. A complex admittivity needs a positive real part. Values of tracers are not
-    looked at.
+    Accepts a scalar (converted to shape (m,)), values per cell (m,) or per node (n,), or symmetric tensors (m, s, s),
+    where s is the dimension of space; in siemens per metre (in a 2-D sheet, siemens). For tensors (m, 3, 3) on a
+    surface in space, only the part in the plane of each triangle matters. A complex admittivity needs a positive real
+    part. Values of traced arrays are not checked.
     """
     conductivity = np.asarray(conductivity) if has_values(conductivity) else jnp.asarray(conductivity)
-    # One type and shape for all that mean the same, or JAX compiles again: Python's numbers are "weakly" typed.
+    # A single type and shape for all equivalent inputs, because JAX compiles again for Python's "weakly typed" numbers.
     conductivity = namespace(conductivity).asarray(conductivity, dtype=_floating(conductivity.dtype))
     m, n, d = mesh.num_cells, mesh.num_points, mesh.space_dimension
     if conductivity.shape not in [(), (m,), (n,), (m, d, d)]:
@@ -64,7 +65,7 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
 
 
 def _floating(kind: Any) -> Any:
-    """The type of floating-point numbers for values of some type. Raises `ValueError` for what are no numbers."""
+    """Floating-point type for values of the given type. Raises `ValueError` for a type that is not numeric."""
     if kind.kind in "OSUmM":
         raise ValueError(f"conductivity is {kind}; give real or complex numbers, S/m (2-D: S).")
     if kind.kind in "biu" or kind.itemsize > 16 or (kind.kind == "f" and kind.itemsize > 8):
@@ -79,7 +80,7 @@ def _check_values(conductivity: Any, normal: Any) -> None:
         if not np.allclose(conductivity, np.swapaxes(conductivity, 1, 2), rtol=1e-12, atol=0):
             raise ValueError("conductivity tensors must be symmetric.")
         real = conductivity.real
-        if normal is not None:  # only across it must they be positive: put a large value along it
+        if normal is not None:  # tensors need to be positive only across the normal: add a large value along it
             along = normal[:, :, None] * normal[:, None]
             across = np.eye(3) - along
             real = across @ real @ across + np.abs(real).max() * along
@@ -94,7 +95,8 @@ def _check_values(conductivity: Any, normal: Any) -> None:
 
 
 def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "p m"]:
-    """Element stiffness ∫ ∇φ_i·σ∇φ_j for conductivity per cell: lower triangles (p, m), p = (d+1)(d+2)/2, siemens."""
+    """Element stiffness ∫ ∇φ_i·σ∇φ_j for a conductivity per cell in S/m (2-D: S): lower triangles (p, m) in siemens, p
+    = (d+1)(d+2)/2."""
     xp = namespace(mesh, conductivity)
     gradient = gradients(mesh)  # (m, d + 1, d)
     flux = gradient if conductivity.ndim == 1 else xp.einsum("mij,mkj->mki", conductivity, gradient)
@@ -109,9 +111,10 @@ def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Arra
 
 
 def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array, "d m p"]:
-    """Gradients of nodal fields in every cell, times the root of the cell's measure: (d, m, p), one layer per axis.
+    """Gradients (d, m, p) of nodal fields in every cell, one layer per axis, multiplied by the square root of the
+    cell's measure.
 
-    With that weight the product of two of them is the integral ∫_e ∇u·∇w.
+    With this weight the product of two gradients is the integral ∫_e ∇u·∇w.
     """
     xp = namespace(mesh, fields)
     weighted = gradients(mesh) * xp.sqrt(measures(mesh))[:, None, None]
@@ -125,10 +128,10 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
 
 
 class System(eqx.Module):
-    """The sparsity pattern of the system matrix, and the lineax solver that solves with it.
+    """Sparsity pattern of the system matrix, and the lineax solver for systems with this pattern.
 
-    Made once for a mesh and a kind of electrode (`System.create`); holds no physics, so the same system serves
-    every conductivity, contact impedance, electrode position and size.
+    Made once for a mesh and a kind of electrode (`System.create`). It holds no physical quantities, so one system
+    serves every conductivity, contact impedance, electrode position and size.
     """
 
     pattern: SparsityPattern
@@ -136,7 +139,8 @@ class System(eqx.Module):
 
     @classmethod
     def create(cls, mesh: Mesh, electrodes: AbstractElectrodes, solver: str | lx.AbstractLinearSolver = "auto"):
-        """`solver`: "auto" (by predicted work and memory), "cholesky", "cg", or any lineax solver.
+        """Make the system for a mesh and electrodes. `solver`: "auto" (by predicted work and memory), "cholesky", "cg",
+        or any lineax solver.
 
         Raises `ValueError` for another name.
         """
@@ -157,10 +161,10 @@ class System(eqx.Module):
     def grounded(
         self, mesh: Mesh, conductivity, electrodes: AbstractElectrodes, contact: Contact
     ) -> tuple[SparseSymmetric, Inexact[Array, "n c"]]:
-        """The symmetric positive-definite matrix A of stiffness, contact mass and ground, (n, n) in siemens, and the
-        loads of the electrodes, and of the ground where these are not points (n, L + 1).
+        """The symmetric positive-definite matrix A, (n, n) in siemens, of stiffness, contact mass and ground; and the
+        loads of the electrodes, (n, L) for point electrodes, otherwise (n, L + 1) with the load of the ground.
 
-        `conductivity` per cell, S/m (2-D: S).
+        `conductivity` per cell, in S/m (2-D: S).
         """
         nothing = (None,) * len(contact.mass)
         conducted = self.pattern.assemble(stiffness(mesh, conductivity), *nothing)
@@ -171,13 +175,14 @@ class System(eqx.Module):
         return SparseSymmetric(values, self.pattern), load
 
     def solve(self, operator: SparseSymmetric, load: Inexact[Array, "n c"]) -> Inexact[Array, "n c"]:
-        """A⁻¹ load, one column per load. Differentiable by the implicit rule, whichever solver."""
+        """Solution A⁻¹ load, one column per load. Differentiable by implicit differentiation, whichever solver is
+        used."""
         load = load.astype(operator.values.dtype)
         if isinstance(self.solver, SparseCholesky) and isinstance(load, np.ndarray):
             return solve(self.solver.plan, factorise(self.solver.plan, operator.values), load)
-        constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B alone, not through the factor
+        constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not through the factor
         state = self.solver.init(constant, {})
-        if isinstance(self.solver, SparseCholesky):  # all columns at once, where lineax takes them one by one
+        if isinstance(self.solver, SparseCholesky):  # all columns at once; lineax solves one by one
             plan = self.solver.plan
 
             def solve_columns(_, columns):
@@ -194,7 +199,7 @@ class System(eqx.Module):
         return jax.vmap(column, in_axes=1, out_axes=1)(load)
 
     def quadratic_form(self, operator: SparseSymmetric, load: Inexact[Array, "n c"]) -> Inexact[Array, "c c"]:
-        """loadᵀ A⁻¹ load; half the work of `solve` where there is a factor."""
+        """The product loadᵀ A⁻¹ load; with a direct solver it takes half the work of `solve`."""
         load = load.astype(operator.values.dtype)
         if isinstance(self.solver, SparseCholesky):
             return quadratic_form(self.solver.plan, factorise(self.solver.plan, operator.values), load)
@@ -204,8 +209,9 @@ class System(eqx.Module):
 def ground_conductance(stiffness: Inexact[Array, " n"], load: Inexact[Array, "n L"]) -> Inexact[Array, " n"]:
     """A conductance (n,) to ground at one node under an electrode, of the order of the `stiffness` (n,) there.
 
-    Currents that sum to zero send nothing through it, so it changes nothing; but the constant potential, which contacts
-    that are all but open leave free, and point electrodes altogether, is fixed by it. Not differentiated.
+    No current flows through it if the currents sum to zero, so it does not change the solution. It fixes the constant
+    part of the potential, which is undetermined for point electrodes, and nearly so for contacts that are almost open.
+    It is not differentiated.
     """
     xp = namespace(stiffness, load)
     stiffness = undifferentiated(abs(stiffness))
@@ -214,5 +220,5 @@ def ground_conductance(stiffness: Inexact[Array, " n"], load: Inexact[Array, "n 
 
 
 def with_ground(load: Inexact[Array, "n L"], ground: Inexact[Array, " n"]) -> Inexact[Array, "n c"]:
-    """Loads of electrodes and, the last, of a `ground` (n,), (n, L + 1)."""
+    """Loads (n, L + 1): those of the electrodes, and last that of the `ground` (n,)."""
     return namespace(load, ground).concatenate([load, ground[:, None]], axis=1)

@@ -1,14 +1,14 @@
-"""Transfer impedance of the electrodes computed from the conductivity, with its derivative rule.
+"""Transfer impedance of the electrodes as a function of the conductivity, with its derivative rule.
 
-Let a_θ(u, w) be the energy form of the electrode model, θ standing for everything it depends on (conductivity,
-contact impedance, electrode positions, mesh points), and F_l the potential for a unit current into electrode l
-that leaves evenly through all. Then Z_lk = a_θ(F_l, F_k), and, F being stationary,
+Let a_θ(u, w) be the energy form of the electrode model, where θ stands for everything it depends on (conductivity,
+contact impedance, electrode positions, mesh points), and F_l the potential for a unit current into electrode l that
+leaves through all electrodes in equal parts. Then Z_lk = a_θ(F_l, F_k), and, as F is stationary,
 
     dZ = -∂_θ a_θ(F, F) dθ      at fixed F,
 
-so a first derivative in any direction is a product of fields that are known already, with no further solve. (For
-point electrodes the load depends on their position, and 2 ∂_θ⟨load, F⟩ dθ is added.) Cheney, Isaacson and Newell,
-SIAM Review 41 (1999) 85-101; Polydorides and Lionheart, Meas. Sci. Technol. 13 (2002) 1871-1883.
+so a first derivative in any direction is a product of known fields and needs no further solve. (For point electrodes
+the load depends on their position, and 2 ∂_θ⟨load, F⟩ dθ is added.) Cheney, Isaacson and Newell, SIAM Review 41 (1999)
+85-101; Polydorides and Lionheart, Meas. Sci. Technol. 13 (2002) 1871-1883.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from jeit_solvers.engines import namespace, undifferentiated
 
 
 class ElectrodeImpedance(NamedTuple):
-    """Z, up to terms that cancel over currents that sum to zero, in two parts: a contact that is nearly open has a
-    resistance beside which the body's part would be lost.
+    """Transfer impedance of the electrodes, up to terms that cancel for currents that sum to zero, in two parts: the
+    resistance of a nearly open contact is so large that the sum would lose the digits of the body's part.
 
-    **Fields**: `body` (L, L), the mean potentials under the electrodes for unit currents, and `contact` (L,), what
-    contacts add to the potential of their own electrode, z / |e|, zeros for point electrodes; ohms.
+    **Fields**: `body`: (L, L) mean potentials under the electrodes for unit currents; `contact`: (L,) what each contact
+    adds to the potential of its electrode, z / |e|, zero for point electrodes; both in ohms.
     """
 
     body: Inexact[Array, "L L"]
@@ -42,21 +42,22 @@ class ElectrodeImpedance(NamedTuple):
 
     @property
     def transfer(self) -> Inexact[Array, "L L"]:
-        """Z (L, L): the mean of every row and column is zero."""
+        """Z (L, L), where the mean of every row and column is zero."""
         return centred(self.body + namespace(self.body).diag(self.contact))
 
 
 def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: AbstractElectrodes, system: System):
-    """Transfer impedance Z (L, L) in ohms: electrode potentials U = Z I for currents I that sum to zero.
+    """Transfer impedance Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
 
-    `conductivity` in S/m (2-D: S), (m,), (n,) or (m, d, d). Rows and columns of Z sum to zero, i.e. the mean electrode
-    potential is the reference. Symmetric. Checks nothing: `ForwardModel.transfer_impedance` does.
+    `conductivity` in S/m (2-D: S), (m,), (n,) or (m, d, d). Z is symmetric; its rows and columns sum to zero, so
+    potentials are relative to the mean of all electrodes. Arguments are not checked, unlike in
+    `ForwardModel.transfer_impedance`.
     """
     return impedance_parts(mesh, conductivity, electrodes, system).transfer
 
 
 def impedance_parts(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> ElectrodeImpedance:
-    """The same in its two parts; `conductivity` in S/m (2-D: S)."""
+    """The transfer impedance as an `ElectrodeImpedance`, in two parts; `conductivity` in S/m (2-D: S)."""
     formula = _quadratic if namespace(mesh, conductivity, electrodes) is np else _differentiable
     return formula(mesh, conductivity, electrodes, system)
 
@@ -87,10 +88,11 @@ def _impedance_parts_jvp(primals, tangents):
 
 
 def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
-    """Potentials F (n, L) for a unit current into each electrode, leaving evenly through all; and Z (L, L).
+    """Potentials F (n, L) for a unit current into each electrode that leaves through all electrodes in equal parts; and
+    Z (L, L).
 
-    Volts per ampere; `conductivity` in S/m (2-D: S). Differentiable by the implicit rule of the linear solve (one more
-    solve per direction).
+    In volts per ampere; `conductivity` in S/m (2-D: S). Differentiable by implicit differentiation of the linear
+    system, with one more solve per direction.
     """
     solved = solved_system(mesh, conductivity, electrodes, system)
     fields, potentials = solved.fields()
@@ -98,8 +100,9 @@ def electrode_fields(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, s
 
 
 class SolvedSystem(NamedTuple):
-    """The grounded matrix A, siemens, the `load` (n, c) and X = A⁻¹ load, as of `System.grounded`; and the `resistance`
-    of the contacts, as of `contact_resistance`."""
+    """The solved finite-element system. **Fields**: `operator`: grounded matrix A in siemens, and `load`: (n, c), both
+    from `System.grounded`; `solution`: X = A⁻¹ load; `resistance`: resistances of the contacts from
+    `contact_resistance`."""
 
     operator: SparseSymmetric
     load: Inexact[Array, "n c"]
@@ -108,7 +111,7 @@ class SolvedSystem(NamedTuple):
 
     @property
     def product(self) -> Inexact[Array, "c c"]:
-        """loadᵀ A⁻¹ load."""
+        """The product loadᵀ A⁻¹ load."""
         return self.load.T @ self.solution
 
     def impedance(self) -> ElectrodeImpedance:
@@ -116,15 +119,17 @@ class SolvedSystem(NamedTuple):
         return electrode_impedance(self.product, self.resistance)
 
     def fields(self) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
-        """Potentials F (n, L) of the nodes and U (L, L) of the electrodes for a unit current into each that leaves
-        evenly through all: each against one reference near the body, whatever the contacts."""
+        """Potentials F (n, L) of the nodes and U (L, L) of the electrodes for a unit current into each electrode that
+        leaves through all electrodes in equal parts. All are relative to the same reference near the body, whatever the
+        contact impedances."""
         return unit_fields(self.solution, self.product, self.resistance)
 
 
 def unit_fields(
     solution: Inexact[Array, "k c"], product: Inexact[Array, "c c"], resistance: Inexact[Array, " L"] | None
 ) -> tuple[Inexact[Array, "k L"], Inexact[Array, "L L"]]:
-    """F at some nodes and U as of `SolvedSystem.fields`, from the rows of X at these nodes and loadᵀ X."""
+    """F at some nodes and U as defined in `SolvedSystem.fields`, from the rows of X at these nodes and the product
+    loadᵀ X."""
     potentials = product
     if resistance is not None:
         terminals = terminal_impedance(product)[:, :-1]
@@ -133,7 +138,7 @@ def unit_fields(
 
 
 def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> SolvedSystem:
-    """The system of the electrodes' loads, solved; `conductivity` in S/m (2-D: S)."""
+    """Solve the system for the loads of the electrodes; `conductivity` in S/m (2-D: S)."""
     contact = electrodes.contact(mesh)
     operator, load = system.grounded(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
     return SolvedSystem(operator, load, system.solve(operator, load), contact_resistance(electrodes, contact))
@@ -141,30 +146,32 @@ def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, syst
 
 @eqx.filter_jit
 def fields_and_inverse(solved: SolvedSystem, strips: Strips, reach: int) -> tuple[Inexact[Array, "p L"], NearInverse]:
-    """F at places of strips of the nodes, and K⁻¹ between them, up to `reach` strips apart, ohms.
+    """F at the places of strips of the nodes, and K⁻¹ between places up to `reach` strips apart, in ohms.
 
-    K is the matrix of the electrode model with the ground and all electrodes floating but one: the potential at one
-    node for a unit current into another. Which one is not, no change of conductivity sees.
+    K is the matrix of the electrode model with the ground and all electrodes but one floating; K⁻¹ is the potential at
+    one node for a unit current into another. The choice of the electrode that is not floating does not affect the
+    derivatives with respect to conductivity.
     """
     fields, solution = strips.spread(solved.fields()[0]), strips.spread(solved.solution)
     inverse = near_inverse(strips, solved.operator, reach)
     if solved.resistance is None:
         return fields, inverse
-    # Electrodes carry what enters at the nodes back out: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ.
+    # The current that enters at a node leaves through an electrode: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ.
     return fields, inverse.add(solution, solution @ terminal_impedance(solved.product))
 
 
 def contact_resistance(electrodes: AbstractElectrodes, contact: Contact) -> Inexact[Array, " L"] | None:
-    """z / |e| (L,) of the electrodes' contacts, ohms; none of point electrodes."""
+    """Resistances z / |e| (L,) of the contacts of the electrodes, in ohms; None for point electrodes."""
     return None if electrodes.is_point else 1 / contact.load.sum(axis=0)
 
 
 def electrode_impedance(product: Inexact[Array, "c c"], resistance: Inexact[Array, " L"] | None) -> ElectrodeImpedance:
-    """Impedance computed from the product loadᵀ A⁻¹ load, A and the loads being those of `System.grounded`, and the
-    contacts' resistance.
+    """Impedance of the electrodes from the product loadᵀ A⁻¹ load, with A and the loads of `System.grounded`, and from
+    the resistances of the contacts.
 
-    The mean potentials under complete electrodes are D⁻¹ Bᵀ u = D⁻¹ BᵀA⁻¹B U with their loads B and D⁻¹, the contacts'
-    resistance; so that of the remainder of U, D⁻¹ I, nothing is lost at large contact impedance.
+    With the electrodes' loads B and the contacts' resistances D⁻¹, the mean potentials under complete electrodes are
+    D⁻¹ Bᵀ u = D⁻¹ BᵀA⁻¹B U. The remainder of U, D⁻¹ I, is kept separate, so no digits are lost at large contact
+    impedance.
     """
     if resistance is None:
         return ElectrodeImpedance((product + product.T) / 2, namespace(product).zeros_like(product[0]))
@@ -173,11 +180,13 @@ def electrode_impedance(product: Inexact[Array, "c c"], resistance: Inexact[Arra
 
 
 def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
-    """Potentials of the electrodes, and of the ground, for a unit current into each that leaves through one of them.
+    """Potentials of the electrodes and of the ground for a unit current into each of them that leaves through a
+    reference terminal.
 
-    Eliminating the nodes leaves (D - BᵀA⁻¹B) U = I. Its columns sum to zero, so the diagonal is the sum of the others,
-    which spares the cancellation in D - BᵀA⁻¹B at small contact impedance. The one that is best connected to the others
-    is the reference, and each is scaled by its own: contacts may be any orders of magnitude apart.
+    Eliminating the nodes leaves (D - BᵀA⁻¹B) U = I. The columns of this matrix sum to zero, so its diagonal is computed
+    as the sum of the other entries, which avoids the cancellation in D - BᵀA⁻¹B at small contact impedance. The
+    reference is the terminal that is best connected to the others. Rows and columns are scaled by their diagonals,
+    because the contact impedances may differ by orders of magnitude.
     """
     xp = namespace(product)
     others = (product + product.T) / 2 * (1 - np.eye(len(product)))
@@ -192,10 +201,12 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
 
 
 def _correction(others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"], current: Inexact[Array, "c c"]):
-    """Correction of the impedance of terminals by one step of refinement, where pairs short-circuit each other.
+    """Correction of the impedance of terminals by one step of iterative refinement, for pairs of terminals that
+    short-circuit each other.
 
-    What flows between two terminals goes with the difference of their potentials: rounded in whatever way, what leaves
-    the one enters the other; and `current`, less all that flows, keeps the digits that tie the pair to the rest.
+    The current between two terminals is computed from the difference of their potentials, so that, whatever the
+    rounding, the current that leaves one enters the other. The residual, `current` minus all these currents, therefore
+    keeps the digits that couple such a pair to the other terminals.
     """
     xp = namespace(others)
     if xp is np:
@@ -207,14 +218,14 @@ def _correction(others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"],
 
 
 def centred(matrix: Inexact[Array, "L L"]) -> Inexact[Array, "L L"]:
-    """The symmetric part of `matrix` with the mean of every row and column taken out."""
+    """The symmetric part of `matrix`, with the mean of every row and column subtracted."""
     matrix = (matrix + matrix.T) / 2
     mean = matrix.mean(axis=0)
     return matrix - mean - mean[:, None] + mean.mean()
 
 
 def _stationary_form(mesh, conductivity, electrodes, fields, impedance):
-    """2⟨load, F⟩ - a(F, F) as a matrix (L, L): its derivative at fixed F and Z is that of Z."""
+    """2⟨load, F⟩ - a(F, F) as a matrix (L, L), whose derivative at fixed F and Z equals the derivative of Z."""
     conductivity = cell_conductivity(mesh, conductivity)
     contact = electrodes.contact(mesh)
     gradient = field_gradients(mesh, fields)

@@ -1,5 +1,5 @@
-"""Analysis of images: rasters of values on a mesh, planes and surfaces through a solid, inclusions, and regions over
-time."""
+"""Analysis of images: rasters of values on a mesh, sections and isosurfaces of solids, inclusions, and series of images
+over time."""
 
 from __future__ import annotations
 

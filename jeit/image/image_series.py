@@ -1,14 +1,13 @@
-"""Series of images, and oscillations in them such as breathing.
+"""Series of images, and their oscillations such as breathing: spectra, and amplitude and phase at a frequency.
 
-Oscillations in a series of values: spectra, and amplitude and phase at a frequency.
+At a frequency f, the values x are fitted by weighted least squares, with weights w (a window over the measured time),
+to
 
-With weights w (a window over the time measured) the values x are fitted, at a frequency f, by
+    x(t) ≈ a + b t + A cos(2πf t + φ).
 
-    x(t) ≈ a + b t + A cos(2πf t + φ),
-
-least squares weighted by w: for even times and whole periods that is the discrete Fourier transform at f, and for any
-other it has neither its leak from the mean, nor from the drift, nor from -f. Frequencies nearer to each other than the
-resolution, 1 / T without a window and 2 / T with Hann's, T the time measured, are not distinguished.
+For evenly spaced times and an integer number of periods this is the discrete Fourier transform at f. For other times it
+avoids the leakage of the mean, of the drift and of -f. Frequencies can be distinguished if they differ by at least the
+resolution: 1 / T without a window and 2 / T with Hann's window, where T is the measured time.
 """
 
 from __future__ import annotations
@@ -29,10 +28,10 @@ from jeit.mesh import Mesh, measures
 class ImageSeries:
     """Changes of conductivity over time.
 
-    **Fields**: `mesh`; `changes` (F, m) in S/m (2-D: S), a row of NaN for a frame without an image; `times` (F,)
-    seconds, rising; `background`, the conductivity that they are changes of, S/m (2-D: S).
+    **Fields**: `mesh`; `changes`: (F, m) in S/m (2-D: S), a row of NaN for a frame without an image; `times`: (F,)
+    increasing times in seconds; `background`: the conductivity to which the changes are relative, in S/m (2-D: S).
 
-    Raises `ValueError` where shapes disagree, times do not rise, and where no frame has an image.
+    Raises `ValueError` if shapes disagree, if times do not increase, and if no frame has an image.
     """
 
     mesh: Mesh
@@ -61,7 +60,7 @@ class ImageSeries:
 
     @property
     def frame_rate(self) -> float | None:
-        """Frames in a second, over all; None for one frame."""
+        """Mean frame rate in frames per second; None for a single frame."""
         return float((len(self.times) - 1) / (self.times[-1] - self.times[0])) if len(self.times) > 1 else None
 
     @property
@@ -70,14 +69,14 @@ class ImageSeries:
         return "S" if self.mesh.dimension == 2 else "S/m"
 
     def functional(self) -> Float[np.ndarray, " m"]:
-        """(m,) the standard deviation of every cell over time: the functional image, of what moves."""
+        """Functional image (m,): the standard deviation of every cell over time."""
         return self.changes[self.imaged].std(axis=0, dtype=float)
 
     def mean_change(self, region: ArrayLike) -> Float[np.ndarray, " F"]:
-        """(F,) the mean change in a region, by the size of its cells; NaN for frames without an image.
+        """Mean change (F,) in a region, weighted by the size of its cells; NaN for frames without an image.
 
-        `region` (m,): True for its cells (`ball_region`, `box_region`, `half_region`). Raises `ValueError` for another
-        shape, and an empty one.
+        `region`: (m,) True for the cells of the region (`ball_region`, `box_region`, `half_region`). Raises
+        `ValueError` for another shape, and for an empty region.
         """
         chosen = np.asarray(region)
         if chosen.dtype != bool or chosen.shape != (self.mesh.num_cells,) or not chosen.any():
@@ -87,22 +86,23 @@ class ImageSeries:
 
 
 Window = Literal["hann", "none"]
-# Widths of a peak, in 1 / T; frequencies looked at in a resolution, where the strongest is looked for.
+# Resolution of each window in units of 1 / T; number of frequencies per resolution in the search for the strongest one.
 _WIDTH = {"hann": 2.0, "none": 1.0}
 _FINE = 8
-# Periods that have to be seen at least.
+# Minimum number of periods in the measured time.
 _PERIODS = 1.0
 
 
 @dataclass(frozen=True)
 class Oscillation:
-    """The part of values (F, …) that oscillates at `frequency`, hertz.
+    """The component of values (F, …) that oscillates at `frequency`, in hertz.
 
-    - `amplitude` (…), in the unit of the values: half of what lies between highest and lowest.
-    - `phase` (…), radians from -π to π: the values go as cos(2πf t + phase), t as in the times given. Where the
-      amplitude is nothing but noise the phase means nothing.
-    - `noise` (…): the standard deviation of the amplitude, from all that the fit leaves, other oscillations included.
-    - `resolution`, hertz.
+    - `amplitude`: (…), in the unit of the values: half of the difference between maximum and minimum.
+    - `phase`: (…), radians from -π to π: the values vary as cos(2πf t + phase), with the times t that were given. The
+      phase is meaningless where the amplitude is only noise.
+    - `noise`: (…), standard deviation of the amplitude, from the residual of the fit, which includes other
+      oscillations.
+    - `resolution`: hertz.
     """
 
     frequency: float
@@ -115,16 +115,17 @@ class Oscillation:
 def oscillation(
     values: ArrayLike, times: ArrayLike, frequency: float | tuple[float, float], *, window: Window = "hann"
 ) -> Oscillation:
-    """Amplitude and phase of values (F, …) at times (F,) seconds, even or not.
+    """Amplitude and phase of values (F, …) at times (F,) in seconds, which need not be evenly spaced.
 
-    - `frequency`: hertz; or a band, (lowest, highest), in which the strongest is looked for, over all values together,
-      among those of a period at least.
-    - `window`: "hann", which keeps apart what is not near in frequency, or "none", twice as sharp for what is alone.
+    - `frequency`: hertz; or a band (lowest, highest), in which the frequency with the largest power over all values is
+      found. Frequencies with less than one period in the measured time are not considered.
+    - `window`: "hann", which separates different frequencies better, or "none", which has twice the resolution for a
+      single oscillation.
 
-    Rows of NaN are left out. Raises `ValueError` for fewer than five frames, less than a period, a frequency at or
-    above half the frame rate, and bad options.
+    Rows of NaN are left out. Raises `ValueError` for fewer than five frames, less than one period, a frequency at or
+    above half the frame rate, and invalid options.
     """
-    kept, at = _finite(values, times)
+    kept, at = _finite_rows(values, times)
     check_name("window", window, _WIDTH)
     spread = float(at[-1] - at[0])
     resolution = _WIDTH[window] / spread
@@ -156,12 +157,13 @@ def oscillation(
 def amplitude_spectrum(
     values: ArrayLike, times: ArrayLike, *, window: Window = "hann"
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K ..."]]:
-    """Frequencies (K,) in hertz from the first whole period to half the frame rate, half a resolution apart, and the
-    amplitude (K, …) of values (F, …) at each, in their unit: a lone oscillation peaks at its own amplitude.
+    """Frequencies (K,) in hertz, from one period in the measured time to half the frame rate in steps of half the
+    resolution, and the amplitude (K, …) of values (F, …) at each frequency, in the unit of the values. A single
+    oscillation has a peak of the height of its amplitude.
 
-    The mean is taken out first. Rows of NaN are left out. Raises `ValueError` as `oscillation` does.
+    The mean is subtracted first. Rows of NaN are left out. Raises `ValueError` as `oscillation` does.
     """
-    kept, at = _finite(values, times)
+    kept, at = _finite_rows(values, times)
     check_name("window", window, _WIDTH)
     spread = float(at[-1] - at[0])
     frequencies = np.arange(1 / spread, (len(at) - 1) / spread / 2, _WIDTH[window] / spread / 2)
@@ -172,7 +174,7 @@ def amplitude_spectrum(
 
 
 def _band(frequency) -> tuple[float, float]:
-    """The lowest and the highest frequency."""
+    """The lowest and the highest frequency, equal if a single frequency is given."""
     band = (frequency, frequency) if is_number(frequency) else frequency
     if not (isinstance(band, tuple | list) and len(band) == 2 and all(is_number(one) and one > 0 for one in band)):
         raise ValueError(f"frequency must be positive hertz, or a band (lowest, highest); it is {describe(frequency)}.")
@@ -181,8 +183,8 @@ def _band(frequency) -> tuple[float, float]:
     return float(band[0]), float(band[1])
 
 
-def _finite(values, times) -> tuple[np.ndarray, np.ndarray]:
-    """Rows without NaN, as real numbers, and their times."""
+def _finite_rows(values, times) -> tuple[np.ndarray, np.ndarray]:
+    """Rows without NaN as real numbers, and their times."""
     given, at = np.asarray(values), np.asarray(times, float)
     if given.ndim < 1 or given.dtype.kind not in "iuf" or at.shape != given.shape[:1]:
         raise ValueError(
@@ -197,7 +199,7 @@ def _finite(values, times) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _weight(times: np.ndarray, window: Window) -> np.ndarray:
-    """Weight of each time; Hann's window is not quite zero at the first and last frames."""
+    """Weight of each time; Hann's window is shifted so that it is not zero at the first and last frames."""
     if window == "none":
         return np.ones(len(times))
     step = (times[-1] - times[0]) / (len(times) - 1)
@@ -205,7 +207,8 @@ def _weight(times: np.ndarray, window: Window) -> np.ndarray:
 
 
 def _fit(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: float):
-    """Coefficients (4, n), the variance left (n,), and each coefficient's variance (4,) for noise of variance one."""
+    """Coefficients (4, n), residual variance (n,), and the variance of each coefficient (4,) for noise of unit
+    variance."""
     turn = 2 * np.pi * frequency * times
     middle = times - times.mean()
     design = np.stack([np.ones(len(times)), middle / middle[-1], np.cos(turn), np.sin(turn)], axis=1)
@@ -216,9 +219,9 @@ def _fit(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: f
 
 
 def _strongest(values: np.ndarray, times: np.ndarray, weight: np.ndarray, band: tuple[float, float, float]) -> float:
-    """The frequency within a band (lowest, highest, resolution) at which all values together oscillate most."""
+    """The frequency in a band (lowest, highest, resolution) at which the power summed over all values is largest."""
     low, high, resolution = band
-    # The combinations of the values that carry all their power.
+    # The first eight principal components, in place of all values.
     rest = values - values.mean(axis=0)
     left, size, _ = np.linalg.svd(rest @ rest.T if rest.shape[1] > len(rest) else rest, full_matrices=False)
     size = np.sqrt(size) if rest.shape[1] > len(rest) else size

@@ -1,4 +1,4 @@
-"""Inclusions: connected regions of an image above a level, with their areas, centroids and forms."""
+"""Inclusions: connected regions of an image above a level, with their areas, centroids and shapes."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _ROUND, _UP = 48, 24
 
 
 class SolidForm(eqx.Module):
-    """An ellipsoid, or an elliptic column that stands.
+    """An ellipsoid, or an upright elliptic column.
 
-    **Fields**: `centre`, metres; `axes`, three half axes as rows, metres, of a column the last up to its upper end;
-    `column`, whether it is one.
+    **Fields**: `centre` in metres; `axes`: three semi-axes as rows, in metres; the last one of a column points to its
+    upper end; `column`: whether the shape is a column.
     """
 
     centre: tuple[float, ...]
@@ -29,7 +29,7 @@ class SolidForm(eqx.Module):
     column: bool
 
     def surface(self) -> TriangleSurface:
-        """Triangles all round it."""
+        """Closed surface of the shape, as triangles."""
         from jeit.image.plane import TriangleSurface
 
         up = np.linspace(0, np.pi, _UP + 1)
@@ -40,7 +40,7 @@ class SolidForm(eqx.Module):
         level = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         unit = np.concatenate([level, np.broadcast_to(height[:, None, None], (len(height), _ROUND, 1))], axis=2)
         axes = np.array(self.axes)
-        axes[0] *= np.sign(np.linalg.det(axes))  # outward all round
+        axes[0] *= np.sign(np.linalg.det(axes))  # so that all normals point outward
         low = _ROUND * np.arange(len(height) - 1)[:, None] + np.arange(_ROUND)
         low_next = np.roll(low, -1, axis=1)
         high, high_next = low + _ROUND, low_next + _ROUND
@@ -48,18 +48,18 @@ class SolidForm(eqx.Module):
         return TriangleSurface(unit.reshape(-1, 3) @ axes + np.array(self.centre), np.stack(corners).reshape(-1, 3))
 
 
-# Share of a sheet, and of a solid, whose images are of coarser grain: a disc of a fourteenth of its width, and a ball
-# of an eighth.
+# Minimum area of an inclusion as a fraction of a sheet (a disc of a fourteenth of its width), and minimum volume as a
+# fraction of a solid (a ball of an eighth of its width), whose images have a coarser resolution.
 _LEAST_AREA = {2: 0.004, 3: 0.001}
 
 
 class Inclusion(eqx.Module):
-    """One region of raised or lowered conductivity.
+    """A region of raised or lowered conductivity.
 
-    **Fields**: `sign`, +1 conductive or -1 resistive; `centroid` in metres, weighted by the change; `area` in m² (of
-    solids volume in m³); `peak`, the strongest change in it, in the image's unit; `on_surface`, whether it lies on a
-    surface in space, which has an area though its centroid has three coordinates; `form`, of what was fitted to data as
-    a body of a solid.
+    **Fields**: `sign`: +1 for conductive, -1 for resistive; `centroid` in metres, weighted by the change; `area` in m²
+    (in solids: volume in m³); `peak`: the strongest change in the region, in the unit of the image; `on_surface`:
+    whether the region lies on a surface in space, so that it has an area although its centroid has three coordinates;
+    `form`: shape of an inclusion that was fitted to data as a body in a solid, else None.
     """
 
     sign: int
@@ -76,17 +76,17 @@ class Inclusion(eqx.Module):
 
     @property
     def kind(self) -> str:
-        """'conductive' or 'resistive'."""
+        """Either 'conductive' or 'resistive'."""
         return "conductive" if self.sign > 0 else "resistive"
 
     @property
     def is_column(self) -> bool:
-        """Whether it stands through the whole height of a solid."""
+        """Whether the inclusion extends through the whole height of a solid."""
         return self.form is not None and self.form.column
 
     @property
     def radius(self) -> float:
-        """Radius of the disk of the same area, or in 3-D of the ball of the same volume, metres."""
+        """Radius in metres of the disk of the same area, or in 3-D of the ball of the same volume."""
         if self.is_solid:
             return float(np.cbrt(3 * self.area / (4 * np.pi)))
         return float(np.sqrt(self.area / np.pi))
@@ -103,14 +103,15 @@ def find_inclusions(
     noise: Float[Array, " m"] | None = None,
     least_significance: float = 5.5,
 ) -> list[Inclusion]:
-    """Peaks of an image, each with the region round it where the change exceeds `level` times that peak.
+    """Find the peaks of an image, each with the surrounding region where the change exceeds `level` times the peak.
 
-    `image` (m,): change of conductivity in every cell. A peak counts if it is at least `least_peak` times the
-    strongest change of either sign, stands at least `least_prominence` times its own height above the saddle to a
-    higher one, and its region covers at least `least_area` of the mesh; the rest are artefacts. Unless given that is
-    0.004 of a sheet and 0.001 of a solid, of which 0.004 would be a ball of a fifth of its width. Artefacts are also
-    peaks of less than `least_significance` times `noise` (m,), the standard deviation of the image, where given.
-    Strongest first. Raises `ValueError` for an image of another size or with NaN.
+    `image`: (m,) change of conductivity in every cell. A peak is an inclusion if it is at least `least_peak` times the
+    strongest change of either sign, stands at least `least_prominence` times its own height above the saddle towards a
+    higher peak, and has a region that covers at least the fraction `least_area` of the mesh; other peaks are artefacts.
+    The default of `least_area` is 0.004 for a sheet and 0.001 for a solid (0.004 of a solid would be a ball of a fifth
+    of its width). If `noise` (m,), the standard deviation of the image, is given, peaks below `least_significance`
+    times the noise are artefacts too. The strongest inclusion comes first. Raises `ValueError` for an image of another
+    size or with NaN.
     """
     regions = inclusion_regions(
         mesh,
@@ -136,7 +137,8 @@ def inclusion_regions(
     noise: Float[Array, " m"] | None = None,
     least_significance: float = 5.5,
 ) -> list[tuple[Inclusion, Bool[np.ndarray, " m"]]]:
-    """The inclusions of `find_inclusions`, each with its cells. Raises `ValueError` as that does."""
+    """The inclusions of `find_inclusions`, each with a mask (m,) of its cells. Raises `ValueError` as `find_inclusions`
+    does."""
     values = np.asarray(image)
     if values.shape != (mesh.num_cells,):
         raise ValueError(f"image has shape {values.shape}; give one value for each of the {mesh.num_cells} cells.")
@@ -152,7 +154,8 @@ def inclusion_regions(
     if strongest == 0:
         return []
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    # A tetrahedron is next to a higher one across some of its facets only: along a ridge the way goes over nodes.
+    # A tetrahedron shares facets with only some of its higher neighbours, so in solids paths along ridges go over
+    # nodes.
     shared = np.asarray(mesh.cells) if mesh.dimension == 3 else shared_facets(mesh)
     if least_area is None:
         least_area = _LEAST_AREA[mesh.dimension]

@@ -1,4 +1,4 @@
-"""Figures of merit of an image, and the score of the Kuopio Tomography Challenge 2023.
+"""GREIT figures of merit of images, and the score of the Kuopio Tomography Challenge 2023.
 
 Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung images", Physiol. Meas. 30 (2009)
 S35-S55.
@@ -16,33 +16,34 @@ from jaxtyping import Array, Float, Int
 
 from jeit_solvers.engines import has_values
 
-# The target is what is brighter than this share of the brightest pixel.
+# Pixels above this fraction of the maximum belong to the target.
 _LEVEL = 0.25
 
 
 class FiguresOfMerit(eqx.Module):
-    """The GREIT figures of merit of images x, each of one target; every field has one value per target.
+    """GREIT figures of merit of images x of one target each; every field has one value per target.
 
-    The quarter-amplitude set Q holds the pixels with x ≥ max(x) / 4, where x is positive for a change of the target's
-    sign. C is the disc round the centre of gravity of Q with the area of Q.
+    The quarter-amplitude set Q consists of the pixels with x ≥ max(x) / 4, where x is positive for a change of the
+    target's sign. C is the disc centred at the centre of gravity of Q with the area of Q.
 
     **Fields**
 
-    - `amplitude_response`: AR = ∫x / (area of the target · its change), dimensionless. 1 if the image holds as much
-      change as there was; best the same everywhere.
-    - `position_error`: PE = r_t - r_q, metres, the distance from the centre of the body of the target less that of the
-      centre of gravity of Q. **Positive when the target is imaged nearer to the centre than it is.** Best zero. A
-      displacement round the centre does not show.
-    - `resolution`: RES = √(area of Q / area of the body), dimensionless: the radius of Q over `body_radius`. Best
-      small, and the same everywhere.
+    - `amplitude_response`: AR = ∫x / (area of the target · its change), dimensionless. It is 1 if the image contains as
+      much change as the target, and should be the same at all positions.
+    - `position_error`: PE = r_t - r_q, metres, where r_t and r_q are the distances of the target and of the centre of
+      gravity of Q from the centre of the body. **Positive if the target is imaged too near to the centre.** Ideally
+      zero. A displacement around the centre does not affect it.
+    - `resolution`: RES = √(area of Q / area of the body), dimensionless: the radius of a disc with the area of Q,
+      divided by `body_radius`. Ideally small, and the same at all positions.
     - `shape_deformation`: SD = (area of Q outside C) / (area of Q), dimensionless, 0 for a round image.
-    - `ringing`: RNG = -(∫x over the pixels outside C where x < 0) / (∫x over C), dimensionless and not negative: the
-      change of the wrong sign round the target, relative to the target. Best zero.
+    - `ringing`: RNG = -(∫x over the pixels outside C where x < 0) / (∫x over C), dimensionless and not negative: change
+      of the wrong sign around the target, relative to the change in the target. Ideally zero.
     - `distance`: r_t, metres.
-    - `body_radius`: metres, of the disc with the body's area; lengths divided by it compare between bodies.
+    - `body_radius`: radius in metres of the disc with the area of the body; lengths divided by it can be compared
+      between bodies.
 
-    All but the first and the last two are NaN for an image without a pixel of the target's sign, where Q is empty; and
-    ringing is infinite where C holds no net change of that sign.
+    All fields except `amplitude_response`, `distance` and `body_radius` are NaN for an image without a pixel of the
+    target's sign, because Q is empty. The ringing is infinite if the net change in C does not have the target's sign.
     """
 
     amplitude_response: Float[Array, "*targets"]
@@ -62,12 +63,12 @@ def figures_of_merit(
     area: Float[Array, "*targets"] | float,
     change: Float[Array, "*targets"] | float = 1.0,
 ) -> FiguresOfMerit:
-    """The GREIT figures of merit of one image (rows, columns), or of many (T, rows, columns), one target in each.
+    """GREIT figures of merit of one image (rows, columns) or of several images (T, rows, columns), each of one target.
 
-    `raster`: change of conductivity on pixels, NaN outside the body, as `Raster.sample` gives it, row 0 at the top;
-    `extent` of the raster, (x_min, x_max, y_min, y_max) in metres. `position` (2,) or (T, 2): centre of each target,
-    metres. `area` of the target, m², and `change`, its change of conductivity, siemens (negative for a resistive
-    target): one number, or (T,). The centre of the body is the centre of gravity of its pixels, whatever its outline.
+    `raster`: change of conductivity on pixels, NaN outside the body, as returned by `Raster.sample`, row 0 at the top;
+    `extent`: (x_min, x_max, y_min, y_max) of the raster in metres. `position`: (2,) or (T, 2) centre of each target in
+    metres. `area`: area of the target in m², and `change`: its change of conductivity in siemens (negative for a
+    resistive target); each a number or (T,). The centre of the body is the centre of gravity of its pixels.
 
     Works under jit and vmap. Raises `ValueError` for arguments whose shapes or values do not fit.
     """
@@ -93,7 +94,7 @@ def _of_one(raster, extent, position, area, change):
     y = (y_max - (jnp.arange(rows) + 0.5) * (y_max - y_min) / rows)[:, None]
     pixel = (x_max - x_min) * (y_max - y_min) / raster.size
     body = jnp.isfinite(raster)
-    value = jnp.where(body, raster, 0) / change  # positive is the target's sign
+    value = jnp.where(body, raster, 0) / change  # positive values have the target's sign
     highest = value.max()
     seen = body & (value >= _LEVEL * highest) & (highest > 0)
     centre, size = _gravity(body, x, y), jnp.sum(body)
@@ -114,7 +115,7 @@ def _of_one(raster, extent, position, area, change):
 
 
 def _gravity(inside, x, y):
-    """Centre of gravity of a set of pixels; NaN for none."""
+    """Centre of gravity of a set of pixels; NaN for an empty set."""
     size = jnp.sum(inside)
     return jnp.stack([jnp.sum(jnp.where(inside, x, 0)), jnp.sum(jnp.where(inside, y, 0))]) / size
 
@@ -163,12 +164,14 @@ RESISTIVE, CONDUCTIVE = 1, 2
 
 
 def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "256 256"]) -> float:
-    """Structural similarity of the conductive and of the resistive mask with the truth's, averaged: 1 is perfect.
+    """Score of the challenge: structural similarity to the true mask, averaged over the conductive and the resistive
+    class; 1 is perfect.
 
-    `labels`, `truth`: 0 background, 1 resistive, 2 conductive; 256 × 256 pixels, as the challenge has it. Means,
-    variances and covariance are taken in Gaussian windows of 80 pixels standard deviation cut at ±160 pixels and
-    normalised at the border; c1 = 1e-4, c2 = 9e-4; mean over all pixels. A class absent from both scores 1. Raises
-    `ValueError` for images of another shape or with other labels. Räsänen et al., KTC2023, doi 10.5281/zenodo.8252370.
+    `labels`, `truth`: 0 background, 1 resistive, 2 conductive; 256 × 256 pixels, as in the challenge. Means, variances
+    and covariance are taken in Gaussian windows with a standard deviation of 80 pixels, cut off at ±160 pixels and
+    normalised at the border; c1 = 1e-4, c2 = 9e-4; mean over all pixels. A class absent from both images scores 1.
+    Raises `ValueError` for images of another shape or with other labels. Räsänen et al., KTC2023, doi
+    10.5281/zenodo.8252370.
     """
     labels, truth = np.asarray(labels), np.asarray(truth)
     for name, image in (("labels", labels), ("truth", truth)):
@@ -181,9 +184,10 @@ def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "
 
 
 def _similarity(first: np.ndarray, second: np.ndarray) -> float:
-    """Structural similarity of two masks, mean over the pixels. Wang et al., IEEE Trans. Image Process. 13 (2004)."""
+    """Structural similarity of two masks, averaged over the pixels. Wang et al., IEEE Trans. Image Process. 13
+    (2004)."""
     window = _window(first.shape[0])
-    # Masks are their own squares.
+    # A mask equals its own square.
     a, b, product = (window @ image.astype(float) @ window.T for image in (first, second, first & second))
     variance_a, variance_b, covariance = a - a**2, b - b**2, product - a * b
     luminance = (2 * a * b + _C1) / (a**2 + b**2 + _C1)
@@ -192,7 +196,8 @@ def _similarity(first: np.ndarray, second: np.ndarray) -> float:
 
 @functools.cache
 def _window(size: int) -> np.ndarray:
-    """Rows of normalised weights along one axis: the window is separable, and so is its normalisation."""
+    """Matrix of normalised Gaussian weights along one axis, one row per pixel; the two-dimensional window is the
+    product of two of them."""
     distance = np.arange(size)[:, None] - np.arange(size)
     weight = np.where(np.abs(distance) <= _REACH, np.exp(-(distance**2) / (2 * _DEVIATION**2)), 0)
     return weight / weight.sum(axis=1, keepdims=True)

@@ -1,9 +1,9 @@
-"""Sections of solids by planes, and isosurfaces of fields on tetrahedra.
+"""Sections of solids by planes, and isosurfaces of fields on tetrahedra, by marching simplices.
 
-Marching simplices: where values at nodes, linear in every cell, pass a level; and the part of a surface above it.
-
-What is cut out of a simplex is a triangle or a quadrilateral, so four corners hold it, the last one twice in a
-triangle. Doi and Koide, IEICE Trans. E74 (1991) 214-224, for tetrahedra; all at once, without a loop over cells.
+A field is given by values at the nodes and is linear in every cell. The part of a simplex where it equals a level, or
+of a triangle where it exceeds the level, is a triangle or a quadrilateral; it is stored as four corners, with the last
+corner repeated for a triangle. Doi and Koide, IEICE Trans. E74 (1991) 214-224, for tetrahedra; all cells are processed
+at once, without a loop.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, describe, is_number
 from jeit.mesh import Mesh, measures
 
-# A tetrahedron's nodes from the highest to the lowest: the ends of the edges that a level passes, round the polygon,
-# by the number of nodes above it.
+# For tetrahedra with nodes sorted from the highest to the lowest value: the end nodes of the edges that the level
+# crosses, in order around the polygon, by the number of nodes above the level.
 _PASSED = {
     1: [[0, 1], [0, 2], [0, 3], [0, 3]],
     2: [[0, 2], [0, 3], [1, 3], [1, 2]],
     3: [[0, 3], [1, 3], [2, 3], [2, 3]],
 }
-# A triangle's: the corners of the part above, a node where both ends are one.
+# For triangles: the corners of the part above the level; a corner at a node has that node as both ends.
 _ABOVE = {
     1: [[0, 0], [0, 1], [0, 2], [0, 2]],
     2: [[0, 0], [1, 1], [1, 2], [0, 2]],
@@ -36,10 +36,10 @@ _EDGE = [[0, 1], [0, 2]]
 
 
 class Pieces(NamedTuple):
-    """Pieces cut out of simplices, one or none of each.
+    """Pieces cut out of simplices, at most one per simplex.
 
-    **Fields**: `ends` (p, c, 2), nodes between which each corner lies; `share` (p, c), how far from the first to the
-    second; `cell` (p,), the simplex that each was cut out of.
+    **Fields**: `ends`: (p, c, 2) nodes between which each corner lies; `share`: (p, c) position of the corner between
+    them, from 0 at the first node to 1 at the second; `cell`: (p,) simplex of each piece.
     """
 
     ends: Int[np.ndarray, "p c 2"]
@@ -47,24 +47,25 @@ class Pieces(NamedTuple):
     cell: Int[np.ndarray, " p"]
 
     def at_corners(self, values: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "p c ..."]:
-        """Values at the corners of a quantity that is linear between nodes, such as their places (n, d)."""
+        """Values at the corners of a quantity that is linear between nodes, such as positions (n, d)."""
         share = self.share.reshape(*self.share.shape, *[1] * (values.ndim - 1))
         return (1 - share) * values[self.ends[..., 0]] + share * values[self.ends[..., 1]]
 
 
 def passed(cells: Int[np.ndarray, "m 4"], values: Float[np.ndarray, " n"], level: float = 0.0) -> Pieces:
-    """The surface in tetrahedra on which `values` (n,) per node have a level: polygons of four corners, in order round
-    them. A node at the level counts as above it, so that two cells never both have the facet between them."""
+    """The surface in tetrahedra where `values` (n,) at the nodes equal `level`: polygons with four corners, in order
+    around each polygon. A node at the level counts as above it, so a facet in the surface is not found from both of its
+    cells."""
     return _cut(cells, values, level, _PASSED)
 
 
 def part_above(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> Pieces:
-    """The part of a surface of triangles on which `values` (n,) per node are at or above a level."""
+    """The part of a surface of triangles where `values` (n,) at the nodes are at or above `level`."""
     return _cut(triangles, values, level, _ABOVE)
 
 
 def passed_edges(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> Pieces:
-    """The lines on a surface of triangles on which `values` (n,) per node have a level: pieces of two corners."""
+    """The lines on a surface of triangles where `values` (n,) at the nodes equal `level`: pieces of two corners."""
     return _cut(triangles, values, level, {1: _EDGE, 2: [[0, 2], [1, 2]]})
 
 
@@ -84,14 +85,15 @@ def _cut(cells, values, level: float, cases: dict[int, list[list[int]]]) -> Piec
 
 @dataclass(frozen=True)
 class TriangleSurface:
-    """A surface of triangles in space: `points` (n, 3) metres, `triangles` (m, 3) into them, with normals outward."""
+    """A surface of triangles in space. **Fields**: `points`: (n, 3) metres; `triangles`: (m, 3) indices of points,
+    ordered so that normals point outward."""
 
     points: Float[np.ndarray, "n 3"]
     triangles: Int[np.ndarray, "m 3"]
 
     @property
     def enclosed(self) -> float:
-        """The volume enclosed by a closed surface, m³."""
+        """Volume enclosed by a closed surface, in m³."""
         a, b, c = (
             np.swapaxes(self.points[self.triangles] - self.points.mean(axis=0), 0, 1)
             if len(self.points)
@@ -101,8 +103,9 @@ class TriangleSurface:
 
 
 def node_values(mesh: Mesh, image: Float[np.ndarray, "..."]) -> Float[np.ndarray, " n"]:
-    """An image at the nodes (n,): of values per cell (m,) the mean of the cells round each node, weighted by their
-    measure; values per node as they are. Raises `ValueError` for another shape, complex values and NaN."""
+    """Values (n,) of an image at the nodes. Values per cell (m,) are averaged over the cells around each node, weighted
+    by their measure; values per node are returned unchanged. Raises `ValueError` for another shape, complex values and
+    NaN."""
     values = np.asarray(image)
     if values.shape not in ((mesh.num_cells,), (mesh.num_points,)):
         raise ValueError(
@@ -122,11 +125,11 @@ def node_values(mesh: Mesh, image: Float[np.ndarray, "..."]) -> Float[np.ndarray
 
 
 def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) -> TriangleSurface:
-    """The closed surface round where an image exceeds `level`, or for a negative level falls below it.
+    """The closed surface of the region where an image exceeds `level`, or, for a negative level, falls below it.
 
-    `values` (m,) per cell, which are averaged to nodes first, or (n,) per node; linear in between. Where the region
-    touches the wall, the wall closes it. Without triangles where the image does not get there. Raises `ValueError` for
-    a level that is zero or no number, and as `node_values`.
+    `values`: (m,) per cell, which are averaged to the nodes first, or (n,) per node; linear in between. Where the
+    region reaches the wall of the body, the wall closes the surface. The surface has no triangles if no value reaches
+    the level. Raises `ValueError` for a level that is zero or not a number, and as `node_values`.
     """
     check_solid(mesh)
     if not is_number(level) or level == 0:
@@ -136,7 +139,7 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
     points = np.asarray(mesh.points)
     inner, wall = passed(np.asarray(mesh.cells), height), part_above(np.asarray(mesh.facets), height)
     ends, share = np.concatenate([inner.ends, wall.ends]), np.concatenate([inner.share, wall.share])
-    # One point for each edge passed and each node of the wall, whichever cells share it.
+    # One point for each crossed edge and each node of the wall, shared between cells.
     ends = np.where(
         ((share == 0) | (share == 1))[..., None], np.where(share == 1, ends[..., 1], ends[..., 0])[..., None], ends
     )
@@ -146,7 +149,7 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
     _, first, number = np.unique(key, return_index=True, return_inverse=True)
     ends, share, number = ends.reshape(-1, 2)[first], share.reshape(-1)[first], number.reshape(-1, 4)
     places = (1 - share)[:, None] * points[ends[:, 0]] + share[:, None] * points[ends[:, 1]]
-    # Outward is from what is above to what is below; the wall's facets have their normals outward.
+    # Normals point from values above the level to values below it; facets of the wall have outward normals already.
     inside = points[inner.ends[..., 1]].sum(axis=1) - points[inner.ends[..., 0]].sum(axis=1)
     outward = np.concatenate([inside, _normals(points[np.asarray(mesh.facets)[wall.cell]])])
     triangles = np.concatenate([number[:, [0, 1, 2]], number[:, [0, 2, 3]]])
@@ -157,23 +160,24 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
 
 
 def _normals(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
-    """Normals of triangles, twice as long as their area."""
+    """Normals of triangles, with a length of twice the area."""
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 AXES = ("x", "y", "z")
-# Distance from a plane within which points lie in it, over the size of the body.
+# Tolerance for treating a point as lying in a plane: its distance from the plane divided by the size of the body.
 _IN_IT = 1e-9
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane in space and how it is looked at: `toward` the viewer, with `right` and `up` on the page.
+    """A plane in space, with the orientation in which it is viewed.
 
-    **Fields**: `point` (3,) metres; `toward`, `right`, `up` (3,), unit vectors at right angles; `name`, what pictures
-    call it, such as "z = 10 mm".
+    **Fields**: `point`: (3,) metres; `toward`, `right`, `up`: (3,) perpendicular unit vectors towards the viewer, to
+    the right and upwards on the page; `name`: name for figures, such as "z = 10 mm".
 
-    z points up on the page, or in horizontal planes y. Make one with `Plane.at` or `Plane.through`.
+    The z axis points up on the page; in horizontal planes the y axis does. Make a plane with `Plane.at` or
+    `Plane.through`.
     """
 
     point: np.ndarray
@@ -184,8 +188,9 @@ class Plane:
 
     @classmethod
     def at(cls, axis: str, value: float) -> "Plane":
-        """The plane on which `axis`, "x", "y" or "z", is `value` metres: seen from the right, the front or above, so
-        that the two other axes point to the right and up. Raises `ValueError`."""
+        """The plane where the coordinate `axis`, "x", "y" or "z", equals `value` metres. It is viewed from the right,
+        the front or above, so that the two other axes point to the right and up. Raises `ValueError` for another axis
+        or a value that is not a number."""
         if axis not in AXES:
             raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
         if not is_number(value):
@@ -197,8 +202,8 @@ class Plane:
 
     @classmethod
     def through(cls, point: ArrayLike, normal: ArrayLike) -> "Plane":
-        """The plane through `point` (3,) metres at right angles to `normal` (3,), which points at the viewer. Raises
-        `ValueError` for what is no place or no direction."""
+        """The plane through `point` (3,), in metres, perpendicular to `normal` (3,), which points towards the viewer.
+        Raises `ValueError` unless both are three finite numbers and the normal is not zero."""
         place, direction = (np.asarray(one, dtype=object) for one in (point, normal))
         for name, value in (("point", place), ("normal", direction)):
             if value.shape != (3,) or not all(is_number(one) for one in value):
@@ -215,11 +220,12 @@ class Plane:
         return cls(place, toward, *_page(toward), f"through ({where}) mm across ({across})")
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-        """Distance of places (n, 3) from the plane, metres, positive towards the viewer."""
+        """Distance of points (n, 3) from the plane in metres, positive towards the viewer."""
         return (points - self.point) @ self.toward
 
     def on_page(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-        """Coordinates (…, 2) to the right and up, metres; along the axes of a plane of `Plane.at` the body's own."""
+        """Coordinates (…, 2) of points to the right and up on the page, in metres. In a plane made with `Plane.at` they
+        are measured along the coordinate axes of the body."""
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
 
@@ -227,8 +233,9 @@ class Plane:
 class Cut:
     """Section of a solid by a plane.
 
-    **Fields**: `polygons` (p, 4, 2), metres on the page of the plane, the last corner twice in triangles; `cell` (p,),
-    the cell that each is of; `outline` (s, 2, 2), lines where the plane meets the surface of the body.
+    **Fields**: `polygons`: (p, 4, 2) corners in metres on the page of the plane, with the last corner repeated in
+    triangles; `cell`: (p,) cell of each polygon; `outline`: (s, 2, 2) line segments where the plane meets the surface
+    of the body.
     """
 
     polygons: Float[np.ndarray, "p 4 2"]
@@ -237,17 +244,17 @@ class Cut:
 
     @property
     def area(self) -> float:
-        """Area of all polygons together, m²."""
+        """Total area of the polygons in m²."""
         corners = self.polygons
         x, y = corners[..., 0], corners[..., 1]
         return float(0.5 * np.abs(np.sum(x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y, axis=1)).sum())
 
 
 def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
-    """The cells of a solid that a plane passes through, as polygons, and the outline of the cut: exact.
+    """Exact section of a solid by a plane: the cells as polygons, and the outline of the section.
 
-    A plane along facets of the mesh cuts the cells behind it, and those before it where there are none behind. Raises
-    `ValueError` for a mesh that is no solid, and for a plane that misses it.
+    A plane that contains facets of the mesh cuts the cells behind it, or those in front of it if there are none behind.
+    Raises `ValueError` for a mesh that is not a solid, and for a plane that misses it.
     """
     check_solid(mesh)
     check_kind("plane", plane, Plane, "a Plane, such as Plane.at('z', 0.02)")
@@ -267,14 +274,14 @@ def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
 
 
 def check_solid(mesh: Mesh) -> None:
-    """Raises `ValueError` for what is no mesh of tetrahedra."""
+    """Raise `ValueError` unless `mesh` is a mesh of tetrahedra."""
     check_kind("mesh", mesh, Mesh, "a Mesh, such as jeit.mesh.box(0.1, 0.1, 0.05)")
     if mesh.cells.shape[1] != 4:
         raise ValueError("mesh: this is for solids of tetrahedra; draw a plane mesh with plot_image.")
 
 
 def _page(toward) -> tuple[np.ndarray, np.ndarray]:
-    """Right and up on the page, of a plane looked at from a direction."""
+    """Unit vectors to the right and up on the page, for a plane viewed from the direction `toward`."""
     upward = (
         np.array([0.0, 0.0, 1.0]) if abs(toward[2]) < 1 - 1e-9 else np.array([0.0, math.copysign(1, toward[2]), 0.0])
     )
@@ -284,6 +291,6 @@ def _page(toward) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _millimetres(value: float) -> str:
-    # A tenth of a millimetre, or in a small body three digits.
+    # Rounded to a tenth of a millimetre, or for small values to three digits.
     text = f"{1e3 * value:.1f}".removesuffix(".0") if abs(value) >= 0.0095 else f"{1e3 * value:.3g}"
     return text.replace("-", "−") if abs(value) > 5e-10 else "0"

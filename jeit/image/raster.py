@@ -1,4 +1,4 @@
-"""Rasters: an image on the cells of a mesh, sampled on a grid of pixels."""
+"""Rasters: images on the cells of a mesh, sampled on a grid of pixels."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jeit_solvers.engines import as_array, either_engine, namespace
 
 
 class Raster(eqx.Module):
-    """Grid of pixels with the cell that each lies in: made once for a mesh, used for every image on it.
+    """Grid of pixels with the cell that contains each pixel; made once for a mesh and used for every image on it.
 
-    **Fields**: `cell` (rows, columns), index of the cell that holds the pixel's centre, or -1 outside the mesh; row 0
-    at the top (largest y), column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres, the outer edges of
-    the outermost pixels.
+    **Fields**: `cell`: (rows, columns) index of the cell that contains the centre of the pixel, or -1 outside the mesh;
+    row 0 is at the top (largest y), column 0 at the left; `extent`: (x_min, x_max, y_min, y_max) in metres, the outer
+    edges of the outermost pixels.
     """
 
     cell: Int[Array, "rows columns"]
@@ -31,10 +31,9 @@ class Raster(eqx.Module):
         extent: tuple[float, float, float, float] | None = None,
         height: float | None = None,
     ) -> "Raster":
-        """`shape`: (rows, columns). `extent`: metres; the smallest square round the mesh unless given. `height`: z of
-        the slice through a 3-D mesh, metres (half way up unless given). Raises `ValueError` for an empty extent,
-        and for a surface in space.
-        """
+        """Make a raster of a mesh. `shape`: (rows, columns). `extent`: in metres; by default the smallest square around
+        the mesh. `height`: z in metres of the slice through a 3-D mesh, by default half of its height. Raises
+        `ValueError` for an empty extent, and for a surface in space."""
         check_flat(mesh, "rasters")
         points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
         low, high = points.min(axis=0), points.max(axis=0)
@@ -56,12 +55,12 @@ class Raster(eqx.Module):
 
     @property
     def pixel_area(self) -> float:
-        """Area of a pixel, m²."""
+        """Area of a pixel in m²."""
         x_min, x_max, y_min, y_max = self.extent
         return (x_max - x_min) * (y_max - y_min) / self.cell.size
 
     def pixel_centres(self) -> np.ndarray:
-        """Centres of the pixels, (rows, columns, 2) metres."""
+        """Centres of the pixels (rows, columns, 2) in metres."""
         rows, columns = self.cell.shape
         x_min, x_max, y_min, y_max = self.extent
         x = x_min + (np.arange(columns) + 0.5) * (x_max - x_min) / columns
@@ -69,7 +68,7 @@ class Raster(eqx.Module):
         return np.stack(np.meshgrid(x, y), axis=-1)
 
     def sample(self, image: Inexact[Array, "*frames m"]) -> Float[Array, "*frames rows columns"]:
-        """Values of one image (m,) or many (F, m) at the pixels, NaN outside the mesh."""
+        """Values at the pixels of one image (m,) or several images (F, m); NaN outside the mesh."""
         return _sample(self.cell, image)
 
 
@@ -80,10 +79,10 @@ def _sample(cell, image):
 
 
 def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Index of the cell that holds each position (q, d), -1 where none does.
+    """Index of the cell that contains each position (q, d), -1 for positions outside all cells.
 
-    Tries the cells with the nearest centroids first and widens the search for what is left; of a slice's positions only
-    cells that it cuts.
+    Tests the cells with the nearest centroids first, and widens the search for the remaining positions. Only cells in
+    the bounding box of the positions are considered, for a slice those that it cuts.
     """
     corners = points[cells]
     slack = 1e-9 * np.ptp(points, axis=0).max()
@@ -106,7 +105,7 @@ def find_cells(points: np.ndarray, cells: np.ndarray, positions: np.ndarray) -> 
         inside = np.minimum(local.min(axis=-1), 1 - local.sum(axis=-1)) > -1e-9
         hit = inside.any(axis=1)
         found[left[hit]] = near[candidate[hit, inside[hit].argmax(axis=1)]]
-        # A cell cannot hold what is farther from its centroid than its farthest corner.
+        # A cell cannot contain a position that is farther from its centroid than its farthest corner.
         left = left[~hit & (distance[:, -1] <= reach)]
         tried, number = number, 4 * number
     return found

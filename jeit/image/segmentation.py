@@ -1,4 +1,4 @@
-"""Images cut into regions: by thresholds, and by watersheds."""
+"""Segmentation of images: regions by geometry, by thresholds and by watersheds."""
 
 from __future__ import annotations
 
@@ -14,51 +14,57 @@ from jeit.mesh.geometry import interior_facets
 
 
 def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray, " m"]:
-    """(m,) True for cells whose centroid lies within `radius` metres of `centre` (d,); in a sheet a disk.
+    """(m,) True for cells whose centroid lies within `radius` metres of `centre` (d,); a disk in a sheet.
 
-    Raises `ValueError` for a centre of other coordinates, a radius that is not positive, and where no cell is left.
+    Raises `ValueError` for a centre with another number of coordinates, a radius that is not positive, and an empty
+    region.
     """
     if not (is_number(radius) and radius > 0):
         raise ValueError(f"radius must be a positive number of metres; it is {describe(radius)}.")
-    distance = np.linalg.norm(_from(mesh, centre, "centre"), axis=1)
-    return _some(mesh, distance <= radius, "no centroid of a cell is so near to centre; make radius larger")
+    distance = np.linalg.norm(_centroids_from(mesh, centre, "centre"), axis=1)
+    return _check_not_empty(mesh, distance <= radius, "no centroid of a cell is so near to centre; make radius larger")
 
 
 def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarray, " m"]:
-    """(m,) True for cells whose centroid lies between the corners `lower` and `upper` (d,), metres.
+    """(m,) True for cells whose centroid lies between the corners `lower` and `upper` (d,), in metres.
 
-    Raises `ValueError` for corners of other coordinates or the wrong way round, and where no cell is left.
+    Raises `ValueError` for corners with another number of coordinates, for a corner `upper` that is not larger than
+    `lower`, and for an empty region.
     """
-    above, below = _from(mesh, lower, "lower"), _from(mesh, upper, "upper")
+    above, below = _centroids_from(mesh, lower, "lower"), _centroids_from(mesh, upper, "upper")
     if not (np.asarray(lower, float) < np.asarray(upper, float)).all():
         raise ValueError("upper must be larger than lower in every coordinate.")
     between = (above >= 0).all(axis=1) & (below <= 0).all(axis=1)
-    return _some(mesh, between, "no centroid of a cell lies between lower and upper")
+    return _check_not_empty(mesh, between, "no centroid of a cell lies between lower and upper")
 
 
 def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None) -> Bool[np.ndarray, " m"]:
-    """(m,) True for cells whose centroid lies from `point` (d,) metres in `direction` (d,): the right half for (1, 0).
+    """(m,) True for cells whose centroid lies in `direction` (d,) from `point` (d,), in metres; direction (1, 0)
+    selects the right half.
 
-    `point`: the body's own middle unless given. Raises `ValueError` for a direction of length zero, and where no cell
-    is left.
+    `point`: by default the centroid of the body. Raises `ValueError` for a direction of length zero, and for an empty
+    region.
     """
     towards = np.asarray(direction, float)
     if towards.shape != (mesh.dimension,) or not np.isfinite(towards).all() or not towards.any():
         raise ValueError(f"direction must be {mesh.dimension} finite numbers, not all zero; it is {direction!r}.")
     size = np.asarray(measures(mesh))
     middle = size @ np.asarray(centroids(mesh)) / size.sum() if point is None else point
-    return _some(mesh, _from(mesh, middle, "point") @ towards > 0, "no cell lies in direction of point")
+    return _check_not_empty(
+        mesh, _centroids_from(mesh, middle, "point") @ towards > 0, "no cell lies in direction of point"
+    )
 
 
-def _from(mesh: Mesh, place: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
-    """Centroids, seen from a place."""
+def _centroids_from(mesh: Mesh, place: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
+    """Centroids of the cells relative to a place. Raises `ValueError` for a place with another number of
+    coordinates."""
     given = np.asarray(place, float)
     if given.shape != (mesh.dimension,) or not np.isfinite(given).all():
         raise ValueError(f"{name} must be {mesh.dimension} finite numbers in metres; it has shape {given.shape}.")
     return np.asarray(centroids(mesh)) - given
 
 
-def _some(mesh: Mesh, chosen, nothing: str) -> Bool[np.ndarray, " m"]:
+def _check_not_empty(mesh: Mesh, chosen, nothing: str) -> Bool[np.ndarray, " m"]:
     if not chosen.any():
         points = np.asarray(mesh.points)
         low, high = (", ".join(f"{x:.2g}" for x in one) for one in (points.min(axis=0), points.max(axis=0)))
@@ -67,7 +73,7 @@ def _some(mesh: Mesh, chosen, nothing: str) -> Bool[np.ndarray, " m"]:
 
 
 def shared_facets(mesh: Mesh) -> Int[np.ndarray, "m k"]:
-    """Numbers of the facets that each cell shares with another, -1 for those on the boundary; once per mesh."""
+    """Indices (m, k) of the facets that each cell shares with another cell, -1 for facets on the boundary."""
     pairs, _ = interior_facets(mesh)
     cell, facet = pairs.T.ravel(), np.tile(np.arange(len(pairs)), 2)
     order = np.argsort(cell, kind="stable")
@@ -84,11 +90,12 @@ def basins(
     floor: float,
     least_prominence: float,
 ) -> Int[np.ndarray, " m"]:
-    """The peak (a cell's index) that every cell above `floor` belongs to, -1 below: a watershed from the top down.
+    """Watershed from the top down: for every cell above `floor` the index of the cell at the peak that it belongs to,
+    -1 for cells below.
 
-    `change` (m,) of every cell, and numbers of what it shares with others, its facets (`shared_facets`) or nodes, -1
-    for none. Where two basins meet, the lower one is swallowed unless its peak stands out from the meeting point, by
-    `least_prominence` times its height.
+    `change`: (m,) value of every cell; `shared`: (m, k) indices of the facets (`shared_facets`) or nodes that cells
+    share, -1 for none. Where two basins meet, the lower one is merged into the higher one, unless its peak exceeds the
+    meeting point by at least `least_prominence` times its height.
     """
     peak = np.full(len(change), -1)
     reached: dict[int, int] = {}
@@ -122,11 +129,12 @@ def segment(
 ) -> UInt8[np.ndarray, "rows columns"]:
     """Labels of the pixels: 0 background, 1 resistive, 2 conductive; 0 outside the body.
 
-    `image` (rows, columns): departure from the background, negative where resistive, NaN outside the body; for absolute
-    images the logarithm of conductivity over background, which weighs both signs alike. Either sign is kept if its peak
-    is at least `least_peak` times the strongest of both, and covers what exceeds `level` times its own peak: where that
-    is half, the middle of a blurred edge. Islands of less than `least_area` of the body are artefacts. Raises
-    `ValueError` for an image that is not two-dimensional, or has no pixel inside the body.
+    `image`: (rows, columns) deviation from the background, negative where resistive, NaN outside the body. For absolute
+    images give the logarithm of conductivity divided by background, which weights both signs equally. A sign is
+    labelled if its peak is at least `least_peak` times the strongest peak of both signs; its label covers the pixels
+    above `level` times the peak (one half is the middle of a blurred edge). Islands smaller than the fraction
+    `least_area` of the body are artefacts. Raises `ValueError` for an image that is not two-dimensional, or has no
+    pixel inside the body.
     """
     values = np.asarray(image)
     if values.ndim != 2 or np.iscomplexobj(values):

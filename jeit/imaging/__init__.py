@@ -1,9 +1,10 @@
-"""Imaging in one call: `image_difference` makes an image of two frames, `compare_on_data` compares the rules for λ on
-them.
+"""Imaging in one call: `image_difference` images the difference of two frames, `compare_on_data` compares the rules for
+the hyperparameter λ on it.
 
-`settings` holds the settings, `preparation` checks, meshes and calibrates, `wiring` finds wiring that is not as
-described, `method` images, `automatic` chooses the method, `difference` finds inclusions, `sequence` images many frames
-at once and `stream_preparation` prepares for imaging frame after frame. Streams of a touched skin are in `jeit.touch`.
+`preparation` checks the data, builds the mesh and calibrates the model; `wiring` detects wiring that differs from its
+description; `method` holds the settings and the imaging methods; `automatic` chooses a method; `difference` finds
+inclusions; `sequence` images many frames at once; `stream_preparation` prepares imaging frame by frame. Streams of
+tactile skins are in `jeit.touch`.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Automatic choice of the method: one step where it is sound, else Gauss-Newton and shapes of strong bodies; and the
-reason."""
+"""Automatic choice of the imaging method, with its reason: one-step imaging where the linear image is sound, otherwise
+Gauss-Newton imaging and a fit of the shapes of bodies."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.prior.matern import MEASURED
 from jeit.inverse.shapes import ShapeReconstruction
 
-# Change relative to the background beyond which voltages are far from linear in it; and beyond which the same is
-# assumed where noise is such a share of the difference that images are damped far below the true change.
+# Changes relative to the background above which voltages are not linear in conductivity: in general, and for noisy
+# data, whose images are damped far below the true change. Share of noise in the difference above which data are noisy.
 _STRONG, _STRONG_IN_NOISE, _NOISY = 0.3, 0.1, 0.3
-# Share of the voltages that a linear image may miss: relative to the share missed if voltages are linear in it, and in
-# all.
+# Tolerances for the share of the difference that the voltages of a linear image do not explain: relative to the share
+# not explained in the linear approximation, and absolute.
 _WORSE, _MUCH = 1.1, 0.1
-# Share of the background that conductivity is kept above where a linear image claims less.
+# Lower bound of the conductivity of a linear image, as a share of the background.
 _LEAST = 0.01
-# Change relative to the background beyond which bodies are looked for in a solid, where smooth images are poorest.
+# Maximum change of an image, relative to the background, above which bodies are fitted in a solid.
 _LEAST_FOR_BODIES = 0.05
-# Step along the linear image that gives its derivative.
+# Step along the linear image for the finite difference that approximates the derivative of the voltages.
 _STEP = 1e-4
 
 
 class Chosen(NamedTuple):
-    """**Fields**: `method` chosen; `why`, in a sentence; what it `imaged`; `shapes` of the bodies in it, if those
-    explain the voltages."""
+    """**Fields**: `method`: name of the chosen method; `why`: the reason, in a sentence; `imaged`: its result;
+    `shapes`: the fitted bodies, if they explain the voltages."""
 
     method: str
     why: str
@@ -40,11 +40,12 @@ class Chosen(NamedTuple):
 
 
 def image_automatically(prepared: PreparedDifference, asked: Asked, segmented: bool = False) -> Chosen:
-    """The one-step image, unless it is unsound; then Gauss-Newton's with its bodies as shapes, unless that fails.
+    """Compute the one-step image if it is sound, otherwise the Gauss-Newton image with its bodies fitted as shapes. If
+    Gauss-Newton imaging fails, the one-step image is returned.
 
-    In a solid, bodies are also looked for where the one-step image is sound, unless a prior was asked for, which would
-    only apply to the field beside them. Each method uses its default λ, not the one asked for. Where the image is to be
-    `segmented` and there are no shapes, it is made by total variation.
+    In a solid with the default prior, bodies are also fitted where the one-step image is sound. Each method uses its
+    default λ, not the requested one. If the image is to be `segmented` and no shapes were fitted, total variation is
+    used.
     """
     imaged = _by("one-step", prepared, asked)
     if np.iscomplexobj(prepared.difference):
@@ -69,14 +70,14 @@ def image_automatically(prepared: PreparedDifference, asked: Asked, segmented: b
 
 
 def _by(name: str, prepared: PreparedDifference, asked: Asked) -> Imaged:
-    """The image by the method of that name, with its own λ."""
+    """Image by the method `name` with its default λ."""
     method = METHODS[name]
     return method.image(prepared, asked._replace(hyperparameter=method.hyperparameter))
 
 
 def _bodies_in_solid(prepared: PreparedDifference, asked: Asked, change: Float[Array, " m"]) -> Chosen | None:
-    """Bodies that the data of a solid support, where a sound linear image shows more than a trace and the noise allows
-    it."""
+    """Fit bodies to the data of a solid; None for sheets, weak changes (see `_LEAST_FOR_BODIES`), noisy data, or if no
+    bodies explain the voltages."""
     noise = prepared.quality.difference_noise
     strongest = np.abs(np.asarray(change)).max() / float(prepared.calibration.conductivity)
     if prepared.mesh.dimension < 3 or strongest < _LEAST_FOR_BODIES or (noise is not None and noise.relative > _NOISY):
@@ -92,28 +93,30 @@ def _bodies_in_solid(prepared: PreparedDifference, asked: Asked, change: Float[A
 
 
 def _with_bodies(prepared: PreparedDifference, why: str, smooth: Imaged, shapes: ShapeReconstruction | None) -> Chosen:
-    """In a sheet the smooth image, with outlines beside it; in a solid that of the bodies and what is smooth beside
-    them: a smooth image alone shows strong ones at a tenth of their contrast there, with ghosts about as strong."""
+    """Result with fitted bodies: for a sheet, the smooth image and the outlines; for a solid, the image of the bodies
+    and of the smooth field around them. In a solid, a smooth image alone shows strong bodies at a tenth of their
+    contrast, with artefacts about as strong."""
     if shapes is None or prepared.mesh.dimension < 3:
         return Chosen("gauss-newton", why, smooth, shapes)
     return Chosen("shapes", why, of_shapes(prepared, shapes), shapes)
 
 
 def _edges(prepared: PreparedDifference) -> str:
-    """Name of the bodies' boundaries."""
+    """Word for the boundaries of bodies, for messages: surfaces in a solid, outlines in a sheet."""
     return "surfaces" if prepared.mesh.dimension == 3 else "outlines"
 
 
 def _shapes(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked) -> ShapeReconstruction | None:
-    """The bodies of a smooth image as shapes, if there are any and they explain the voltages within what sharp outlines
-    may miss, or as well as the image does."""
+    """Fit the bodies of a smooth image as shapes; None if none are found, or if their misfit exceeds both that of the
+    smooth image and one standard deviation of `PreparedDifference.sharp_noise`."""
     found = shapes_in(prepared, smooth, asked)
     explains = float(found.misfit) <= max(1.0, float(smooth.misfit))
     return found if found.bodies and explains else None
 
 
 def unsound(prepared: PreparedDifference, change: Float[Array, " m"]) -> str:
-    """Fault of a linear image, S/m (2-D: S) per cell, in half a sentence; empty if there is none."""
+    """Describe the fault of a linear image, the `change` of conductivity per cell in S/m (2-D: S); empty if it has
+    none."""
     background, relative = float(prepared.calibration.conductivity), np.asarray(change)
     relative = relative / background
     lowest, highest = float(relative.min()), float(relative.max())
@@ -130,7 +133,8 @@ def unsound(prepared: PreparedDifference, change: Float[Array, " m"]) -> str:
 
 
 def _missed(prepared: PreparedDifference, background: float, relative: np.ndarray, step: float) -> float:
-    """Share of the difference that is missed by a step along the image, over its length; in the noise's norm."""
+    """Share of the measured difference that is not explained by the change of voltages for a step along the image,
+    divided by the length of the step. The norm is weighted by the inverse of the noise."""
     model, used = prepared.model, np.asarray(prepared.mask)
     conductivity = background * np.maximum(1 + step * relative, _LEAST)
     predicted = (np.asarray(model.voltages(conductivity)) - np.asarray(model.voltages(background))) / step

@@ -1,6 +1,6 @@
-"""Comparison of the rules for the hyperparameter on one measured difference: the λ that each chooses, and its image.
+"""Comparison of the rules for the hyperparameter on one measured difference: the λ chosen by each, and its image.
 
-This is what `jeit choose` runs, as one function; on simulated data use `jeit.inverse.compare_rules`.
+The command `jeit choose` runs `compare_on_data`; for simulated data see `jeit.inverse.compare_rules`.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from jeit.inverse.linearisation import Linearisation
 class RuleOutcome:
     """Result of one rule for a difference.
 
-    - `choice`: the λ chosen, and the curve it was chosen by.
-    - `residual`: ‖w (v - Jx)‖ / ‖w v‖, the share of the difference that its image leaves unexplained.
-    - `noise_figure`: signal-to-noise ratio of the data over that of the image (see `jeit.inverse.RULES`).
+    - `choice`: the chosen λ, and the curve from which it was chosen.
+    - `residual`: ‖w (v - Jx)‖ / ‖w v‖, the share of the difference v not explained by the image x.
+    - `noise_figure`: signal-to-noise ratio of the data divided by that of the image (see `jeit.inverse.RULES`).
     - `change`: the image, change of conductivity per cell (m,), S/m (2-D: S).
-    - `inclusions`: found in it, strongest first.
+    - `inclusions`: inclusions found in the image, strongest first.
     """
 
     choice: Choice
@@ -45,10 +45,10 @@ class RuleOutcome:
 class ComparedRules:
     """Result of `compare_on_data`.
 
-    - `prepared`: the difference that was imaged.
-    - `settings`: the settings used; the prior is in them.
+    - `prepared`: the imaged difference.
+    - `settings`: the settings used, among them the prior.
     - `outcomes`: the result of each rule, by name.
-    - `refused`: rules that could not choose, by name, with the reason.
+    - `refused`: the reason why a rule could not choose λ, by name of the rule.
     """
 
     prepared: PreparedDifference
@@ -66,12 +66,12 @@ def compare_on_data(
     frame: int | str | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ComparedRules:
-    """Image what changed between a reference frame and a frame of `measurement`, once for each rule's hyperparameter.
+    """Image the change between a reference frame and a frame of `measurement` with the hyperparameter of each rule.
 
-    `rules`: names in `jeit.inverse.RULES`, all unless given. Of `settings` the prior, the mesh and the calibration are
-    used; the images are one-step's. Other arguments and errors as in `jeit.imaging.image_difference`; a rule that
-    cannot work on these data is `refused`, unless it is the only one asked for. Raises `ValueError` for a rule that
-    there is not, and as they do.
+    `rules`: names in `jeit.inverse.RULES`; default: all. The images are computed by one-step imaging; `settings` gives
+    the prior, the mesh, the calibration and the search for inclusions. Other arguments as in
+    `jeit.imaging.image_difference`. A rule that cannot be applied to the data is listed in `refused`, or raises
+    `ValueError` if it is the only one requested. Raises `ValueError` for unknown rules, and as `image_difference`.
     """
     settings = as_settings(settings)
     names = list(dict.fromkeys(RULES if rules is None else rules))

@@ -1,7 +1,7 @@
 """Difference imaging of two frames: check, mesh, calibrate, image, and find inclusions.
 
-This is what `jeit reconstruct` runs, as one function. Its steps are the public functions of `jeit.data`,
-`jeit.imaging.preparation`, `jeit.inverse` and `jeit.image`; take them from there for anything out of the ordinary.
+The command `jeit reconstruct` runs `image_difference`. Its steps are public functions of `jeit.data`,
+`jeit.imaging.preparation`, `jeit.inverse` and `jeit.image`, which can also be called one by one.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ from jeit_solvers import Status
 from jeit_solvers.engines import as_array
 
 _MIDDLE = 0.5
-# Greatest misfit of an image's voltages, in standard deviations, that raises no doubt.
+# Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
-# Least share of usable voltages, and range of plausible conductivities in S/m, from tap water and fat to brine, with a
-# margin on both sides.
+# Minimum share of usable voltages that raises no doubt, and range of plausible conductivities in S/m: from tap water
+# and fat to brine, with a margin on both sides.
 _FEW_CHANNELS, _CONDUCTIVITIES = 0.5, (1e-3, 30.0)
 
 
@@ -47,25 +47,24 @@ class ImagedDifference:
 
     - `measurement`, `reference`: the two frames compared, one frame each.
     - `quality`: the quality of the data, assessed before imaging.
-    - `settings`: the settings used, with automatic choices filled in; `why`: the reason for the method, where it was
-      chosen automatically.
-    - `wiring`: how electrodes and channels seem to be connected.
-    - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
-    - `reconstruction`: the reconstruction matrix, or what the iteration found, or the shapes; with the hyperparameter
+    - `settings`: the settings used, with automatic choices filled in.
+    - `why`: the reason for the method, if it was chosen automatically.
+    - `wiring`: the estimated connection of electrodes and channels.
+    - `calibration`: the forward model fitted to the reference, with its mesh.
+    - `reconstruction`: the reconstruction matrix, the result of the iteration, or the shapes; with the hyperparameter
       used and the rule that chose it.
-    - `change`: change of conductivity in every cell (m,), S/m (2-D: S); against `calibration.conductivity`. Of complex
-      voltages the change of admittivity σ + iωε, complex like the background.
-    - `raster`: `change` on a grid, NaN outside the mesh; `extent` (x_min, x_max, y_min, y_max) in metres.
-    - `inclusions`: regions of changed conductivity, strongest first; iterative images are looked at on the scale of the
-      logarithm, which weighs both signs alike, and for what stands out of the noise; complex ones in the real part.
-      Where there are `shapes`, those.
-    - `unlike_electrodes`: electrodes, counted from 0, which the model fits far worse than the others, with the ratio of
-      the misfits; channels that read them count less.
-    - `shapes`: bodies with their outlines, and what each explains; None where none were fitted, or they do not
-      explain the voltages.
-    - `labels`: 0 background, 1 resistive, 2 conductive for every pixel of the raster, if asked for.
-    - `timings`: seconds of each step.
-    - `frame`: the number in its file of the frame imaged, from 0, of `num_frames`.
+    - `change`: change of conductivity in every cell (m,), S/m (2-D: S), relative to `calibration.conductivity`. For
+      complex voltages, the complex change of admittivity σ + iωε.
+    - `raster`: `change` on a grid, NaN outside the mesh; `extent`: (x_min, x_max, y_min, y_max) in metres.
+    - `inclusions`: regions of changed conductivity, strongest first; the `shapes` if there are any. In iterative images
+      they are found in the logarithm of conductivity, which weights both signs alike, and must exceed the noise; in
+      complex images, in the real part.
+    - `unlike_electrodes`: electrodes, numbered from 0, that the model fits far worse than the others, with the ratio of
+      the misfits. Channels that measure on them have less weight.
+    - `shapes`: fitted bodies with their outlines; None if none were fitted, or if they do not explain the voltages.
+    - `labels`: label of every pixel of the raster, if requested: 0 background, 1 resistive, 2 conductive.
+    - `timings`: duration of each step in seconds.
+    - `frame`: number of the imaged frame in its file, from 0; `num_frames`: number of frames in the file.
     """
 
     measurement: Measurement
@@ -89,13 +88,14 @@ class ImagedDifference:
 
     @property
     def lowest(self) -> float:
-        """Least change relative to the background; below -1 the linear image claims a negative conductivity."""
+        """Minimum change relative to the background; below -1, a linear image has negative conductivities."""
         return float(np.real(self.change).min()) / float(np.real(self.calibration.conductivity))
 
     @property
     def peak_ranges(self) -> tuple[tuple[float, float], ...]:
-        """Range of the change in each inclusion, S/m (2-D: S): one standard deviation either way, over both kinds where
-        the data do not distinguish an ellipsoid from a column; empty where the data do not determine it."""
+        """Range of the change in each inclusion, S/m (2-D: S): plus or minus one standard deviation. If the data do not
+        distinguish an ellipsoid from a column, the range covers both. Empty without shapes, or if the data do not
+        determine the contrast of one of them."""
         if self.shapes is None or not all(one.contrast_is_determined for one in self.shapes.bodies):
             return ()
         background, bodies = float(self.calibration.conductivity), self.shapes.bodies
@@ -110,26 +110,26 @@ class ImagedDifference:
 
     @property
     def mesh(self) -> Mesh:
-        """The mesh imaged on: of bodies in a solid finer at their surfaces than that of the calibration."""
+        """Mesh of the image; with bodies in a solid, a mesh that is refined at their surfaces."""
         return _imaged_on(self.reconstruction, self.calibration).mesh
 
     @property
     def electrodes(self) -> AbstractElectrodes:
-        """The electrodes on the mesh imaged on."""
+        """Electrodes on the mesh of the image."""
         return _imaged_on(self.reconstruction, self.calibration).electrodes
 
     @property
     def chosen_by(self) -> str:
-        """Source of the hyperparameter: a rule's name, "default" for the method's own number, "given" for any other
-        number; "none" for methods without one."""
+        """Source of the hyperparameter: the name of a rule, "default" for the method's default number, "given" for any
+        other number, "none" for methods without a hyperparameter."""
         rule, asked = self.reconstruction.rule, self.settings.hyperparameter
         own = asked is None or asked == METHODS[self.settings.method].hyperparameter
         return "default" if rule == "given" and own else rule
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons to doubt the image, in sentences: channels too few or in another unit, an iteration that did not
-        converge, voltages that it does not explain, bodies that may as well be of another kind."""
+        """Reasons to doubt the image, in sentences: too few channels, an implausible background, an iteration that did
+        not converge, voltages not explained by the image, or bodies whose kind the data do not determine."""
         found, said = self.reconstruction, _doubts_of_data(self)
         if isinstance(found, LinearReconstruction):
             return tuple(said)
@@ -156,36 +156,37 @@ class ImagedDifference:
 
     @property
     def level(self) -> float:
-        """Share of its peak at which an inclusion ends: at the middle of its blurred edge, if it is cut out."""
+        """Level at which an inclusion ends, as a share of its peak: 0.5, the middle of its blurred edge, in segmented
+        images, otherwise the level of the settings."""
         return _MIDDLE if self.settings.segment else self.settings.level
 
     @property
     def is_complex(self) -> bool:
-        """Whether the image is one of admittivity, of complex voltages."""
+        """Whether the image shows complex admittivity, computed from complex voltages."""
         return np.iscomplexobj(self.change)
 
     @property
     def iterative(self) -> bool:
-        """Whether the image solves for conductivity itself."""
+        """Whether the image was computed by an iterative method, which solves for conductivity itself."""
         return isinstance(self.reconstruction, Reconstruction | ShapeReconstruction)
 
     @property
     def departure(self) -> Float[Array, " m"]:
-        """Values per cell in which inclusions are found: the change of conductivity, or of its logarithm in iterative
-        images."""
+        """Values per cell in which inclusions are found: the change of conductivity, or, for iterative images, the
+        change of its natural logarithm."""
         if not self.iterative:
             return self.change
         return as_array(np.log1p(np.asarray(self.change) / float(self.calibration.conductivity)))
 
 
 def _imaged_on(found, calibration: Calibration) -> ForwardModel:
-    """The model whose mesh the result is on."""
+    """Forward model on the mesh of the result."""
     finer = found.finer if isinstance(found, ShapeReconstruction) else None
     return calibration.model if finer is None else finer.model
 
 
 def _doubts_of_data(found: ImagedDifference) -> list[str]:
-    """Too few channels, or a background that no solid has."""
+    """Reasons to doubt the data: too few usable voltages, or an implausible background conductivity of a solid."""
     used, said = np.asarray(found.measurement.mask)[0], []
     if (left := np.mean(used)) < _FEW_CHANNELS:
         said.append(
@@ -209,13 +210,13 @@ def image_difference(
     frame: int | str | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ImagedDifference:
-    """Image what changed between a reference frame and a frame of `measurement`.
+    """Image the change between a reference frame and a frame of `measurement`.
 
-    `reference`: the undisturbed body (the mean of its frames is used); None if `measurement` carries its own, a
-    frame named "reference". `frame`: which frame to image, by number from 0 or by name; the first unless given.
-    `progress` is called with the name of each step as it begins. Raises `ValueError` for data that cannot be
-    imaged (see `jeit.data.check_imageable`) or that do not say where the electrodes are, and for things of another
-    kind, such as a path that is not read yet.
+    `reference`: measurement of the undisturbed body, whose frames are averaged; None if `measurement` has a frame named
+    "reference". `frame`: number (from 0) or name of the frame to image; default: the first. `progress` is called with
+    the name of each step when it begins. Raises `ValueError` for data that cannot be imaged (see
+    `jeit.data.check_imageable`) or lack the places of the electrodes, and for arguments of another type, such as the
+    path of a file.
     """
     settings = as_settings(settings)
     clock = Clock(progress)
@@ -275,7 +276,7 @@ def image_difference(
 def _inclusions(
     found: ImagedDifference, grid: Raster
 ) -> tuple[list[Inclusion], UInt8[np.ndarray, "rows columns"] | None]:
-    """Inclusions of an image, with changes of conductivity as peaks; and labels, if they are asked for."""
+    """Inclusions of an image, with the change of conductivity as their peak; and labels of the pixels, if requested."""
     settings, reconstruction, background = found.settings, found.reconstruction, found.calibration.conductivity
     if found.shapes is not None:
         bodies = found.shapes.bodies
@@ -294,7 +295,7 @@ def _inclusions(
 
 
 def _form(body: Star | Ellipsoid) -> SolidForm | None:
-    """Form by which pictures draw a body in a solid."""
+    """Form of a body in a solid, for drawing; None for star shapes."""
     if isinstance(body, Star):
         return None
     axes = sorted(body.axes.tolist(), key=lambda axis: abs(axis[2])) if body.column else body.axes.tolist()
@@ -302,7 +303,7 @@ def _form(body: Star | Ellipsoid) -> SolidForm | None:
 
 
 def _covered(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
-    """Pixels that lie in a region of either sign."""
+    """Label the pixels in the regions of resistive and conductive inclusions."""
     cell = np.asarray(grid.cell)
     labels = np.zeros(cell.shape, np.uint8)
     for one, region in regions:
@@ -311,7 +312,8 @@ def _covered(regions, grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
 
 
 def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UInt8[np.ndarray, "rows columns"]:
-    """Pixels that lie in a body of either sign, of the strongest where two meet; of a solid half way up."""
+    """Label the pixels in resistive and conductive bodies, in a solid at half its height. Where bodies overlap, the
+    first in the list counts."""
     centres, inside = grid.pixel_centres(), np.asarray(grid.cell) >= 0
     if mesh.dimension == 3:
         z = np.asarray(mesh.points)[:, 2]
@@ -323,7 +325,7 @@ def _labels(mesh: Mesh, bodies: Sequence[Star | Ellipsoid], grid: Raster) -> UIn
 
 
 def _sampled(grid: Raster, change) -> Inexact[Array, "rows columns"]:
-    """An image on a raster; of a complex one both parts."""
+    """Sample an image on a raster, real and imaginary part separately for complex images."""
     if not np.iscomplexobj(change):
         return grid.sample(change)
     parts = [np.asarray(grid.sample(as_array(part))) for part in (np.real(change), np.imag(change))]
@@ -331,6 +333,6 @@ def _sampled(grid: Raster, change) -> Inexact[Array, "rows columns"]:
 
 
 def _with_change(inclusion: Inclusion, background) -> Inclusion:
-    """An inclusion found in the logarithm of conductivity over `background`, its peak turned into a change."""
+    """Convert the peak of an inclusion from a change of log conductivity to a change of conductivity."""
     peak = float(background * np.expm1(inclusion.peak))
     return replace(inclusion, peak=peak)

@@ -1,4 +1,4 @@
-"""Settings of imaging, and its methods by name."""
+"""Settings of imaging, and the imaging methods by name."""
 
 from __future__ import annotations
 
@@ -34,29 +34,30 @@ AUTO = "auto"
 
 @dataclass(frozen=True)
 class ImagingSettings:
-    """Settings of imaging. The defaults here are jeit's defaults, for Python and command line alike.
+    """Settings of imaging. The defaults apply to Python and the command line alike.
 
-    - `method`: "auto", the one-step image where it is sound, else Gauss-Newton's with its bodies outlined; in solids,
-      bodies as ellipsoids wherever the data support them (`jeit.inverse.shapes`); or one of `METHODS`: linear ones,
-      iterative ones that solve for conductivity itself, and "shapes", outlines alone.
+    - `method`: "auto" or a name in `METHODS`, which has linear methods, iterative methods that solve for conductivity
+      itself, and "shapes", which fits outlines of bodies. "auto" uses one-step imaging if its image is sound, otherwise
+      Gauss-Newton imaging with outlines of the bodies; in solids, ellipsoids are fitted wherever the data support them
+      (see `jeit.inverse.shapes`).
     - `prior`: a name in `jeit.inverse.prior.matern.PRIORS`, or a quadratic prior; used by one-step, Gauss-Newton and
-      Levenberg-Marquardt imaging. With "auto", one that is not the default asks in solids for an image by it, and no
-      bodies.
-    - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; a number for total variation and filtered
-      back-projection; not used by plain back-projection. With "auto" it asks for a one-step image. None:
-      "noise-figure" for one-step images, 5 for Gauss-Newton and Levenberg-Marquardt, 300 for total variation, what
-      served on measured tanks.
-    - `contact`: how the contact impedance is calibrated ("each", "common", "fixed"); None decides by the protocol: each
-      electrode's own where voltages are read on driven electrodes, else fixed, for then nothing shows it.
-    - `num_points`: nodes of the mesh, about; None for 2,000 of a sheet, and of a solid body 10,000.
+      Levenberg-Marquardt imaging. With "auto" in solids, no bodies are fitted if the prior is not the default.
+    - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`. Total variation and filtered back-projection
+      need a number; plain back-projection and "shapes" use none. With "auto" and a hyperparameter, one-step imaging is
+      used. Defaults: "noise-figure" for one-step imaging, 5 for Gauss-Newton and Levenberg-Marquardt, 300 for total
+      variation, which gave good images of measured tanks.
+    - `contact`: calibration of the contact impedance: "each" (one value per electrode), "common" (one value) or
+      "fixed". Default: "each" if voltages are measured on driven electrodes, otherwise "fixed", since the data do not
+      determine it.
+    - `num_points`: approximate number of mesh nodes; default: 2,000 for a sheet, 10,000 for a solid.
     - `raster_shape`: (rows, columns) of the raster.
     - `level`, `least_peak`: see `jeit.image.find_inclusions`.
-    - `as_is`: image even where the wiring is found to be another than described, see `jeit.imaging.wiring`.
-    - `segment`: whether to cut the image up into background, resistive and conductive: by the outlines where there are
-      any, else at half of every inclusion's own peak; with "auto", of an image by total variation.
-    - `bodies`: of which kind those of a solid are: "either", "ellipsoids", or "columns" through its whole height.
+    - `as_is`: whether to image even if the wiring seems to differ from its description, see `jeit.imaging.wiring`.
+    - `segment`: whether to label background, resistive and conductive pixels: by the outlines if there are any,
+      otherwise at half of each inclusion's peak. With "auto", images without outlines are then made by total variation.
+    - `bodies`: kind of the bodies in a solid: "either", "ellipsoids", or "columns" through its whole height.
 
-    Raises `ValueError`, naming the setting, for what there is not or what does not go together.
+    Raises `ValueError`, naming the setting, for unknown or incompatible values.
     """
 
     method: str = AUTO
@@ -95,20 +96,21 @@ class ImagingSettings:
 
 
 def as_settings(given: ImagingSettings | None) -> ImagingSettings:
-    """The settings given, or the defaults. Raises `ValueError` for something else."""
+    """Return the given settings, or the defaults for None. Raises `ValueError` for an argument of another type."""
     settings = ImagingSettings() if given is None else given
     check_kind("settings", settings, ImagingSettings, "ImagingSettings, such as ImagingSettings(method='gauss-newton')")
     return settings
 
 
 def check_prior(prior) -> None:
-    """Raises `ValueError` for what is neither a prior nor the name of one."""
+    """Check a prior or its name. Raises `ValueError` for anything else."""
     if not isinstance(prior, AbstractPrior):
         check_name("prior", prior, PRIORS, "" if isinstance(prior, str) else ", or an object such as Noser()")
 
 
 def check_body(contact: str | None, num_points: int | None) -> None:
-    """Raises `ValueError` for a calibration that there is not, and for meshes too coarse or too fine."""
+    """Check the calibration of contacts and the number of mesh nodes. Raises `ValueError` for an unknown calibration,
+    and for meshes that are too coarse or too fine."""
     if contact is not None:
         check_name("contact", contact, CONTACTS)
     if num_points is not None and not (isinstance(num_points, Integral) and 50 <= num_points <= 100_000):
@@ -116,7 +118,7 @@ def check_body(contact: str | None, num_points: int | None) -> None:
 
 
 def check_hyperparameter(hyperparameter: float | str) -> None:
-    """Raises `ValueError` for what is neither a positive number nor a rule."""
+    """Check λ or the name of its rule. Raises `ValueError` for anything but a positive number or a rule."""
     if isinstance(hyperparameter, str):
         check_name("hyperparameter", hyperparameter, RULES, ", or a number")
     elif not (is_number(hyperparameter) and hyperparameter > 0):
@@ -124,16 +126,17 @@ def check_hyperparameter(hyperparameter: float | str) -> None:
 
 
 Imaged = tuple[LinearReconstruction | Reconstruction | ShapeReconstruction, Inexact[Array, " m"]]
-"""A reconstruction, and the change of conductivity per cell that it finds, S/m (2-D: S); complex of complex ones."""
+"""A reconstruction, and its change of conductivity per cell, S/m (2-D: S); complex for complex voltages."""
 NamedPrior = str | AbstractPrior
-"""A prior, or the name of one."""
+"""A prior, or the name of a prior."""
 NamedWeight = float | str | None
-"""λ, or the name of the rule that chooses it; None for methods that have no use for one."""
+"""λ, or the name of the rule that chooses it; None for methods without a hyperparameter."""
 
 
 class Asked(NamedTuple):
-    """Settings passed to a method: the `prior` and λ, `hyperparameter`; `kinds` of bodies of a solid, see
-    `jeit.inverse.shapes.EllipsoidPrior`; `progress`, called with the name of each stage of what takes long."""
+    """Settings passed to a method: `prior`; `hyperparameter`: λ or the name of its rule; `kinds`: kinds of bodies in a
+    solid (see `jeit.inverse.shapes.EllipsoidPrior`); `progress`: called with the name of each stage of long
+    computations."""
 
     prior: NamedPrior
     hyperparameter: NamedWeight = None
@@ -141,7 +144,8 @@ class Asked(NamedTuple):
     progress: Callable[[str], None] | None = None
 
 
-# Starts of shapes: all peaks of a smooth image that may be bodies, ghosts among them.
+# Inclusions of a smooth image from which fits of shapes start, artefacts among them: minimum peak and minimum area, see
+# `jeit.image.find_inclusions`, and maximum number.
 _PEAK, _AREA, _MOST = 0.15, 0.002, 8
 
 
@@ -149,10 +153,12 @@ _PEAK, _AREA, _MOST = 0.15, 0.002, 8
 class Method:
     """A method to image a difference.
 
-    - `image`: the function that does it, given what the settings ask.
-    - `takes_prior`: whether it uses the prior of the settings; `prior`, what it is called where the method has its own.
-    - `hyperparameter`: λ unless given. `takes_hyperparameter`: whether it has any use for one; `number`: one that
-      serves, where λ cannot be chosen by a rule.
+    - `image`: the function that computes the image from a prepared difference and the requested settings.
+    - `takes_prior`: whether the method uses the prior of the settings.
+    - `prior`: name of the method's own prior, if it has one.
+    - `hyperparameter`: the default λ or rule.
+    - `takes_hyperparameter`: whether the method has a hyperparameter.
+    - `number`: a suitable λ, for methods whose λ cannot be chosen by a rule.
     """
 
     image: Callable[[PreparedDifference, Asked], Imaged]
@@ -164,7 +170,8 @@ class Method:
 
 
 def prior_for(prior: NamedPrior, domain: Body) -> AbstractPrior:
-    """The prior itself, or the one of that name in `jeit.inverse.prior.matern.PRIORS`, made for the body's size."""
+    """Return a prior; if `prior` is a name in `jeit.inverse.prior.matern.PRIORS`, create it for the size of the
+    body."""
     if not isinstance(prior, str):
         return prior
     x_min, x_max, y_min, y_max = domain.extent
@@ -172,8 +179,8 @@ def prior_for(prior: NamedPrior, domain: Body) -> AbstractPrior:
 
 
 def rule_for(name: str, prepared: PreparedDifference) -> Rule:
-    """The rule of that name, with the noise of the data where the rule needs it. Raises `ValueError` if the noise is
-    not known."""
+    """Rule `name` for the hyperparameter, with the noise of the data if the rule needs it. Raises `ValueError` if that
+    noise is not known."""
     if name != "discrepancy":
         return RULES[name]
     if prepared.noise is None:
@@ -186,7 +193,7 @@ def rule_for(name: str, prepared: PreparedDifference) -> Rule:
 
 
 def _weight(prepared: PreparedDifference, hyperparameter: NamedWeight) -> float | Rule:
-    """λ, with the rule in place of its name."""
+    """Return λ as a number, or the rule that chooses it."""
     assert hyperparameter is not None
     return rule_for(hyperparameter, prepared) if isinstance(hyperparameter, str) else hyperparameter
 
@@ -207,7 +214,7 @@ def _one_step(prepared: PreparedDifference, asked: Asked) -> Imaged:
 def _back_projection(prepared: PreparedDifference, asked: Asked, *, filtered: bool) -> Imaged:
     weight = asked.hyperparameter
     given = {"hyperparameter": weight} if isinstance(weight, (int, float)) else {}
-    # Bands lie between the equipotential lines of the real background; complex voltages are imaged part by part.
+    # The equipotential lines are those of the real background; real and imaginary voltages are projected separately.
     conductivity = np.real(prepared.calibration.conductivity)
     found = back_projection(prepared.model, conductivity, filtered=filtered, mask=prepared.mask, **given)
     return found, found.image(prepared.difference)
@@ -216,10 +223,10 @@ def _back_projection(prepared: PreparedDifference, asked: Asked, *, filtered: bo
 def _iterated(
     prepared: PreparedDifference, asked: Asked, *, solver: AbstractSolver, own: AbstractPrior | None = None
 ) -> Imaged:
-    """The conductivity whose voltages differ from the model's own as the frame differs from its reference.
+    """Estimate conductivity iteratively from the model's reference voltages plus the measured difference.
 
-    Errors of the model that are the same with and without objects cancel. `own`: the method's own prior, in place of
-    that asked for. Raises `ValueError` if the solver fails.
+    Model errors that are the same in the frame and its reference cancel. `own`: a prior of the method that replaces the
+    requested prior. Raises `ValueError` if the solver fails, and for complex voltages.
     """
     model, background = prepared.model, prepared.calibration.conductivity
     if np.iscomplexobj(prepared.difference):
@@ -243,10 +250,10 @@ def _iterated(
 
 
 def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked) -> ShapeReconstruction:
-    """Estimate the bodies that explain a difference, starting from all inclusions of a smooth image of it.
+    """Fit bodies that explain a difference, starting from the inclusions of its smooth image.
 
-    The factor by which the objective must rise without a body, besides the test by evidence, allows for errors of the
-    model, which the noise does not include.
+    A body is kept only if the objective without it is larger by the factor `least_rise` and the evidence favours it.
+    The factor allows for model errors, which the noise does not include.
     """
     model, background = prepared.model, prepared.calibration.conductivity
     solid = prepared.mesh.dimension == 3
@@ -260,7 +267,7 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked
         noise=prepared.sharp_noise,
         mask=prepared.mask,
         prior=EllipsoidPrior(kinds=asked.kinds) if solid else None,
-        # In a solid, errors of the model are modelled as a smooth field.
+        # In a solid, model errors are represented by a smooth field instead.
         least_rise=1 if solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
         smooth=smooth if solid else None,
         progress=asked.progress,
@@ -274,7 +281,7 @@ def _shapes(prepared: PreparedDifference, asked: Asked) -> Imaged:
 
 
 def of_shapes(prepared: PreparedDifference, found: ShapeReconstruction) -> Imaged:
-    """Shapes and their change of conductivity; of a solid, per cell of the finer mesh."""
+    """Shapes and their change of conductivity; for a solid, per cell of the refined mesh."""
     drawn = found if found.finer is None else found.finer
     return found, drawn.conductivity - prepared.calibration.conductivity
 
@@ -296,4 +303,4 @@ METHODS: dict[str, Method] = {
     ),
     "shapes": Method(_shapes, prior="star shapes", takes_hyperparameter=False),
 }
-"""Methods by the names of the command line."""
+"""Imaging methods by name, as used in Python and on the command line."""

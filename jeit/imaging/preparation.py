@@ -1,4 +1,4 @@
-"""Prepare two frames for imaging: checks, mesh, model and calibration, with progress and timing."""
+"""Preparation of two frames for imaging: checks, mesh, model and calibration, with progress and timing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from jeit_solvers.engines import as_array
 
 
 class Clock:
-    """Reports each step to `progress` and keeps the seconds that it took in `seconds`."""
+    """Timer of steps: reports the start of each step to `progress`, and stores its duration in `seconds`."""
 
     def __init__(self, progress: Callable[[str], None] | None):
         self.progress = progress
@@ -44,8 +44,8 @@ class Clock:
 
 
 def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> int:
-    """Number, from 0, of the frame to image: the one given by number or name, else the first that is not the file's own
-    reference. Raises `ValueError` for a frame that there is not."""
+    """Number, from 0, of the frame to image, given by number or name; default: the first frame that is not named
+    "reference". Raises `ValueError` for a frame that does not exist."""
     if frame is not None:
         return measurement.frame_number(frame)
     return int(measurement.num_frames > 1 and measurement.frame_names[:1] == ("reference",))
@@ -53,7 +53,8 @@ def chosen_frame(measurement: Measurement, frame: int | str | None = None) -> in
 
 @contextmanager
 def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
-    """Context in which a `ValueError` that names the measurement also names the frame, where there are several."""
+    """Context manager that adds the frame number to a `ValueError` that names the measurement, if it has several
+    frames."""
     try:
         yield
     except ValueError as error:
@@ -63,14 +64,14 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
         raise ValueError(str(error).replace(name, f"{name}, frame {number}", 1)) from error
 
 
-# Default number of nodes of a solid body and of a sheet.
+# Default number of mesh nodes for a solid and for a sheet.
 SOLID_POINTS, SHEET_POINTS = 10_000, 2000
-# Share of a difference that every model is assumed to miss.
+# Minimum share of a difference that is assumed to remain unexplained by any model.
 _LEAST_MISFIT = 0.03
-# Factor by which sharp outlines may miss more of it.
+# Factor by which this share is larger for images with sharp outlines.
 _SHARP = 3.0
-# Misfit of an electrode, relative to the others', from which it counts as unlike them; in sound tanks it is at most
-# 2.6.
+# Misfit of an electrode, relative to that of the others, above which it counts as unlike them. In sound tanks the ratio
+# was at most 2.6.
 _UNLIKE = 3.0
 
 
@@ -79,13 +80,14 @@ class PreparedDifference:
     """A difference of two frames, ready to be imaged.
 
     - `measurement`, `reference`: the two frames compared, one frame each.
-    - `quality`: what was found about the data.
+    - `quality`: the quality of the data.
     - `domain`: the body.
-    - `contact`: how the contact impedance was calibrated: "each", "common" or "fixed".
-    - `wiring`: how electrodes and channels seem to be connected.
-    - `calibration`: the forward model fitted to the reference; `model` and `mesh` are in it.
-    - `difference`: (M,) volts, zero in masked channels; `mask` (M,), True for channels usable in both frames.
-    - `frame`: the number of the frame in its file, from 0, of `num_frames`.
+    - `contact`: calibration of the contact impedance: "each", "common" or "fixed".
+    - `wiring`: the estimated connection of electrodes and channels.
+    - `calibration`: the forward model fitted to the reference, with its mesh.
+    - `difference`: difference of the voltages (M,) in volts, zero in masked channels.
+    - `mask`: (M,), True for channels that are usable in both frames.
+    - `frame`: number of the frame in its file, from 0; `num_frames`: number of frames in the file.
     """
 
     measurement: Measurement
@@ -102,27 +104,27 @@ class PreparedDifference:
 
     @property
     def model(self) -> ForwardModel:
-        """The calibrated forward model."""
+        """Calibrated forward model."""
         return self.calibration.model
 
     @property
     def mesh(self) -> Mesh:
-        """The mesh to image on."""
+        """Mesh of the calibrated model, on which images are computed."""
         return self.calibration.model.mesh
 
     @property
     def relative_noise(self) -> Float[Array, " M"]:
-        """Relative noise of the channels, volts: `relative_noise` of the reference, multiplied for channels that read
-        an unlike electrode by that electrode's relative misfit."""
+        """Noise of the channels relative to each other, volts: `jeit.inverse.relative_noise` of the reference,
+        multiplied by the relative misfit of unlike electrodes for channels that measure on them."""
         trusted = relative_noise(np.asarray(self.reference.voltages)[0], self.mask)
         reads = np.asarray(self.model.protocol.channel_measurement) != 0
         return as_array(trusted * np.max(np.where(reads, self._doubt, 1), axis=1))
 
     @property
     def unlike_electrodes(self) -> dict[int, float]:
-        """Electrodes, counted from 0, whose channels the model fits far worse in the reference than the others', each
-        with the ratio of the misfits: their gain is uneven, or they are loose or out of place. Channels that read them
-        count less."""
+        """Electrodes, numbered from 0, whose channels in the reference are fitted far worse than those of the others,
+        each with the ratio of the misfits. They may be loose or displaced, or their gain may differ. Channels that
+        measure on them have less weight."""
         return {int(one): float(self._doubt[one]) for one in np.flatnonzero(self._doubt > 1)}
 
     @functools.cached_property
@@ -134,27 +136,30 @@ class PreparedDifference:
 
     @property
     def noise(self) -> float | None:
-        """Standard deviation of the noise found in the difference, in units of `relative_noise`; None if not known."""
+        """Estimated standard deviation of the noise of the difference, in units of `relative_noise`; None if not
+        known."""
         return self.quality.trusted_noise
 
     @property
     def modelled_noise(self) -> Float[Array, " M"]:
-        """Expected deviation of the difference from a model that explains it, volts: the noise found in the difference,
-        and the share of the difference that equals the model's misfit of the reference, at least 3 %.
+        """Expected deviation of the difference from the voltages of the model, volts: the root of the sum of squares of
+        the noise of the difference, and of the model error, which is the difference times the relative misfit of the
+        reference (at least 3 %).
 
-        Where no noise can be found, a tenth of the difference, at most 1 % of the channels' voltages, is used instead.
+        If the noise is not known, 0.1 of the difference is used instead, at most 1 in units of `relative_noise`.
         """
         return self._off_by(1.0)
 
     @property
     def sharp_noise(self) -> Float[Array, " M"]:
-        """`modelled_noise` for bodies with sharp outlines, volts: three times the model's share. Smooth images adapt to
-        errors of the model, sharp ones do not."""
+        """`modelled_noise` for bodies with sharp outlines, volts. Its model error is three times larger, since bodies
+        with sharp outlines, unlike smooth images, cannot adapt to model errors."""
         return self._off_by(_SHARP)
 
     @property
     def modelled_share(self) -> float:
-        """Share of the variance of `sharp_noise` that is due to the model, from 0 to 1; 1 where no noise is known."""
+        """Share of the variance of `sharp_noise` that is due to the model error, from 0 to 1; 1 if the noise is not
+        known."""
         sharp = np.asarray(self.sharp_noise)[0] / np.asarray(self.relative_noise)[0]
         return 1 - (0 if self.noise is None else self.noise / float(sharp)) ** 2
 
@@ -175,12 +180,12 @@ def prepare_difference(
     as_is: bool = False,
     clock: Clock | None = None,
 ) -> PreparedDifference:
-    """Check a frame against its reference, make a mesh, and calibrate a model of the body on the reference.
+    """Check a frame and its reference, build a mesh, and calibrate a model of the body on the reference.
 
-    Arguments as in `jeit.imaging.image_difference` and its settings; `clock` takes the time of each step. Raises
-    `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`), that do not say where the electrodes
-    are, whose wiring is not as described (see `jeit.imaging.wiring`), or not its reference's, unless `as_is`, or on
-    which the calibration fails.
+    Arguments as in `jeit.imaging.image_difference` and its settings; `clock` measures the duration of each step. Raises
+    `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the places of the electrodes,
+    if the calibration fails, and, unless `as_is`, if the wiring differs from its description or from that of the
+    reference (see `jeit.imaging.wiring`).
     """
     clock = Clock(None) if clock is None else clock
     one, base = select_frames(measurement, reference, frame)
@@ -196,7 +201,9 @@ def prepare_difference(
         model = ForwardModel(imaging_mesh(domain, electrodes, num_points), electrodes, base.protocol)
     with clock("wiring"):
         wiring = find_wiring(model, base)
-        if wiring.explanation or quality.imageable:  # noise may resemble another wiring, but is not explained by it
+        # For data that cannot be imaged, a wiring error is reported only if another wiring explains them: pure noise
+        # fits no wiring.
+        if wiring.explanation or quality.imageable:
             check_wiring(wiring, base, as_is)
         if not quality.imageable:
             with naming_frame(measurement, number):
@@ -208,9 +215,9 @@ def prepare_difference(
 
 
 def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
-    """Raise `ValueError` for a wiring that is not as described, as found on `reference`; not if taken `as_is`."""
+    """Check the wiring found in `reference`. Raises `ValueError` if it differs from its description, unless `as_is`."""
     if wiring.fault and not as_is:
-        # With the opposite sign nothing can be calibrated, whatever `as_is` says.
+        # Voltages of the opposite sign cannot be calibrated, even with `as_is`.
         otherwise = "" if wiring.reversed_signs else "; or go on as it is (as_is=True, --as-is)"
         raise ValueError(
             f"'{reference.name}' does not fit its description: {wiring.fault} Mend the wires or the description"
@@ -221,10 +228,10 @@ def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
 def calibrated_model(
     model: ForwardModel, base: Measurement, *, contact: str | None = None, clock: Clock | None = None
 ) -> tuple[Calibration, str]:
-    """The forward model, calibrated on a frame of the undisturbed body; and which `contact` was fitted.
+    """Calibrate the forward model on a frame of the undisturbed body; return it and the `contact` calibration used.
 
-    `contact`: "each", "common" or "fixed"; decided by the protocol, and by what converges, unless given. Raises
-    `ValueError` if the calibration fails.
+    `contact`: "each", "common" or "fixed"; default: `default_contact`, or "common" if the data do not determine the
+    contact impedance of each electrode. Raises `ValueError` if the calibration fails.
     """
     clock = Clock(None) if clock is None else clock
     with clock("calibrate"):
@@ -232,7 +239,7 @@ def calibrated_model(
         voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
         calibration = calibrate(model, voltages, mask=mask, contact=chosen)
         if contact is None and chosen == "each" and not calibration.distinguishes_contacts:
-            chosen = "common"  # the data do not determine so many impedances
+            chosen = "common"  # the data do not determine one impedance per electrode
             calibration = calibrate(model, voltages, mask=mask, contact=chosen)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
@@ -246,12 +253,12 @@ def calibrated_model(
 def select_frames(
     measurement: Measurement, reference: Measurement | None = None, frame: int | str | None = None
 ) -> tuple[Measurement, Measurement]:
-    """The frame to image and the reference to image it against, one frame each.
+    """Select the frame to image and its reference, one frame each.
 
-    A frame named "reference" in `measurement` is never imaged unless asked for, and is what the others are compared
-    with when no `reference` is given. A reference that was measured with other currents is converted to those of the
-    measurement where it determines their voltages (`jeit.data.driven_by`), and its notes say so. Raises `ValueError`
-    when there is no reference, no such frame, or no measurement.
+    A frame named "reference" in `measurement` is imaged only if requested, and serves as reference if no `reference`
+    is given. A reference measured with other currents is converted to those of the measurement if it determines their
+    voltages (see `jeit.data.driven_by`), which is recorded in its notes. Raises `ValueError` if there is no reference
+    or no such frame, and for arguments that are not measurements.
     """
     check_measurement("measurement", measurement)
     if reference is not None:
@@ -265,17 +272,17 @@ def select_frames(
 
 
 def check_measurement(name: str, given: Measurement) -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no `Measurement`, such as the path of one."""
+    """Check that the argument `name` is a `Measurement`. Raises `ValueError` otherwise, such as for a path."""
     check_kind(name, given, Measurement, "a Measurement, as of jeit.read(path)")
 
 
 def imaging_mesh(
     domain: Body, electrodes: AbstractElectrodes, num_points: int | None, *, usual: int | None = None
 ) -> Mesh:
-    """A mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep.
+    """Mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep.
 
-    None is for `usual`: unless given, 2,000 of a sheet, and 10,000 of a solid body. Raises `ValueError` for a number
-    beside a mesh of one's own.
+    Default of `num_points`: `usual`, or, without it, 2,000 for a sheet and 10,000 for a solid. Raises `ValueError` if a
+    number is given for a body that has its own mesh.
     """
     if num_points is None and not isinstance(domain, OwnMesh):
         num_points = usual or (SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS)
@@ -283,16 +290,16 @@ def imaging_mesh(
 
 
 def default_contact(measurement: Measurement) -> str:
-    """Default calibration of contact impedance: "each" if driven electrodes are read, else "fixed".
+    """Default calibration of contact impedances: "each" if voltages are measured on driven electrodes, else "fixed".
 
-    Only the voltage of an electrode that carries current drops across its contact; without such channels the fit would
-    bend contact impedances to explain something else.
+    Voltage drops only across the contacts of electrodes that carry current. Without channels on these electrodes, the
+    fit would distort contact impedances to explain other effects.
     """
     return "each" if measurement.protocol.channels_on_driven_electrodes().any() else "fixed"
 
 
 def check_real(measurement: Measurement) -> None:
-    """Raise `ValueError` for complex voltages, where only `image_difference` takes them."""
+    """Check that voltages are real, for functions other than `image_difference`. Raises `ValueError` otherwise."""
     if np.iscomplexobj(measurement.voltages):
         raise ValueError(
             f"'{measurement.name}' is complex; choose the part to image with [data] component in its description: "
@@ -301,7 +308,7 @@ def check_real(measurement: Measurement) -> None:
 
 
 def body_of(measurement: Measurement, reference: Measurement) -> tuple[Body, AbstractElectrodes]:
-    """Body and electrodes, from whichever of the two says them; raises `ValueError` where neither does."""
+    """Body and electrodes of a measurement, or else of its reference. Raises `ValueError` if neither has them."""
     domain = measurement.domain if measurement.domain is not None else reference.domain
     electrodes = measurement.electrodes if measurement.electrodes is not None else reference.electrodes
     if domain is None or electrodes is None:

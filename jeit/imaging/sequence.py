@@ -1,12 +1,10 @@
-"""Image many frames at once, and frames of several frequencies.
+"""Imaging of many frames at once, and of frames measured at two frequencies.
 
-Frequency-difference imaging: one body at two frequencies, without a frame of it empty.
-
-Admittivity σ + iωε changes with frequency, in tissue and the tanks that stand for it more than in saline. The plain
-difference v₂ - v₁ holds the change of the background beside that of what is in it; the weighted one, v₂ - αv₁ with
-α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩, leaves out all that looks like the body at the first frequency, scaled: a homogeneous body
-gives zero. Seo, Lee, Kim, Zribi and Woo, Physiol. Meas. 29 (2008) 755-769; Jun, Kuen, Lee, Woo, Holder and Seo,
-Physiol. Meas. 30 (2009) 1087-1099.
+Frequency-difference imaging compares a body at two frequencies, without a frame of the empty body. Admittivity σ + iωε
+depends on frequency, in tissue and in phantoms of tissue more than in saline. The plain difference v₂ - v₁ contains the
+changes of the background and of the objects. The weighted difference v₂ - αv₁ with α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ removes all
+that is proportional to the voltages at the first frequency; it is zero for a homogeneous body. Seo, Lee, Kim, Zribi and
+Woo, Physiol. Meas. 29 (2008) 755-769; Jun, Kuen, Lee, Woo, Holder and Seo, Physiol. Meas. 30 (2009) 1087-1099.
 """
 
 from __future__ import annotations
@@ -35,17 +33,22 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array
 
-# Frames that are imaged at once, and bytes of a number that is kept.
-_BATCH, _KEPT = 256, 4
-# Channels that a frame may lack, of those that most frames have.
+# Number of frames imaged at once, and number of bytes of a stored value.
+_BATCH, _VALUE_BYTES = 256, 4
+# Minimum share of the frames that must have a channel for the channel to be used.
 _MOST_FRAMES = 0.5
 
 
 @dataclass(frozen=True)
 class ImagedSequence:
-    """Result of `image_sequence`: the `series` of images; `prepared`, the model of the body; the `reconstruction`
-    matrix that made all of them; `refused` (F,), True for frames that lack channels and have no image; `regions`, (m,)
-    True for the cells of each that was asked for, by name."""
+    """Result of `image_sequence`.
+
+    - `series`: the images.
+    - `prepared`: the prepared difference, with the model of the body.
+    - `reconstruction`: the reconstruction matrix, the same for all images.
+    - `refused`: (F,), True for frames without an image because they lack channels.
+    - `regions`: cells of each requested region, (m,) booleans, by name.
+    """
 
     series: ImageSeries
     prepared: PreparedDifference
@@ -64,15 +67,17 @@ def image_sequence(
 ) -> ImagedSequence:
     """Image every frame of a measurement that has times, with one linear method and one λ.
 
-    - `reference`: the undisturbed body; unless given a frame named "reference", or else the mean over all frames: then
-      images are changes about what the body is like on average.
-    - `settings`: of a linear method, one-step unless given. λ is chosen for the frame that differs most.
-    - `regions`: of interest, by name, each a function of the mesh, such as
-      `lambda mesh: jeit.image.ball_region(mesh, (0, 0), 0.01)`; called before any image, so that what they raise is.
+    - `reference`: the undisturbed body; default: the frame named "reference", or else the mean of all frames, so that
+      images show changes relative to the average.
+    - `settings`: settings of a linear method; default: one-step imaging. λ is chosen for the frame that differs most
+      from the reference.
+    - `regions`: regions of interest by name, each a function of the mesh, such as
+      `lambda mesh: jeit.image.ball_region(mesh, (0, 0), 0.01)`. They are called before imaging, so that their errors
+      are raised early.
 
-    Channels that fewer than half of the frames have are left out of all; frames that lack another are refused. The
-    images take four bytes a cell and frame. Raises `ValueError` as `image_difference`, for a measurement without times
-    or of one frame, for an iterative method, and for images that would not fit in memory.
+    Channels missing in more than half of the frames are not used; frames that lack any other channel are refused. The
+    images need four bytes per cell and frame. Raises `ValueError` as `image_difference`, for a measurement without
+    times or with one frame, for an iterative method, and for images that would not fit in memory.
     """
     check_measurement("measurement", measurement)
     check_real(measurement)
@@ -110,7 +115,7 @@ def image_sequence(
     )
     chosen = {name: region(prepared.mesh) for name, region in (regions or {}).items()}
     number, cells = measurement.num_frames, prepared.mesh.num_cells
-    check_memory(f"the images of '{measurement.name}', {number} frames,", float(_KEPT * number * cells))
+    check_memory(f"the images of '{measurement.name}', {number} frames,", float(_VALUE_BYTES * number * cells))
     with clock("image"):
         found, _ = METHODS[settings.method].image(prepared, Asked(settings.prior, settings.hyperparameter))
         if not isinstance(found, LinearReconstruction):
@@ -130,8 +135,12 @@ def image_sequence(
 
 @dataclass(frozen=True)
 class ImagedFrequencies:
-    """Result of `image_frequencies`: `image`, the change from the first frequency, scaled, to the second, and `weight`
-    α, the factor between the two, by which the body as a whole has changed; 1 for plain differences."""
+    """Result of `image_frequencies`.
+
+    - `image`: the image of the weighted difference of the two frequencies.
+    - `weight`: factor α of the voltages at the first frequency, by which those of the body as a whole change; 1 for
+      plain differences.
+    """
 
     image: ImagedDifference
     weight: complex
@@ -147,10 +156,10 @@ def image_frequencies(
 ) -> ImagedFrequencies:
     """Image the change of a body between two frequencies, relative to the change of the body as a whole.
 
-    `first`, `second`: the same body, electrodes and protocol at two frequencies, in volts; complex voltages give an
-    image of admittivity. `weighted`: v₂ - αv₁, else v₂ - v₁. The background is that of the second frequency, fitted to
-    αv₁; with α = 1, that of the first. `frame`: of `second`, as for `image_difference`, as are `settings`. Raises
-    `ValueError` for data that cannot be imaged, and for two frequencies at which the body has nothing in common.
+    `first`, `second`: voltages of the same body, electrodes and protocol at two frequencies; complex voltages give an
+    image of admittivity. `weighted`: whether to image v₂ - αv₁ (see `frequency_weight`) or v₂ - v₁. The background is
+    fitted to αv₁, or v₁. `frame`: frame of `second`; `settings`: as for `image_difference`. Raises `ValueError` for
+    data that cannot be imaged, and if the voltages at the two frequencies are not similar.
     """
     check_measurement("second", second)
     check_measurement("first", first)
@@ -163,9 +172,10 @@ def image_frequencies(
 
 
 def frequency_weight(second: Measurement, first: Measurement) -> float | complex:
-    """α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ over the channels usable at both frequencies, one frame each; complex of complex ones.
+    """Weight α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ of the voltages at the first frequency, from the first frame of each measurement
+    and the channels usable in both; complex for complex voltages.
 
-    Raises `ValueError` for other channels, and where α is not finite or turns the voltages round.
+    Raises `ValueError` if the numbers of channels differ, and if α is not finite or its real part is not positive.
     """
     ahead, before = np.asarray(second.voltages)[0], np.asarray(first.voltages)[0]
     if ahead.shape != before.shape:

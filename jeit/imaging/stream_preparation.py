@@ -1,4 +1,4 @@
-"""Preparation of streams: an imager for a measured sensor, and the frames of a file or a pipe, one by one."""
+"""Preparation of streams: an imager for a measured sensor, and frames read one by one from a file or a pipe."""
 
 from __future__ import annotations
 
@@ -30,24 +30,26 @@ from jeit.inverse.nonlinear.solvers import AbstractSolver, as_solver
 from jeit.inverse.prior.matern import MEASURED
 from jeit.inverse.streaming.imager import check_memory
 
-# Default number of nodes of the mesh, for a body that is not a mesh itself.
+# Default number of mesh nodes for bodies without a mesh of their own.
 STREAM_POINTS = 1200
 
 
 @dataclass(frozen=True)
 class StreamSettings:
-    """Settings of imaging frame after frame. The defaults here are jeit's defaults, for Python and command line alike.
+    """Settings of imaging frame by frame. The defaults apply to Python and the command line alike.
 
-    - `solver`: `GaussNewton()`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or the name of one
-      ("gauss-newton", "levenberg-marquardt", "one-step"). `max_steps`: most iterations for a frame, where the solver
-      has none of its own; as an `Imager` has it, 4, unless given.
+    - `solver`: `GaussNewton()`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or one of the names
+      "gauss-newton", "levenberg-marquardt", "one-step".
+    - `max_steps`: maximum number of iterations per frame, if the solver does not set it; default: 4, as for
+      `jeit.inverse.Imager`.
     - `prior`: a name in `jeit.inverse.prior.matern.PRIORS`, or a quadratic prior.
-    - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; "noise-figure" unless given.
-    - `memory`: frames over which an image changes, see `jeit.inverse.Imager`; 0 takes every frame alone.
-    - `contact`, `num_points` (1,200 unless given), `as_is`: as in `jeit.imaging.ImagingSettings`.
+    - `hyperparameter`: λ, or the name of a rule in `jeit.inverse.RULES`; default: "noise-figure".
+    - `memory`: number of frames over which an image changes, see `jeit.inverse.Imager`; 0: frames are imaged
+      independently.
+    - `contact`, `num_points` (default: 1,200), `as_is`: as in `jeit.imaging.ImagingSettings`.
 
-    Raises `ValueError` for a solver that does not image frames, a prior that there is not, a memory that is no number
-    of frames, and as `jeit.imaging.ImagingSettings`.
+    Raises `ValueError` for a solver that cannot image frames, an unknown prior, a memory that is not a number of
+    frames, and as `jeit.imaging.ImagingSettings`.
     """
 
     solver: AbstractSolver | str = field(default_factory=GaussNewton)
@@ -75,11 +77,12 @@ def prepare_imager(
     measurement: Measurement | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Imager, Calibration]:
-    """Prepare an imager for the sensor whose undisturbed frames are `reference`; return it and the model calibrated on
-    them.
+    """Prepare an imager for a sensor, and return it with the model calibrated on `reference`, frames of the undisturbed
+    sensor.
 
-    `measurement`: what is to be imaged, if it is known already: its protocol must be the reference's. `progress` is
-    called with the name of each step as it begins. Raises `ValueError` for another protocol, and as `image_difference`.
+    `measurement`: the frames to image, if they are available; their protocol must be that of the reference. `progress`
+    is called with the name of each step when it begins. Raises `ValueError` for another protocol, and as
+    `image_difference`.
     """
     settings = StreamSettings() if settings is None else settings
     check_kind("settings", settings, StreamSettings, "StreamSettings, such as StreamSettings(solver='one-step')")
@@ -113,13 +116,13 @@ def prepare_imager(
 
 
 def frames_of(measurement: Measurement) -> Float[np.ndarray, "F M"]:
-    """The frames of a measurement, volts, NaN where a channel is masked: as `jeit.inverse.stream` takes them."""
+    """Voltages (F, M) of a measurement, volts, NaN in masked channels: the input of `jeit.inverse.stream`."""
     return np.where(measurement.mask, measurement.voltages, np.nan)
 
 
 def parse_frames(lines: Iterable[str]) -> Iterator[object]:
-    """A frame for every line that is not empty, its voltages parted by spaces, commas or semicolons; one that does not
-    hold numbers comes as its text, and will be refused."""
+    """Parse a frame from each line that is not empty: voltages separated by spaces, commas or semicolons. A line that
+    does not contain numbers is returned as text, and refused later."""
     for line in lines:
         parts = line.strip().rstrip(",;").replace(";", ",").split(",")
         words = line.split() if len(parts) == 1 else [part.strip() or "nan" for part in parts]

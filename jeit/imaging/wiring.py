@@ -1,16 +1,13 @@
-"""Wiring errors: exchanged wires, channels in another order, opposite signs, and the correction that explains the
-frame.
+"""Detection of wiring errors: exchanged wires, channels in another order, and voltages of opposite sign.
 
-Drives or measurements exchanged in a frame, and not in its reference: the exchange that makes the two alike is found.
+`exchanges_message` detects drives or measurements that are exchanged in a frame but not in its reference. If each drive
+has all measurements, frame and reference are matrices (drives, measurements), and an exchange of two drives exchanges
+two rows. The exchanges that make the frame most similar to its reference are found.
 
-Where every drive is read by every measurement, a frame is a matrix F (drives, measurements), as its reference R is.
-With two drives exchanged two of its rows are; that breaks reciprocity, as noise does, or not, and no image explains it.
-
-Wires exchanged, channels in another order, signs turned: the wiring that explains a frame of the empty body is found.
-
-A uniform body is known but for its conductivity and its contacts. Its transfer impedance Z (L, L) is computed once for
-each of a few contact impedances; with electrode k standing where p(k) should, it is Z[p, p], and all ways of wiring are
-compared by how well they explain the frame, whatever its size.
+`find_wiring` finds the wiring that explains a frame of the empty body. A uniform body is known except for its
+conductivity and its contacts. Its transfer impedance Z (L, L) is computed for several contact impedances; if electrode
+k is at the place of electrode p(k), it is Z[p, p]. Wirings are compared by their misfit to the frame, with a free
+scale.
 """
 
 from __future__ import annotations
@@ -29,15 +26,15 @@ from jeit.forward.model import select_channels
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
-# Share of the difference that may be left after each exchange, and after all reported exchanges; and the greatest
-# number of exchanges searched for.
+# Maximum ratio of the difference after an exchange to that before, for each exchange and for all reported exchanges
+# together; and maximum number of exchanges.
 _EXCHANGE_STEP, _EXCHANGE_BETTER, _MOST = 0.9, 0.5, 4
 
 
 def exchanges_message(frame: Measurement, reference: Measurement) -> str:
-    """A sentence that names drives, or measurements of every drive, that look exchanged in a frame, counted from 1;
-    empty where no exchange halves its difference from the reference, and where some drive has other readings than
-    others."""
+    """Sentence that names the drives, or the measurements of every drive, that seem exchanged in a frame, numbered from
+    1; empty if no exchanges halve its difference from the reference, or if not all drives have the same
+    measurements."""
     order = _order(frame)
     if order is None:
         return ""
@@ -61,7 +58,8 @@ def exchanges_message(frame: Measurement, reference: Measurement) -> str:
 
 
 def _order(frame: Measurement) -> np.ndarray | None:
-    """(drives, measurements) where each channel is; None where some drive lacks one."""
+    """Index of the channel of each drive and measurement, (drives, measurements); None if a drive lacks a
+    measurement."""
     drive, reading = (np.asarray(one) for one in (frame.protocol.drive_index, frame.protocol.measurement_index))
     shape = int(drive.max()) + 1, int(reading.max()) + 1
     order = np.full(shape, -1)
@@ -72,7 +70,7 @@ def _order(frame: Measurement) -> np.ndarray | None:
 def _exchanges(
     measured: Inexact[np.ndarray, "n k"], rest: Inexact[np.ndarray, "n k"]
 ) -> tuple[float, list[tuple[int, int]]]:
-    """Difference left between rows once some are exchanged, and the exchanges, the most effective first."""
+    """Norm of the difference between two matrices after exchanges of rows, and the exchanges, most effective first."""
     square = np.sum(np.abs(measured) ** 2, axis=1)[:, None] + np.sum(np.abs(rest) ** 2, axis=1)
     apart: Float[np.ndarray, "n n"] = np.maximum(square - 2 * np.real(measured @ rest.conj().T), 0)
     left, pairs = float(np.trace(apart)), []
@@ -89,13 +87,13 @@ def _exchanges(
 
 
 MOST_MISFIT = 0.15
-"""Relative misfit of the empty body above which something is taken to be wrong."""
-# Share of the misfit that may be left with another wiring: after each exchange, and after all that is reported.
+"""Relative misfit of the empty body above which a wiring error is suspected."""
+# Maximum ratio of the misfit with another wiring to that before: for each exchange, and for the wiring reported.
 _STEP, _BETTER = 0.85, 0.6
 _MOST_EXCHANGES = 4
-# Misfit of the empty body above which imaging is refused even though no other wiring explains it.
+# Relative misfit of the empty body above which imaging is refused even if no other wiring explains the frame.
 _HOPELESS = 0.5
-# Contact impedance times conductivity, in units of the body's size: from hardly any to what drowns the body.
+# Contact impedance times conductivity, divided by the size of the body: from negligible to dominant.
 _CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
 
@@ -103,10 +101,10 @@ _CONTACTS = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 class Wiring:
     """Estimated connection of electrodes and channels.
 
-    - `places`: electrode k stands where electrode `places[k]` should, counted from 0.
-    - `order`: how channels follow each other, where not as described: a name in `channel_orders`; else empty.
-    - `reversed_signs`: whether all voltages have the other sign.
-    - `misfit`: relative misfit of the frame by a uniform body with this wiring; `described`, with the wiring described.
+    - `places`: electrode k is at the place of electrode `places[k]`, numbered from 0.
+    - `order`: order of the channels, a name in `channel_orders`; empty if as described.
+    - `reversed_signs`: whether all voltages have the opposite sign.
+    - `misfit`: relative misfit of a uniform body with this wiring to the frame; `described`: with the described wiring.
     """
 
     places: tuple[int, ...]
@@ -117,12 +115,12 @@ class Wiring:
 
     @property
     def as_described(self) -> bool:
-        """Whether nothing else explains the frame far better."""
+        """Whether the wiring is the described one."""
         return not (self.order or self.reversed_signs or self._cycles())
 
     @property
     def fault(self) -> str:
-        """The fault of the wiring, in a sentence; empty where there is none, or none that prevents imaging."""
+        """The fault of the wiring, in a sentence; empty if it has none that prevents imaging."""
         if self.explanation or self.described < _HOPELESS:
             return self.explanation
         return (
@@ -132,7 +130,7 @@ class Wiring:
 
     @property
     def explanation(self) -> str:
-        """The wiring found, in a sentence, electrodes counted from 1; empty where all is as described."""
+        """The wiring found, in a sentence, with electrodes numbered from 1; empty if it is the described one."""
         found = [_exchanged_places(self.places, self._cycles())]
         found.append(self.order and f"the channels look ordered {self.order}")
         found.append("all voltages look to have the opposite sign" if self.reversed_signs else "")
@@ -142,7 +140,7 @@ class Wiring:
         )
 
     def _cycles(self) -> list[list[int]]:
-        """Electrodes that stand in each other's places."""
+        """Cycles of the permutation of electrodes: each electrode is at the place of the next in its cycle."""
         cycles, left = [], {k for k, place in enumerate(self.places) if place != k}
         while left:
             cycle = [min(left)]
@@ -154,21 +152,22 @@ class Wiring:
 
 
 def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
-    """The wiring that explains a frame of the empty body, `measurement`'s first: as described, unless another misses
-    far less of it.
+    """Find the wiring that explains the first frame of `measurement`, of the empty body: the described wiring, unless
+    the misfit of another is far smaller.
 
-    Tried are channels in another order, voltages of the opposite sign, electrodes counted from another one or the other
-    way round, and up to four exchanges of two electrodes, one after the other. What a body cannot show, such as turning
-    a round and even one, is not found.
+    Candidates are other orders of the channels, voltages of opposite sign, other first electrodes, the reverse order of
+    electrodes, and up to four successive exchanges of two electrodes. Errors that leave the voltages unchanged, such as
+    a rotation of the electrodes of a symmetric body, cannot be found.
     """
     count, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
     plain = Wiring(tuple(range(count)))
     if not np.any(np.asarray(measurement.filled())[0]):
-        return replace(plain, misfit=1.0, described=0.0)  # nothing is known of the wiring of a frame without signal
+        return replace(plain, misfit=1.0, described=0.0)  # a frame without signal does not determine the wiring
     misfit_of = _comparison(model, measurement, orders)
 
     def least(tried: Iterable[Wiring], so_far: Wiring) -> Wiring:
-        # The first of those that differ by rounding alone, as of orders that hold the same voltages by reciprocity.
+        # Misfits are rounded so that the first of equivalent wirings is taken, such as orders that are the same by
+        # reciprocity.
         best = min((misfit_of(one) for one in tried), key=lambda one: round(one.misfit, 9))
         return best if best.misfit < _STEP * so_far.misfit else so_far
 
@@ -183,7 +182,7 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
 
     best = misfit_of(plain)
     described = 1.0 if best.reversed_signs else best.misfit
-    if best.misfit < MOST_MISFIT:  # as described, or but for the sign
+    if best.misfit < MOST_MISFIT:  # as described, except possibly for the sign
         return replace(best, described=described)
     best = with_exchanges(least([replace(plain, order=order) for order in orders], best))
     turned = [Wiring(places, order) for places in _turns(count) for order in orders]
@@ -194,8 +193,8 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
 
 
 def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
-    """Possible orders of the channels (M,) in a file, by name: the index at which each of the protocol's channels is
-    found. The order as described comes first, under an empty name."""
+    """Possible orders of the channels in a file, by name: index in the file (M,) of each channel of the protocol. The
+    first has an empty name and is the order of the protocol."""
     drive, measurement = np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)
     channels = np.arange(len(drive))
     first = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
@@ -219,7 +218,7 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
 
 
 def _comparison(model: ForwardModel, measurement: Measurement, orders) -> Callable[[Wiring], Wiring]:
-    """A function that gives a wiring its misfit, and the sign with which it is least."""
+    """Function that computes the misfit of a wiring and the sign of its voltages."""
     protocol = on_host(model.protocol)
     voltages, mask = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
     impedances = _impedances(model)
@@ -240,7 +239,7 @@ def _comparison(model: ForwardModel, measurement: Measurement, orders) -> Callab
 
 
 def _impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
-    """Transfer impedances of the uniform body of unit conductivity, for the contacts there may be."""
+    """Transfer impedances of the uniform body of unit conductivity, for each contact impedance of `_CONTACTS`."""
     electrodes = model.electrodes
     if electrodes.is_point:
         return [np.asarray(model.transfer_impedance(1.0))]
@@ -251,7 +250,7 @@ def _impedances(model: ForwardModel) -> list[Float[np.ndarray, "L L"]]:
 
 
 def _turns(count: int) -> Iterator[tuple[int, ...]]:
-    """Places of electrodes counted from another one, and the other way round."""
+    """Places of electrodes for each other first electrode, and for the reverse order."""
     for shift in range(count):
         for way in (1, -1):
             if (shift, way) != (0, 1):
@@ -265,7 +264,7 @@ def _exchanged(places: tuple[int, ...], first: int, second: int) -> tuple[int, .
 
 
 def _exchanged_places(places: tuple[int, ...], cycles: list[list[int]]) -> str:
-    """The places of exchanged electrodes, in words."""
+    """Description of exchanged electrodes, in words."""
     if cycles and places in _turns(len(places)):
         way = "from another one" if (places[1] - places[0]) % len(places) == 1 else "the other way round"
         first = f", electrode 1 standing where {places[0] + 1} should" if places[0] else ""

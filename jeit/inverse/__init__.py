@@ -1,7 +1,7 @@
-"""Inverse problems: calibration, priors, linear and nonlinear images, and the rules that choose a hyperparameter.
+"""Inverse problems: calibration, priors, linear and nonlinear images, and rules that choose the hyperparameter.
 
-Solvers, links and further unknowns are in `jeit.inverse.nonlinear`; the classes of results are in the modules that
-compute them.
+Solvers, links and further unknowns are in `jeit.inverse.nonlinear`; classes of results are in the modules that compute
+them.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Calibration: the background conductivity and contact impedance that explain a frame of the undisturbed body."""
+"""Calibration: fit of background conductivity and contact impedance to a frame of the undisturbed body."""
 
 from __future__ import annotations
 
@@ -22,15 +22,14 @@ from jeit.inverse.nonlinear.problem import check_steps
 from jeit_solvers import Status, as_minimum, ended_number, symmetric_inverse
 from jeit_solvers.engines import as_array, has_values, on_device, on_host, undifferentiated
 
-# Logarithm of a contact impedance over the model's, beyond which it no longer changes the voltages.
+# Logarithm of the ratio of a contact impedance to the model's, beyond which it no longer changes the voltages.
 FARTHEST = 50.0
-# Tolerance of the parameters and the misfit: as small as double precision allows.
+# Tolerance of the parameters and the misfit in a traced fit: as small as double precision allows.
 _TRACED_TOLERANCE = 1e-12
 
 
 class TracedFit(NamedTuple):
-    """The model, conductivity, predicted voltages, misfit, standard deviations of the contacts, iterations and the
-    `Status.number` of a fit."""
+    """Result of `traced_fit`; fields as in `Calibration`."""
 
     model: ForwardModel
     conductivity: Float[Array, ""]
@@ -43,7 +42,7 @@ class TracedFit(NamedTuple):
 
 @eqx.filter_jit
 def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact: str, max_steps: int) -> TracedFit:
-    """Fit the logarithms of σ and of z·σ over the model's z to the channels `used` by least squares; see
+    """Fit log σ and log (z·σ / model's z) to the channels `used` by least squares, inside a JAX transformation; see
     `calibrate`."""
     problem = on_device((model, measured, used))
     unit = jnp.where(used, model.voltages(1.0), 0)
@@ -54,7 +53,7 @@ def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact:
     frozen_start, frozen = undifferentiated((start, problem))
     found = optx.least_squares(residual, solver, frozen_start, frozen, max_steps=max_steps, throw=False)
     parameters = as_minimum(found.value, problem, partial(_gradient, contact), partial(_inverse, contact))
-    fitted, conductivity = _applied(contact, parameters, model)
+    fitted, conductivity = _fitted_model(contact, parameters, model)
     left = residual(parameters, problem)
     covariance = symmetric_inverse(_normal(contact, parameters, problem))
     freedom = jnp.maximum(jnp.sum(used) - size, 1)
@@ -65,8 +64,8 @@ def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact:
     return TracedFit(fitted, conductivity, fitted.voltages(conductivity), misfit, deviation, steps, outcome)
 
 
-def _applied(contact: str, parameters, model: ForwardModel) -> tuple[ForwardModel, Any]:
-    """The model and conductivity that the parameters stand for."""
+def _fitted_model(contact: str, parameters, model: ForwardModel) -> tuple[ForwardModel, Any]:
+    """Model and conductivity for these parameters."""
     conductivity = jnp.exp(parameters[0])
     if contact == "fixed":
         return model, conductivity
@@ -77,7 +76,7 @@ def _applied(contact: str, parameters, model: ForwardModel) -> tuple[ForwardMode
 
 def _residual(contact: str, parameters, problem):
     model, measured, used = problem
-    fitted, conductivity = _applied(contact, parameters, model)
+    fitted, conductivity = _fitted_model(contact, parameters, model)
     predicted = fitted.voltages(conductivity)
     return jnp.where(used, predicted - measured, 0) / jnp.linalg.norm(jnp.where(used, measured, 0))
 
@@ -87,13 +86,13 @@ def _gradient(contact: str, parameters, problem):
 
 
 def _normal(contact: str, parameters, problem):
-    """JᵀJ (p, p)."""
+    """Normal matrix JᵀJ (p, p) of the residual."""
     jacobian = jax.jacfwd(lambda p: _residual(contact, p, problem))(parameters)
     return jacobian.T @ jacobian
 
 
 def _inverse(contact: str, parameters, problem):
-    """Inverse of Gauss-Newton's matrix."""
+    """Function that multiplies a vector with the inverse of JᵀJ."""
     inverse = symmetric_inverse(_normal(contact, parameters, problem))
     return lambda vector: inverse @ vector
 
@@ -104,24 +103,25 @@ _REASONS = {
 }
 _TRACED = "It was fitted inside a transformation of JAX; the status says how that ended."
 
-# A relative misfit that measured tanks of known geometry do not reach: 1 % of KIT4's, 8 % of the Kuopio challenge's.
+# Relative misfit above which the model is questioned. It is 1 % for the KIT4 tanks and 8 % for the Kuopio challenge,
+# whose geometry is known.
 _MUCH = 0.12
-# Bounds of the largest voltage of a frame, volts: this number and its inverse.
+# The largest voltage of a frame must lie between this number and its reciprocal, in volts.
 _SMALLEST = 1e-30
-# Relative change of misfit, or of the parameters, that ends a fit; and of a fit on a large mesh.
+# Relative change of the misfit or the parameters that ends a fit: on small meshes, and on large ones.
 _TOLERANCE, _SOLID = 1e-8, 1e-4
-# Cells from which a step takes seconds.
+# Number of cells above which a mesh counts as large: a step then takes seconds.
 _MANY = 30_000
 
 
 class Calibration(eqx.Module):
     """A forward model fitted to a reference frame.
 
-    **Fields**: `model`, with its electrodes' contact impedance fitted; `conductivity`, the uniform background
-    (S/m; 2-D: S), complex if the voltages are; `voltages` (M,), what the model predicts; `misfit`, ‖predicted -
-    measured‖ / ‖measured‖ over the channels used; `contact_deviation` (k,), standard deviations of the logarithms of
-    the k contact impedances fitted, from how well the model fits; `iterations`; `outcome`, the `Status.number` of how
-    the fit ended, and `reason`, in a sentence, empty where all is well.
+    **Fields**: `model`: the model with fitted contact impedance; `conductivity`: uniform background (S/m; 2-D: S),
+    complex if the voltages are; `voltages` (M,): voltages predicted by the fitted model; `misfit`: ‖predicted -
+    measured‖ / ‖measured‖ over the channels used; `contact_deviation` (k,): standard deviations of the logarithms of
+    the k fitted contact impedances, estimated from the residuals; `iterations`: number of iterations; `outcome`:
+    `Status.number` of how the fit ended; `reason`: a sentence on why it did not converge, empty if it did.
     """
 
     model: ForwardModel
@@ -137,18 +137,18 @@ class Calibration(eqx.Module):
     def status(self) -> Status:
         """How the fit ended: "converged", "step limit" or "failed".
 
-        Raises `ValueError` inside `jax.jit`, where that is not known yet, and for a batch.
+        Raises `ValueError` inside `jax.jit`, where the outcome is not known yet, and for a batch of fits.
         """
         return Status.of_number(self.outcome)
 
     @property
     def distinguishes_contacts(self) -> bool:
-        """Whether every contact impedance fitted is known to within a factor of three."""
+        """Whether the fit converged and every fitted contact impedance is known to within a factor of three."""
         return bool(self.status == Status.CONVERGED and (self.contact_deviation < 1).all())
 
     @property
     def note(self) -> str:
-        """The meaning of a large misfit, in a sentence; empty where it is not large."""
+        """Sentence that explains a large misfit; empty if the misfit is not large."""
         if not float(self.misfit) > _MUCH:
             return ""
         if self.model.mesh.dimension == 3:
@@ -170,16 +170,20 @@ def calibrate(
     contact: str = "common",
     max_steps: int = 100,
 ) -> Calibration:
-    """Fit background conductivity and contact impedance to a reference frame, by least squares.
+    """Fit background conductivity and contact impedance to a reference frame by least squares.
 
-    `voltages` (M,) volts of the empty tank. `mask`: True for the channels to use. `contact`: "common", one impedance
-    for all electrodes; "each", one per electrode; "fixed", the model's own. The parameters are logarithms, so both
-    stay positive; the start is the model's impedance with the conductivity that scales the prediction best (voltages
-    are proportional to 1/σ at fixed z·σ). To complex voltages a complex background σ + iωε is fitted, its logarithm's
-    two parts; contact impedances stay real. Raises `ValueError` for a frame of another shape or without signal.
+    - `voltages`: (M,) volts of the empty tank.
+    - `mask`: True for the channels to use.
+    - `contact`: "common" fits one factor of the model's contact impedance for all electrodes; "each" fits one per
+      electrode; "fixed" keeps the model's contact impedance.
 
-    Goes through `jax.grad`, `jax.vmap` and `jax.jit` in the voltages and in all fields of the model. Derivatives are
-    those of the minimum, by the implicit function theorem with the full Hessian.
+    The parameters are logarithms, so conductivity and impedance stay positive. The fit starts from the model's contact
+    impedance and the conductivity that best scales the prediction for σ = 1 to the data (voltages are proportional to
+    1/σ at fixed z·σ). For complex voltages the background σ + iωε is complex, with the two parts of its logarithm as
+    parameters; contact impedances stay real. Raises `ValueError` for a frame of another shape or without signal.
+
+    Works inside `jax.grad`, `jax.vmap` and `jax.jit`, with respect to the voltages and all fields of the model.
+    Derivatives of the minimum follow from the implicit function theorem with the full Hessian.
     """
     check_model(model)
     check_mask(mask)
@@ -217,7 +221,7 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     if model.electrodes.is_point:
         contact = "fixed"
     size = np.linalg.norm(measured)
-    # Start at the model's own contact impedance for a conductivity of one, scaled to fit.
+    # The starting conductivity scales the model's voltages at a conductivity of one to the data.
     unit = np.where(used, model.voltages(1.0), 0)
     if not (unit @ measured).real > 0:
         raise ValueError(
@@ -262,17 +266,17 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
 
 
 def _deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
-    """Standard deviations of fitted parameters, treating the residuals as independent errors."""
+    """Standard deviations of the fitted parameters if the residuals are independent errors."""
     _, size, rows = np.linalg.svd(solution.jac, full_matrices=False)
     freedom = max(np.count_nonzero(solution.fun) - len(solution.x), 1)
     return np.linalg.norm(rows / size[:, None], axis=0) * np.sqrt(2 * solution.cost / freedom)
 
 
 class _Problem:
-    """Voltages as a function of log σ and of log z·σ over the model's z: one for all electrodes, or for each.
+    """Voltages as a function of log σ and of log (z·σ / model's z), which is one number or one per electrode.
 
-    Voltages at fixed z·σ are proportional to 1/σ, so that these are nearly independent of each other. Of a complex
-    admittivity γ, log |γ| stands in place of log σ, and its phase is the second parameter.
+    Voltages are proportional to 1/σ at fixed z·σ, so these parameters are nearly uncorrelated. For a complex
+    admittivity γ, the first two parameters are log |γ| and the phase.
     """
 
     def __init__(self, model: ForwardModel, contact: str, is_complex: bool):
@@ -283,7 +287,7 @@ class _Problem:
 
     @property
     def num_parameters(self) -> int:
-        """Number of parameters: one for the conductivity, or two if it is complex, and those of the contacts."""
+        """Number of parameters: one for the conductivity, or two if it is complex, plus the contact impedances."""
         return (
             self.first_contact + {"fixed": 0, "common": 1, "each": self.given.electrodes.num_electrodes}[self.contact]
         )
@@ -294,7 +298,7 @@ class _Problem:
         return 2 if self.is_complex else 1
 
     def model(self, parameters) -> tuple[ForwardModel, float | complex]:
-        """The model and conductivity that the parameters stand for."""
+        """Model and conductivity for these parameters."""
         conductivity = np.exp(parameters[0] + 1j * parameters[1]) if self.is_complex else np.exp(parameters[0])
         if self.contact == "fixed":
             return self.given, conductivity
@@ -304,25 +308,26 @@ class _Problem:
         return self.given.with_electrodes(electrodes.with_contact_impedance(impedance)), conductivity
 
     def voltages(self, parameters):
-        """(M,) volts."""
+        """Voltages (M,) in volts for these parameters."""
         return self.select(self._fields(parameters)[2])
 
     def jacobian(self, parameters):
-        """Derivatives of the voltages in the parameters, (M, p) volts."""
+        """Derivatives of the voltages with respect to the parameters, (M, p) volts."""
         model, fields, impedance = self._fields(parameters)
         by_conductivity = -self.select(impedance)[:, None]
         if self.sensitivity is None:
             return self._with_phase(by_conductivity, by_conductivity)
         energies = self.sensitivity(fields, impedance, model.electrodes.contact_impedance)
         by_contact = np.stack([self.select(energy) for energy in energies], axis=1)
-        at_fixed_contact = by_conductivity + by_contact.sum(axis=1, keepdims=True)  # z·σ goes with σ
+        at_fixed_contact = by_conductivity + by_contact.sum(axis=1, keepdims=True)  # z·σ is proportional to σ
         if self.contact == "fixed":
             return self._with_phase(at_fixed_contact, at_fixed_contact)
         columns = by_contact if self.contact == "each" else by_contact.sum(axis=1, keepdims=True)
         return np.concatenate([self._with_phase(by_conductivity, at_fixed_contact), columns], axis=1)
 
     def _with_phase(self, by_size, by_logarithm):
-        """The column of log |γ|, and of a complex γ that of its phase, at fixed contact impedance."""
+        """Column of derivatives with respect to log |γ| and, for a complex γ, to its phase at fixed contact
+        impedance."""
         return np.concatenate([by_size, 1j * by_logarithm], axis=1) if self.is_complex else by_size
 
     def _fields(self, parameters):

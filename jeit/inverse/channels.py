@@ -1,13 +1,14 @@
-"""Independent channels of a protocol, and the weight of each channel.
+"""Independent channels of a protocol, and the noise of channels.
 
-The transfer impedance Z (L, L) of any body is symmetric, with rows that sum to zero: L (L - 1) / 2 numbers. A protocol
-often reads more, twice over or in combinations: 208 adjacent channels hold 104, a tank's 2356 hold 376. With T (M, r)
-the combinations that make all channels from r independent ones, v = T v[index], data y with weights W = 1 / noise² are
-as good as their r best estimates,
+The transfer impedance Z (L, L) of a body is symmetric with rows that sum to zero, so it has L (L - 1) / 2 independent
+values. A protocol often has more channels, which repeat or combine these: 208 adjacent channels have 104 independent
+values, 2356 channels of a tank have 376. All channels v are combinations of r independent ones, v = T v[index] with T
+(M, r). For data y with weights W = 1 / noise², the weighted estimates ŷ of the independent channels hold the same
+information,
 
     ‖W^½ (T u - y)‖² = (u - ŷ)ᵀ G (u - ŷ) + rest,   G = TᵀWT,   ŷ = G⁻¹TᵀWy,
 
-and least squares on those cost a fraction: the work grows with the square of the number of channels.
+and least squares with ŷ is much cheaper, because the work grows with the square of the number of channels.
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ _RANK = 1e-9
 
 
 class Data(eqx.Module):
-    """Voltages of independent channels, their noise, and the residual that no body explains.
+    """Voltages of independent channels and their noise.
 
-    **Fields**: `voltages` ŷ (r,) volts; `weight` (r,), 1 / volts; `covariance` and `precision` (r, r) of weight · ŷ,
-    inverse to each other, the precision with a unit diagonal; `rest`, the sum of squares that all conductivities leave.
+    **Fields**: `voltages` (r,): ŷ, volts; `weight` (r,): 1 / volts; `covariance`, `precision` (r, r): covariance of
+    weight · ŷ and its inverse, which has a unit diagonal; `rest`: sum of squared residuals that no conductivity can
+    explain.
     """
 
     voltages: Float[Array, " r"]
@@ -40,20 +42,21 @@ class Data(eqx.Module):
     rest: Float[Array, ""]
 
     def whiten(self, rows: Float[Array, "r *n"]) -> Float[Array, "r *n"]:
-        """Values of weighted channels, (r,) or (r, n), made independent and of unit variance."""
+        """Transform values of weighted channels, (r,) or (r, n), so that their noise is independent with unit
+        variance."""
         return lower_cholesky(self.precision).T @ rows
 
 
 class IndependentChannels(eqx.Module):
-    """Channels that determine all the others: v = `combination` (M, r) · v[`index` (r,)] for every body."""
+    """Channels that determine all others: v = `combination` (M, r) · v[`index` (r,)] for every body."""
 
     index: Int[Array, " r"]
     combination: Float[Array, "M r"]
 
     @classmethod
     def create(cls, protocol: Protocol) -> "IndependentChannels":
-        """Choose channels by a pivoted QR factorisation of their linear forms of Z; all channels, where the protocol is
-        traced and the forms have no values."""
+        """Choose channels by a pivoted QR factorisation of the linear forms that map Z to the channels. If the protocol
+        is traced, all channels are used."""
         if not has_values(protocol):
             number = protocol.num_measurements
             return cls(as_array(np.arange(number)), as_array(np.eye(number)))
@@ -74,15 +77,15 @@ class IndependentChannels(eqx.Module):
         return cls(as_array(order[:rank][sort]), as_array(combination[:, sort]))
 
     def weigh(self, noise: Float[Array, " M"]) -> "Weighing":
-        """Weights that combine voltages of this standard deviation, (M,) volts; the same for all frames of equal
-        noise."""
+        """Compute the map from voltages with noise of this standard deviation, (M,) volts, to `Data`."""
         return _weigh(self.combination, noise)
 
 
 class Weighing(eqx.Module):
-    """Map from voltages to `Data`: everything that depends on the noise alone.
+    """Map from voltages to `Data`, which is the same for all frames of equal noise.
 
-    **Fields**: `noise` (M,) volts; `estimator` (r, M) with ŷ = estimator · y; the rest as in `Data`.
+    **Fields**: `noise` (M,): standard deviations, volts; `estimator` (r, M): matrix with ŷ = estimator · y; `weight`,
+    `covariance`, `precision`: as in `Data`.
     """
 
     noise: Float[Array, " M"]
@@ -122,10 +125,9 @@ def relative_noise(
 ) -> Float[Array, " M"]:
     """Standard deviation of channels whose errors grow with their voltages: relative · √(v² + (floor · median|v|)²).
 
-    The errors of a difference image of a real tank rarely come from the voltmeter: gains, electrode shapes and depth
-    that the model lacks leave errors in proportion to the voltage, largest where driven electrodes are read. `voltages`
-    (M,) of the reference, volts; `mask`: True for usable channels, the others do not count in the median and come out
-    as 1.
+    In real tanks most errors of difference data are proportional to the voltage, because the model does not describe
+    gains, electrode shapes and depth exactly; they are largest where driven electrodes are read. `voltages` (M,):
+    reference frame, volts. `mask`: True for usable channels; others are left out of the median and get 1.
     """
     xp = namespace(voltages, mask)
     size = abs(xp.asarray(voltages))
@@ -137,11 +139,11 @@ def relative_noise(
 def electrode_misfits(
     protocol: Protocol, residual: Float[Array, " M"], noise: Float[Array, " M"], mask: Bool[Array, " M"]
 ) -> Float[np.ndarray, " L"]:
-    """Misfit (L,) of the channels that read each electrode, over the median of all electrodes.
+    """Misfit (L,) of the channels that read each electrode, divided by the median over all electrodes.
 
-    `residual` (M,): predicted less measured, volts; `noise` (M,) volts, see `relative_noise`; `mask`: True for usable
-    channels. 1 for electrodes that none of those reads. An electrode far above 1 has another gain, offset or place than
-    the model assumes.
+    `residual` (M,): predicted - measured, volts; `noise` (M,): volts, see `relative_noise`; `mask`: True for usable
+    channels. Electrodes that no usable channel reads get 1. A value far above 1 indicates an electrode whose gain,
+    offset or position differs from the model's.
     """
     used = np.asarray(mask)
     reads = (np.asarray(protocol.channel_measurement) != 0) & used[:, None]
@@ -153,12 +155,13 @@ def electrode_misfits(
 
 
 def repeated_noise(frames, mask=None, *, prior_frames: float = 4.0) -> Float[np.ndarray, " M"]:
-    """Standard deviation of a single frame's channels (M,), volts, measured from repeated frames of a body at rest.
+    """Standard deviation (M,) of the channels of a single frame, in volts, estimated from repeated frames of an
+    unchanged body.
 
-    `frames` (F, M) volts, F at least 2. `mask` (F, M) or (M,): True for usable voltages; a channel with fewer than two
-    comes out as 1. A deviation of few frames is itself uncertain: variances are drawn towards the channels' median
-    as if that had been seen in `prior_frames` frames more. Raises `ValueError` for other shapes, for frames that are
-    all alike, and for NaN in what is used.
+    `frames` (F, M): volts, F at least 2. `mask` (F, M) or (M,): True for usable voltages; a channel with fewer than two
+    usable voltages gets 1. Estimates from few frames are uncertain, so variances are shrunk towards their median over
+    channels with a weight of `prior_frames` frames. Raises `ValueError` for other shapes, for identical frames, and for
+    NaN in usable voltages.
     """
     if np.iscomplexobj(frames):
         raise ValueError("frames are complex; give their real part or magnitude.")

@@ -1,5 +1,5 @@
-"""Noise of an iterative image: its standard deviation due to the noise of the data, to distinguish bodies from
-ghosts."""
+"""Standard deviation of an iterative image due to the noise of the data, used to distinguish inclusions from
+artefacts."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from jaxtyping import Float
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit_solvers.engines import on_host
 
-# Rows of an image's size at a time.
+# Number of rows of the size of an image computed at a time.
 _ROWS = 32
 
 
 def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
     """Standard deviation (m,) of an image in every cell due to the noise of the data alone, on the link's scale.
 
-    The solution satisfies c = K (Jc - r), K = Jᵀ(JJᵀ + C)⁻¹, so that noise of covariance C gives its coefficients the
-    covariance K C Kᵀ. The noise is as large as given, or as the residual of the image, if that is larger. Raises
-    `ValueError` for total variation and bounded solvers, whose images are not of that kind.
+    The coefficients at the solution satisfy c = K (Jc - r) with K = Jᵀ(JJᵀ + C)⁻¹, so noise of covariance C gives them
+    the covariance K C Kᵀ. If the image's misfit exceeds 1, the standard deviation is multiplied by it. Raises
+    `ValueError` for total variation and bounded solvers, to which this does not apply.
     """
     if not reconstruction.inversion.penalty.is_standard_normal:
         raise ValueError("reconstruction: only images with smooth priors and unbounded solvers have such a noise.")

@@ -1,11 +1,11 @@
-"""The linearised problem of difference imaging: checked, whitened and decomposed.
+"""The linearised problem of difference imaging: its arguments are checked, and it is whitened and decomposed.
 
-The linear problem in the space of the data, solved for one hyperparameter without an eigendecomposition.
+Without derivatives the problem is solved with the eigendecomposition of `jeit.inverse.spectrum`. For traced arguments
+it is solved for one hyperparameter without an eigendecomposition (`DirectProblem`), because eigenvectors of equal
+eigenvalues, which occur for symmetric bodies, have no derivatives although the images have. In the notation of
+`jeit.inverse.spectrum`,
 
-Derivatives take this path: eigenvectors of equal eigenvalues, which symmetric bodies have, have no derivative, but the
-images made of them have. In the notation of `jeit.inverse.spectrum`
-
-    R_λ = ΓJᵀK⁻¹(1 - BGᵀ) + NGᵀ,   G = K⁻¹B(BᵀK⁻¹B)⁻¹,   K = JΓJᵀ + λ²,   B = JN.
+    R_λ = ΓJᵀK⁻¹(I - BGᵀ) + NGᵀ,   G = K⁻¹B(BᵀK⁻¹B)⁻¹,   K = JΓJᵀ + λ²I,   B = JN.
 """
 
 from __future__ import annotations
@@ -32,11 +32,10 @@ from jeit_solvers.engines import adjoint, as_array, has_values, namespace, on_ho
 
 
 class DirectProblem(eqx.Module):
-    """The whitened problem in orthonormal combinations of the channels, with those methods of a `Spectrum` that images
-    need.
+    """Whitened linear problem without an eigendecomposition; it has the methods of a `Spectrum` that compute images.
 
-    **Fields**: `directions` (M, r), the combinations; `jacobian` J (r, m) of them; `product` ΓJᵀ (m, r); `null_space` N
-    (m, p).
+    **Fields**: `directions` (M, r): orthonormal combinations of the channels; `jacobian` (r, m): Jacobian J of the
+    combinations; `product` (m, r): ΓJᵀ; `null_space` (m, p): basis N of the prior's null space.
     """
 
     directions: Float[Array, "M r"]
@@ -45,11 +44,11 @@ class DirectProblem(eqx.Module):
     null_space: Float[Array, "m p"]
 
     def image(self, data: Inexact[Array, " M"], hyperparameter) -> Inexact[Array, " m"]:
-        """R_λ v (m,) for whitened data v."""
+        """Image R_λ v (m,) of whitened data v."""
         return self.reconstruction(hyperparameter) @ data
 
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
-        """R_λ (m, M) for whitened data."""
+        """Reconstruction matrix R_λ (m, M) for whitened data."""
         outer = self.jacobian @ self.product
         damped = (outer + adjoint(outer)) / 2 + hyperparameter**2 * jnp.eye(len(outer))
         inverse = jnp.linalg.inv(damped) if jnp.iscomplexobj(damped) else symmetric_inverse(damped)
@@ -62,16 +61,17 @@ class DirectProblem(eqx.Module):
         return matrix @ self.directions.T
 
 
-# Singular values so small, beside the largest, are rounding.
+# Singular values below this fraction of the largest are rounding errors.
 _NOTHING = 1e-12
 
 
 class Linearisation(eqx.Module):
-    """v = J x at a background conductivity, divided by the noise, for the channels in use.
+    """Linear problem v = J x at a background conductivity for the channels in use, with rows divided by their noise.
 
-    **Fields**: `spectrum` of the problem, or where anything of it is traced, by a derivative, `jax.jit` or `jax.vmap`,
-    the `DirectProblem`, which has no rules for λ; `prior`; `channels` (K,) in use; `root_weight` (K,), 1 / their
-    standard deviation; `num_channels` M of the protocol.
+    **Fields**: `spectrum`: the `Spectrum` of the problem, or a `DirectProblem` if it is traced (by a derivative,
+    `jax.jit` or `jax.vmap`), with which rules for λ do not work; `prior`; `channels` (K,): channels in use;
+    `root_weight` (K,): 1 / standard deviation of these, 1 / volts; `num_channels`: number of channels M of the
+    protocol.
     """
 
     spectrum: Spectrum | DirectProblem
@@ -90,8 +90,8 @@ class Linearisation(eqx.Module):
         noise: Float[Array, " M"] | float = 1.0,
         mask: Bool[Array, " M"] | None = None,
     ) -> "Linearisation":
-        """Linearise at `conductivity`, S/m (2-D: S); arguments as in `one_step`. Raises `ValueError` for those that do
-        not fit."""
+        """Linearise at `conductivity`, S/m (2-D: S); arguments as in `one_step`. Raises `ValueError` for arguments that
+        do not fit together."""
         prior = PRIOR if prior is None else prior
         check_model(model)
         check_prior(prior)
@@ -119,9 +119,10 @@ class Linearisation(eqx.Module):
         return cls(spectrum, prior, channels, root_weight, model.protocol.num_measurements)
 
     def whiten(self, difference: ArrayLike) -> Float[Array, " K"]:
-        """A change of voltages (M,) in standard deviations, channels in use only.
+        """Change of voltages (M,) divided by the standard deviations, for the channels in use (K,).
 
-        Raises `ValueError` for another number of channels, and for NaN in channels in use, where they can be seen.
+        Raises `ValueError` for another number of channels and, unless traced, for NaN or infinite values in channels in
+        use.
         """
         if np.shape(difference) != (self.num_channels,):
             raise ValueError(
@@ -135,7 +136,7 @@ class Linearisation(eqx.Module):
         return as_array(data)
 
     def matrix(self, hyperparameter) -> Float[Array, "m M"]:
-        """The reconstruction matrix: change of conductivity per volt, zero for channels not in use."""
+        """Reconstruction matrix: change of conductivity per volt, zero for channels not in use."""
         if not has_values(self.spectrum, self.root_weight, hyperparameter):
             used = jnp.asarray(self.spectrum.reconstruction(hyperparameter)) * self.root_weight
             return jnp.zeros((used.shape[0], self.num_channels), used.dtype).at[:, self.channels].set(used)
@@ -143,10 +144,10 @@ class Linearisation(eqx.Module):
         return as_array(images @ weights)
 
     def factors(self, hyperparameter) -> tuple[Float[np.ndarray, "m k"], Float[np.ndarray, "k M"]]:
-        """Factors of the reconstruction matrix: images (m, k) and their weights (k, M), 1 / volts, the smaller of the
-        two forms to keep. For a problem that has values."""
+        """Factors of the reconstruction matrix: images (m, k), and their weights (k, M) in 1 / volts. Not available for
+        traced problems."""
         assert isinstance(self.spectrum, Spectrum)
-        known, chosen = on_host((self.spectrum, hyperparameter))  # NumPy arrays stay so, and are not copied
+        known, chosen = on_host((self.spectrum, hyperparameter))  # NumPy arrays are not copied
         images, whitened = (np.asarray(part) for part in known.factors(chosen))
         weights: Any = np.zeros((whitened.shape[0], self.num_channels), whitened.dtype)
         weights[:, self.channels] = whitened * self.root_weight
@@ -156,15 +157,16 @@ class Linearisation(eqx.Module):
 def combined_blocks(
     model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
 ) -> Iterator[tuple[slice, Any]]:
-    """Weighted sums (r, b) of channels' Jacobians, in blocks of b cells to limit the memory; in NumPy.
+    """Iterate over blocks of b cells, to limit memory, and yield the cells and the weighted sums (r, b) of the
+    channels' Jacobians there, in NumPy.
 
-    `conductivity` in S/m (2-D: S). Raises `ValueError` for a bad one.
+    `conductivity` in S/m (2-D: S). Raises `ValueError` for an invalid conductivity.
     """
     fields = evaluate(model, fields_and_impedance_of, check_conductivity(model.mesh, conductivity))[0]
     mesh, protocol, fields = on_host((model.mesh, model.protocol.subset(channels), fields))
     electrodes = protocol.num_electrodes
     if electrodes * (electrodes + 1) // 2 < len(channels):
-        # Products of fields are fewer: ∂v = -Σ_ab d_a m_b ∫ ∇u_a · ∇u_b.
+        # There are fewer products of fields than channels: ∂v = -Σ_ab d_a m_b ∫ ∇u_a · ∇u_b.
         weights, blocks = -weights @ _forms(model.protocol, channels), field_products(mesh, fields)
     else:
         blocks = jacobian_blocks(mesh, protocol, fields)
@@ -175,7 +177,7 @@ def combined_blocks(
 def combined_jacobian(
     model: ForwardModel, conductivity, channels: Int[np.ndarray, " K"], weights: Float[Any, "r K"]
 ) -> Inexact[Any, "r m"]:
-    """Weighted sums of channels' Jacobians in every cell, (r, m); `conductivity` in S/m (2-D: S)."""
+    """Weighted sums (r, m) of the channels' Jacobians; `conductivity` in S/m (2-D: S)."""
     kind = complex if np.iscomplexobj(conductivity) else float
     found = np.empty((len(weights), model.mesh.num_cells), kind)
     for cells, block in combined_blocks(model, conductivity, channels, weights):
@@ -184,8 +186,8 @@ def combined_jacobian(
 
 
 def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[Array, " K"]]:
-    """Indices (K,) of the channels in use, and 1 / their noise (K,), 1 / volts, traced where the noise is; raises
-    `ValueError`."""
+    """Indices (K,) of the channels in use, and the reciprocals (K,) of their noise, 1 / volts. Raises `ValueError` for
+    an invalid mask or noise."""
     check_mask(mask)
     num_channels = model.protocol.num_measurements
     used = np.ones(num_channels, bool) if mask is None else np.asarray(mask, bool)
@@ -203,38 +205,41 @@ def used_channels(model: ForwardModel, noise, mask) -> tuple[np.ndarray, Float[A
 
 
 def check_mask(mask) -> None:
-    """Raise `ValueError` for a mask that is traced: how many channels there are has to be known."""
+    """Raise `ValueError` for a traced mask, because the number of channels in use must be known."""
     instead = "give it as an array of NumPy, outside; to weigh channels by what is traced, give noise"
     check_has_values("mask", mask, "which channels are used depends on", instead)
 
 
 def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarray, "K r"]:
-    """An orthonormal basis of the changes of whitened data that changes of conductivity can make. All channels, however
-    many, are combinations of the L(L - 1)/2 transfer impedances of L electrodes.
+    """Orthonormal basis of the changes of whitened data that changes of conductivity can cause. Its dimension is at
+    most L(L - 1)/2 for L electrodes, because all channels are combinations of that many transfer impedances.
 
-    Drive d and measurement m, which sum to zero, see Σ_ab d_a m_b G_ab = Σ_a<b (d_a m_b + d_b m_a)(G_ab - (G_aa +
-    G_bb)/2) of a symmetric G, be it the transfer impedance or its derivative.
+    For a drive d and a measurement m, which sum to zero, and a symmetric matrix G (the transfer impedance or its
+    derivative), Σ_ab d_a m_b G_ab = Σ_a<b (d_a m_b + d_b m_a)(G_ab - (G_aa + G_bb)/2).
     """
-    directions, size, _ = np.linalg.svd(root_weight[:, None] * _seen(protocol, channels), full_matrices=False)
+    directions, size, _ = np.linalg.svd(
+        root_weight[:, None] * _pair_coefficients(protocol, channels), full_matrices=False
+    )
     return directions[:, size > _NOTHING * size[0]]
 
 
 def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array, "K r"]:
-    """`data_directions`, differentiable in the weights; as many as channels where the protocol has no values."""
+    """`data_directions`, differentiable with respect to the weights; the identity if the protocol is traced."""
     if not has_values(protocol):
         return jnp.eye(len(channels))
-    directions, size, _ = np.linalg.svd(_seen(protocol, channels), full_matrices=False)
+    directions, size, _ = np.linalg.svd(_pair_coefficients(protocol, channels), full_matrices=False)
     return jnp.linalg.qr(root_weight[:, None] * directions[:, size > _NOTHING * size[0]])[0]
 
 
-def _seen(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]:
-    """Coefficients of the channels for every pair of electrodes."""
+def _pair_coefficients(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]:
+    """Coefficients (K, e) of the channels for each of the e pairs of electrodes."""
     first, second = np.triu_indices(protocol.num_electrodes)
     return _forms(protocol, channels)[:, first < second]
 
 
 def _forms(protocol: Protocol, channels) -> Float[np.ndarray, "K f"]:
-    """Channels as linear forms of the upper triangle, diagonal included, of what is symmetric between electrodes."""
+    """Coefficients (K, f) of the channels as linear forms of the upper triangle, including the diagonal, of a symmetric
+    matrix between electrodes."""
     drive = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]
     measurement = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
     first, second = np.triu_indices(protocol.num_electrodes)

@@ -1,18 +1,18 @@
-"""Eigendecomposition of the linear problem in the space of the data, from which images for any hyperparameter are
-cheap.
+"""Eigendecomposition of the linear problem in data space, which makes images for any hyperparameter cheap.
 
-For complex admittivities J and data are complex, ᵀ stands for the conjugate transpose, and the image is the minimum of
-the same sum of squares. With whitened Jacobian J (M, m), prior covariance Γ and null space N, the reconstruction is
+With the whitened Jacobian J (M, m), the prior covariance Γ and a basis N of the prior's null space, the reconstruction
+matrix is
 
     R_λ = ΓJᵀP_λ + N(BᵀK⁻¹B)⁻¹BᵀK⁻¹,   K = JΓJᵀ + λ²I,   B = JN,   P_λ = Q(QᵀKQ)⁻¹Qᵀ,
 
-Q being an orthonormal basis of the complement of B (all of the data where N is empty). With QᵀJΓJᵀQ = UΛUᵀ the
-residual is v - JR_λv = λ²P_λv = QU diag(λ²/(Λ + λ²)) UᵀQᵀv, whatever λ, and
+where Q is an orthonormal basis of the orthogonal complement of B (Q = I if N is empty). With the eigendecomposition
+QᵀJΓJᵀQ = UΛUᵀ, which does not depend on λ, the residual is v - JR_λv = λ²P_λv = QU diag(λ²/(Λ + λ²)) UᵀQᵀv, and
 
     R_λ = (I - NB⁺J) ΓJᵀQU diag(1/(Λ + λ²)) UᵀQᵀ + NB⁺.
 
-What data can show of a body is often of far fewer dimensions than there are channels: J = DG with orthonormal columns
-in D (M, r), and G (r, m) and its product ΓGᵀ are all that is kept of the size of the image.
+The changes of data that a body can cause often have a far lower dimension r than the number of channels: J = DG with
+orthonormal columns of D (M, r). Only G (r, m) and ΓGᵀ are stored at the size of the image. For complex admittivities J
+and the data are complex and ᵀ denotes the conjugate transpose.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from numpy.typing import ArrayLike
 from jeit_solvers import symmetric_eigen
 from jeit_solvers.engines import adjoint, either_engine, has_values, host, namespace
 
-# Cells of which a mean over cells is taken, about.
+# Approximate number of cells over which means over the image are taken.
 _ENOUGH = 10_000
 
 
 class Spectrum(eqx.Module):
-    """Eigendecomposition of the data-space system, from which the reconstruction for any λ is cheap.
+    """Eigendecomposition of the data-space system, in the notation of `jeit.inverse.spectrum`.
 
-    **Fields**: `basis` (M, k) = QU; `eigenvalues` Λ (k,); `directions` D (M, r); `reduced` G (r, m); `images` ΓGᵀ
-    (m, r); `null_space` N (m, p); `seen` B = JN (M, p); `outer` JΓJᵀ (M, M); `repeated`, how many of the components say
-    nothing, whatever was measured, see `Protocol.repeated_facts`.
+    **Fields**: `basis` (M, k): QU; `eigenvalues` (k,): Λ; `directions` (M, r): D; `reduced` (r, m): G; `images` (m, r):
+    ΓGᵀ; `null_space` (m, p): N; `seen` (M, p): B = JN; `outer` (M, M): JΓJᵀ; `repeated`: number of components that hold
+    no information because readings are repeated, see `Protocol.repeated_facts`.
     """
 
     basis: Float[Array, "M k"]
@@ -56,61 +56,63 @@ class Spectrum(eqx.Module):
         directions: Float[Array, "M r"] | None = None,
         repeated: int = 0,
     ):
-        """From the whitened Jacobian, its product with the prior covariance, and the prior's null space; of all
-        channels, or in orthonormal `directions` of theirs."""
+        """Create from the whitened Jacobian of all channels, or of their orthonormal combinations `directions`, its
+        product with the prior covariance, and the prior's null space."""
         given = host.asarray(np.eye(len(jacobian))) if directions is None else directions
         basis, eigenvalues, seen, outer = _decompose(jacobian, product, null_space, given)
         return cls(basis, eigenvalues, given, jacobian, product, null_space, seen, outer, repeated)
 
     @property
     def freedom(self) -> int:
-        """Number of independent components of the data: all but those that are repeated."""
+        """Number of independent components of the data, without repeated readings."""
         return self.eigenvalues.shape[0] - self.repeated
 
     @property
     def jacobian(self) -> Float[Array, "M m"]:
-        """The whitened Jacobian J (M, m)."""
+        """Whitened Jacobian J (M, m)."""
         return self.directions @ self.reduced
 
     @property
     def product(self) -> Float[Array, "m M"]:
-        """ΓJᵀ (m, M)."""
+        """Product ΓJᵀ (m, M)."""
         return self.images @ self.directions.T
 
     def reconstruction(self, hyperparameter) -> Float[Array, "m M"]:
-        """R_λ (m, M) for whitened data."""
+        """Reconstruction matrix R_λ (m, M) for whitened data."""
         images, weights = self.factors(hyperparameter)
         return images @ weights
 
     def factors(self, hyperparameter) -> tuple[Float[Array, "m k"], Float[Array, "k M"]]:
-        """Images (m, k), no more than the data can distinguish, and their weights: R_λ = images · weights."""
+        """Factors of R_λ = images · weights: images (m, k) and weights (k, M), k at most the dimension of the data plus
+        that of the null space."""
         return _factors(self, hyperparameter)
 
     def image(self, data: ArrayLike, hyperparameter) -> Float[Array, " m"]:
-        """R_λ v (m,) for whitened data v, without R_λ."""
+        """Image R_λ v (m,) of whitened data v, computed without forming R_λ."""
         return _image(self, data, hyperparameter)
 
     def filter(self, hyperparameter) -> Float[Array, " r"]:
-        """λ²/(Λ + λ²): the share of each data component that stays in the residual."""
+        """Filter λ²/(Λ + λ²), the fraction of each data component that stays in the residual."""
         return hyperparameter**2 / (self.eigenvalues + hyperparameter**2)
 
     def modes(self) -> Float[Array, "m k"]:
-        """(I - NB⁺J) ΓJᵀQU: what each data component adds to the image, but for the factor 1/(Λ + λ²)."""
+        """Images (I - NB⁺J) ΓJᵀQU; mode i times 1/(Λᵢ + λ²) is the contribution of data component i to the image."""
         return _modes(self)
 
     def squared_modes(self) -> Float[np.ndarray, " k"]:
-        """The mean over cells of the square of each of the `modes`; over some thousands, where there are more."""
+        """Mean over cells of the squared absolute value of each of the `modes`; over a subset of about `_ENOUGH` cells
+        on large meshes."""
         images, weights = (np.asarray(part) for part in _mode_factors(self))
         some = images[:: max(1, len(images) // _ENOUGH)]
         return np.mean(np.abs(some @ weights) ** 2, axis=0)
 
     def candidates(self, size: int = 200) -> Float[np.ndarray, " K"]:
-        """Candidate λ (K,), logarithmic over the range where any component is neither kept nor dropped."""
+        """Candidate λ (K,), logarithmically spaced from 1e-6 to 10 times the square root of the largest eigenvalue."""
         largest = np.sqrt(np.asarray(self.eigenvalues).max())
         return largest * np.logspace(-6, 1, size)
 
     def curves(self, data: ArrayLike | None, candidates: Float[np.ndarray, " K"]) -> tuple[np.ndarray, np.ndarray]:
-        """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), of every candidate λ; empty ones without data, or where
+        """Residual ‖v - JR_λv‖ and penalty √(xᵀQx), each (K,), for every candidate λ; empty arrays without data or if
         they are traced."""
         if data is None or not has_values(data):
             return np.zeros(0), np.zeros(0)
@@ -141,7 +143,7 @@ def _factors(spectrum: Spectrum, hyperparameter):
     weights = spectrum.directions.T @ inverse
     if spectrum.null_space.shape[1] == 0:
         return spectrum.images, weights
-    # Least-squares coefficients of the null space for the data that the penalised part leaves.
+    # Coefficients of the null space, fitted by least squares to the data that the penalised part does not explain.
     coefficients = xp.linalg.pinv(spectrum.seen)
     rest = np.eye(basis.shape[0]) - spectrum.outer @ inverse
     images = xp.concatenate([spectrum.images, spectrum.null_space], axis=1)

@@ -1,19 +1,19 @@
 """Uncertainty of an image: its posterior distribution by the Laplace approximation.
 
-At the solution ĉ of ½ rᵀGr + penalty(c) the posterior is taken for the Gaussian of the linearised problem, with
+The posterior is approximated by the Gaussian of the problem linearised at the minimum ĉ of ½ rᵀGr + penalty(c). Its
 covariance
 
-    Σ = (Q + JᵀGJ)⁻¹ = Q⁻¹ - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹JQ⁻¹,
+    Σ = (Q + JᵀGJ)⁻¹ = Q⁻¹ - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹JQ⁻¹
 
-computed in the space of the data. Of smooth priors Q is 1, and Σ is exact where voltages are linear in c. Tarantola,
-Inverse Problem Theory (SIAM 2005), ch. 3; Kaipio and Somersalo, Statistical and Computational Inverse Problems
-(Springer 2005), ch. 3; MacKay, Neural Comput. 4 (1992) 415-447.
+is computed in data space. For smooth priors Q = I, and Σ is exact if voltages are linear in c. Tarantola, Inverse
+Problem Theory (SIAM 2005), ch. 3; Kaipio and Somersalo, Statistical and Computational Inverse Problems (Springer 2005),
+ch. 3; MacKay, Neural Comput. 4 (1992) 415-447.
 
-Of total variation Q is the form that touches its energy at ĉ from above, that of lagged diffusivity (Vogel and Oman,
-SIAM J. Sci. Comput. 17 (1996) 227-238): a jump of height d between cells is held at it with a stiffness of 1 / √(d² +
-β²), a jump of none with that of 1 / β. So Σ is conditional on the edges found: the uncertainty if the places of the
-edges, and roughly their heights, were known. Where an edge lies the energy itself bends less than Q, and the data may
-be as well explained by an edge elsewhere: there the truth is spread wider.
+For total variation, Q is the quadratic form of lagged diffusivity, which touches the energy at ĉ from above (Vogel and
+Oman, SIAM J. Sci. Comput. 17 (1996) 227-238). A jump of height d between cells has a stiffness proportional to
+1 / √(d² + β²). Σ is therefore conditional on the edges found: it is the uncertainty if the positions of the edges, and
+roughly their heights, were known. At an edge the energy has a smaller curvature than Q, and an edge at another position
+may explain the data as well, so the true uncertainty is larger there.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from jeit.mesh import measures
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
 
-# Rows of an image's size at a time.
+# Number of rows of the size of an image computed at a time.
 _ROWS = 32
 
 
 class Posterior(eqx.Module):
-    """Posterior of an image: a Gaussian of its coefficients, with mean ĉ. Made by `posterior`.
+    """Posterior of an image: a Gaussian distribution of its coefficients with mean ĉ, created by `posterior`.
 
-    **Fields**: `inversion`; `coefficients` ĉ (n,); `jacobian` J (r, n) there; `root` W (r, r) with WᵀW =
-    (JQ⁻¹Jᵀ + C)⁻¹; `cross` JQ⁻¹ (r, n), J itself where Q is 1; `prior`, the normal distribution of precision Q.
+    **Fields**: `inversion`: the problem; `coefficients` (n,): ĉ; `jacobian` (r, n): J at ĉ; `root` (r, r): W with
+    WᵀW = (JQ⁻¹Jᵀ + C)⁻¹; `cross` (r, n): JQ⁻¹; `prior`: normal distribution of precision Q.
     """
 
     inversion: Inversion
@@ -53,16 +53,16 @@ class Posterior(eqx.Module):
     prior: AbstractNormal
 
     def standard_deviation(self) -> Float[Array, " m"]:
-        """Standard deviation of the conductivity of every cell, S/m (2-D: S), to first order in the link."""
+        """Standard deviation of the conductivity of every cell, S/m (2-D: S), with the link linearised."""
         estimate, deviation = _estimate(self)
         return self.inversion.link.slope(estimate) * deviation
 
     def credible_interval(self, probability: float = 0.95) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Lower and upper bounds of every cell's conductivity, between which it lies with this probability, one cell at
-        a time.
+        """Lower and upper limits of every cell's conductivity, S/m (2-D: S), between which it lies with this
+        probability, for each cell separately.
 
-        Gaussian on the link's scale, so that bounds and positivity are kept. Raises `ValueError` for a probability that
-        is not between 0 and 1.
+        The interval is computed on the link's scale, so positivity and bounds of the link hold. Raises `ValueError` if
+        the probability is not between 0 and 1.
         """
         if not 0 < probability < 1:
             raise ValueError(f"probability must lie between 0 and 1; it is {probability}.")
@@ -72,9 +72,10 @@ class Posterior(eqx.Module):
         return link.conductivity(estimate - reach * deviation), link.conductivity(estimate + reach * deviation)
 
     def region(self, cells) -> tuple[float | Float[Array, ""], float | Float[Array, ""]]:
-        """Mean conductivity of some cells, weighted by area, and its standard deviation, S/m (2-D: S).
+        """Mean conductivity of the given cells, weighted by area (3-D: volume), and its standard deviation, S/m
+        (2-D: S).
 
-        `cells`: booleans (m,) or indices. Raises `ValueError` for none, or cells that are not there, or traced.
+        `cells`: booleans (m,) or indices. Raises `ValueError` for an empty selection, invalid indices and traced cells.
         """
         measure = on_host(measures(self.inversion.model.mesh))
         chosen = np.zeros(measure.size, bool)
@@ -92,8 +93,8 @@ class Posterior(eqx.Module):
         return (float(mean), float(deviation)) if has_values(mean) else (mean, deviation)
 
     def unknowns(self) -> dict[str, Float[Array, " k"]]:
-        """Standard deviations of what was estimated along with the conductivity, in the units of
-        `Reconstruction.unknowns`; to first order where a logarithm was estimated."""
+        """Standard deviations of the unknowns estimated along with the conductivity, in the units of
+        `Reconstruction.unknowns`; linearised for quantities whose logarithm was estimated."""
         model, values = self.inversion.model, self.inversion.values(self.coefficients)
         start = self.inversion.basis.num_coefficients
         deviation = jnp.sqrt(1 - jnp.sum((self.root @ self.cross) ** 2, axis=0))
@@ -106,8 +107,8 @@ class Posterior(eqx.Module):
         return found
 
     def sample(self, key: PRNGKeyArray, number: int) -> Float[Array, "number m"]:
-        """Conductivities (number, m) drawn from the posterior, S/m (2-D: S). Raises `ValueError` for what is
-        no key."""
+        """Draw conductivities (number, m) from the posterior, S/m (2-D: S). Raises `ValueError` if `key` is not a key
+        of `jax.random`."""
         check_key(key)
         prior, noise = jax.random.split(key)
         numbers = jax.random.normal(prior, (number, self.prior.num_draws(len(self.coefficients))))
@@ -115,14 +116,14 @@ class Posterior(eqx.Module):
 
 
 def posterior(reconstruction: Reconstruction) -> Posterior:
-    """The posterior round a reconstruction, by the Laplace approximation.
+    """Posterior distribution of a reconstruction, by the Laplace approximation.
 
-    With a smooth prior its standard deviations are as accurate as the noise, the prior and the forward model are: with
-    λ = 1 and a prior of the right variance they hold at their nominal rate; λ = 2 assumes that the image varies half as
-    much. With total variation they are conditional on the edges found: the uncertainty if the places of the edges, and
-    roughly their heights, were known. At an edge, which may lie elsewhere, the truth is spread wider. Raises
-    `ValueError` for bounded solvers, whose posterior is not near a Gaussian, and for a reconstruction that has failed,
-    or is none.
+    With a smooth prior, the standard deviations are as accurate as the noise, the prior and the forward model: with
+    λ = 1 and the correct prior variance, credible intervals have their nominal coverage; λ = 2 assumes that the image
+    varies half as much. With total variation, they are conditional on the edges found: they hold if the positions of
+    the edges, and roughly their heights, are known, and are too small at an edge that may lie elsewhere. Raises
+    `ValueError` for bounded solvers, whose posterior is not nearly Gaussian, for a failed reconstruction, and for any
+    other object.
     """
     check_kind("reconstruction", reconstruction, Reconstruction, "what reconstruct has returned")
     inversion, coefficients = reconstruction.inversion, reconstruction.coefficients
@@ -131,7 +132,8 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
     in_pieces = inversion.model.mesh.dimension == 3 or not inversion.penalty.is_standard_normal
     if not (has_values(inversion, coefficients) and in_pieces):
         return _posterior(inversion, coefficients)
-    # For a solid body compiled programs would hold the Jacobian several times over; those of factors take seconds.
+    # For a solid body, compiled programs would hold several copies of the Jacobian; with sparse factors, compilation
+    # takes seconds.
     with np.errstate(all="ignore"):
         known, ended = on_host((inversion, coefficients))
         jacobian, cross, inner, normal = _within_data(known, ended)
@@ -148,7 +150,7 @@ def _posterior(inversion: Inversion, coefficients) -> Posterior:
 
 
 def _within_data(inversion: Inversion, coefficients):
-    """J, JQ⁻¹, JQ⁻¹Jᵀ + C, and the normal distribution of precision Q."""
+    """Matrices J, JQ⁻¹ and JQ⁻¹Jᵀ + C, and the normal distribution of precision Q."""
     normal = inversion.penalty.normal(coefficients)
     if normal is None:
         raise ValueError(
@@ -162,15 +164,16 @@ def _within_data(inversion: Inversion, coefficients):
 
 @either_engine
 def _estimate(posterior: Posterior):
-    """x at the solution, background unknowns included, and its standard deviation, per cell, on the link's scale.
+    """Image x at the solution, including unknowns that change it, and its standard deviation, per cell, on the link's
+    scale.
 
-    With S the shapes and what unknowns add to the image, the variance is diag(S Q⁻¹ Sᵀ) - diag(S Q⁻¹Jᵀ WᵀW JQ⁻¹ Sᵀ), of
-    which the rows W JQ⁻¹ Sᵀ are made some at a time.
+    S holds the shapes and the contributions of the unknowns to the image. The variance is diag(S Q⁻¹ Sᵀ) -
+    diag(S Q⁻¹Jᵀ WᵀW JQ⁻¹ Sᵀ); the rows W JQ⁻¹ Sᵀ are computed in blocks.
     """
     inversion, coefficients = posterior.inversion, posterior.coefficients
     basis, xp = inversion.basis, namespace(posterior)
     estimate, count = inversion.estimate(coefficients), basis.num_coefficients
-    # Unknowns change the image linearly, if at all.
+    # An unknown changes the image linearly or not at all.
     further = [np.arange(len(coefficients)) == number for number in range(count, len(coefficients))]
     added = [inversion.estimate(coefficients + one) - estimate for one in further]
     variance = posterior.prior.variance(basis) + sum(one**2 for one in added)
@@ -186,7 +189,7 @@ def _estimate(posterior: Posterior):
 
 @either_engine
 def _weighted(posterior: Posterior, weight):
-    """The weighted sum of cells' conductivities and its standard deviation."""
+    """Weighted sum of the cells' conductivities, and its standard deviation."""
     inversion, coefficients, xp = posterior.inversion, posterior.coefficients, namespace(posterior, weight)
     estimate, count = inversion.estimate(coefficients), inversion.basis.num_coefficients
     slope = weight * inversion.link.slope(estimate)
@@ -200,7 +203,8 @@ def _weighted(posterior: Posterior, weight):
 
 @either_engine
 def _sample(posterior: Posterior, numbers, errors):
-    """c = ĉ + z - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹(Jz + e), with z from the prior and e from the noise."""
+    """Sample conductivities with c = ĉ + z - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹(Jz + e), where z is drawn from the prior and e from
+    the noise."""
     inversion, root, xp = posterior.inversion, posterior.root, namespace(posterior, numbers)
     drawn = posterior.prior.drawn(numbers.T).T
     seen = drawn @ posterior.jacobian.T + errors @ xp.linalg.cholesky(inversion.data.covariance).T

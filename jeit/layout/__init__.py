@@ -1,8 +1,9 @@
 """Layouts of electrodes: arrangements as arrays of positions, and `Layout`, a design with sizes, labels and an outline.
 
-Arrangements: `ring`, `ring_and_centre`, `perimeter`, `grid`, `quasi_uniform`, and `spread` over surfaces in space.
-Layouts: `named_layout`, or from and to a CSV, DXF or SVG file (`read_layout`, `write_layout`); `SurfaceLayout` of
-curved skins, from a CSV file by `read_surface_layout`.
+The functions `ring`, `ring_and_centre`, `perimeter`, `grid` and `quasi_uniform` compute arrangements in a plane, and
+`spread` on surfaces in space. A `Layout` is created by name with `named_layout`, or read from and written to a CSV, DXF
+or SVG file with `read_layout` and `write_layout`. A `SurfaceLayout` of a curved skin is read from a CSV file with
+`read_surface_layout`.
 """
 
 from __future__ import annotations

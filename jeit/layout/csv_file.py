@@ -1,4 +1,4 @@
-"""Layouts in CSV files, in a plane and on surfaces."""
+"""Reading and writing of layouts in CSV files, in a plane and on surfaces."""
 
 from __future__ import annotations
 
@@ -22,16 +22,20 @@ from jeit.mesh import Domain, Mesh
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 _FLAT = ("x", "y", "diameter")
 _KNOWN = ("x", "y", "z", "diameter")
-# "x_mm", "x [mm]", "x (mm)", "xmm"
+# Title of a column with its unit: "x_mm", "x [mm]", "x (mm)" or "xmm".
 _LENGTH = re.compile(rf"({'|'.join(_KNOWN)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
 _LABEL, _IMPEDANCE = "label", "contact_impedance_ohm_m2"
 MOST_BYTES = 2**24
-"""Of a file of a layout: electrodes of more could not be read in a minute."""
+"""Maximum size of a layout file in bytes: reading a larger file would take more than a minute."""
 
 
 class LayoutTable(NamedTuple):
-    """A table of L electrodes: `lengths` (L,) by name, metres, `contact_impedance` (L,) ohm·m² or None, `labels` or
-    None, the numbers of their `lines`, and the `titles` of the lengths' columns."""
+    """A table of L electrodes.
+
+    **Fields**: `lengths`: coordinates and diameters (L,) by name, metres; `contact_impedance`: (L,) ohm·m², or None;
+    `labels`: labels, or None; `lines`: number of the line of each electrode; `titles`: titles of the columns of
+    lengths.
+    """
 
     lengths: dict[str, Float[np.ndarray, " L"]]
     contact_impedance: Float[np.ndarray, " L"] | None
@@ -41,12 +45,13 @@ class LayoutTable(NamedTuple):
 
 
 def millimetres(metres: float) -> float:
-    """A length as the decimal millimetres of a text file: 12.5, not 12.500000000000002 or -0.0."""
+    """Convert metres to millimetres for a text file, rounded so that 12.500000000000002 becomes 12.5, and -0.0 becomes
+    0.0."""
     return round(1e3 * float(metres), 9) + 0.0
 
 
 def write_csv(layout: Layout | SurfaceLayout, file: BinaryIO) -> None:
-    """Write the electrodes; the outline, or the surface, has no place in a table."""
+    """Write the electrodes of a layout as a table, without the outline or the surface."""
     lengths = np.column_stack([layout.centres, layout.diameters])
     names = _FLAT if lengths.shape[1] == 3 else _KNOWN
     header = [*(f"{name}_mm" for name in names), _LABEL]
@@ -62,7 +67,8 @@ def write_csv(layout: Layout | SurfaceLayout, file: BinaryIO) -> None:
 
 
 def read_csv(path: Path, outline: Domain | None) -> Layout:
-    """Read what `write_csv` wrote, or a table made by hand. Raises `ValueError`, naming the line."""
+    """Read a layout in a plane from a table, written by `write_csv` or by hand. Raises `ValueError`, naming the
+    line."""
     table = read_table(path, _FLAT)
     centres, diameters = np.column_stack([table.lengths["x"], table.lengths["y"]]), table.lengths["diameter"]
     _check_unit(centres, diameters, table.titles)
@@ -78,7 +84,8 @@ def read_csv(path: Path, outline: Domain | None) -> Layout:
 
 
 def read_table(path: Path, wanted: Sequence[str]) -> LayoutTable:
-    """A table with the lengths `wanted`, of "x", "y", "z" and "diameter", each with a unit. Raises `ValueError`."""
+    """Read a table whose columns of lengths are `wanted`, some of "x", "y", "z" and "diameter", each with a unit.
+    Raises `ValueError` for anything else."""
     lines = _lines(path, wanted)
     delimiter = next((mark for mark in ";\t" if mark in lines[0][1]), ",")
     (_, header), *rows = [(number, _cells(line, delimiter)) for number, line in lines]
@@ -110,7 +117,7 @@ def read_table(path: Path, wanted: Sequence[str]) -> LayoutTable:
 
 
 def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -> None:
-    """Raise `ValueError` for lengths that must be of another unit than the columns' titles say."""
+    """Raise `ValueError` for lengths that are implausible in the unit that the titles of the columns state."""
     x_min, x_max, y_min, y_max = bounds(centres, diameters)
     size = max(x_max - x_min, y_max - y_min)
     if size < SMALLEST:
@@ -126,7 +133,7 @@ def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -
 
 
 def _lines(path: Path, wanted: Sequence[str]) -> list[tuple[int, str]]:
-    """Lines that hold something, with their numbers from 1."""
+    """Read the lines that are neither empty nor comments, with their numbers from 1."""
     try:
         text = read_text(path, encoding="utf-8-sig", most=MOST_BYTES)
     except UnicodeError:
@@ -144,7 +151,8 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _columns(header: list[str], wanted: Sequence[str]) -> dict[str, tuple[int, float]]:
-    """Place and unit of every column. Raises `ValueError` for names that say no unit, are missing or not known."""
+    """Index and unit (in metres) of every column, by name. Raises `ValueError` for columns that are missing, unknown,
+    repeated, or do not state their unit."""
     columns: dict[str, tuple[int, float]] = {}
     for place, title in enumerate(header):
         length = _LENGTH.fullmatch(title.lower())
@@ -182,11 +190,12 @@ def _number(cell: str, delimiter: str, where: str) -> float:
 
 
 def read_surface_layout(path: str | Path, surface: Mesh, *, outward: bool = True) -> SurfaceLayout:
-    """Read the electrodes of a curved skin from a `.csv` file: columns `x_mm`, `y_mm`, `z_mm`, `diameter_mm` and, if
-    wanted, `label` and `contact_impedance_ohm_m2`, as in `read_layout`, which wants no z. `write_layout` writes it.
+    """Read the electrodes of a curved skin from a `.csv` file, such as `write_layout` writes.
 
-    `surface` and `outward` as in `SurfaceLayout`, onto whose surface the places are moved. Raises `FileNotFoundError`
-    if there is no such file, and `ValueError` for what is no such table, naming the line, and as `SurfaceLayout` does.
+    The columns are `x_mm`, `y_mm`, `z_mm`, `diameter_mm` and optionally `label` and `contact_impedance_ohm_m2`, in the
+    format of `read_layout`. `surface` and `outward` as in `SurfaceLayout`; positions are moved to the surface. Raises
+    `FileNotFoundError` if there is no such file, and `ValueError` for an invalid table, naming the line, and as
+    `SurfaceLayout` does.
     """
     path = Path(path)
     if path.suffix.lower() != ".csv":

@@ -1,4 +1,4 @@
-"""Layouts as DXF drawings, through ezdxf."""
+"""Reading and writing of layouts as DXF drawings, with the package ezdxf."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jeit.layout.csv_file import MOST_BYTES
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
-# The task that needs the extra, and the formats that do not.
+# Texts for the error message without the extra: the task that needs it, and the formats that do not.
 _DRAWINGS = ("a DXF drawing", "CSV and SVG files need nothing more.")
 _OUTLINE, _ELECTRODES, _LABELS = "OUTLINE", "ELECTRODES", "LABELS"
 # AutoCAD's colour numbers: laser cutters distinguish lines to cut from lines to engrave by their colour.
@@ -24,9 +24,10 @@ _COLOURS = {_OUTLINE: 1, _ELECTRODES: 5, _LABELS: 8}
 
 
 def write_dxf(layout: Layout, file: BinaryIO) -> None:
-    """Write a drawing in millimetres, of the format of AutoCAD 2007: the first that holds labels in any script.
+    """Write a layout as a drawing in millimetres, in the format of AutoCAD 2007, the first one that supports labels in
+    any script.
 
-    Raises `ImportError` where the extra `cad` is not installed.
+    Raises `ImportError` if the extra `cad` is not installed.
     """
     ezdxf = optional("ezdxf", *_DRAWINGS)
     drawing = ezdxf.new("R2007")
@@ -49,7 +50,7 @@ def write_dxf(layout: Layout, file: BinaryIO) -> None:
 
 
 class _Pen:
-    """Draws on one of a drawing's layers."""
+    """Draws circles and polygons on one layer of a drawing."""
 
     def __init__(self, space: Any, layer: str):
         self.space, self.on = space, {"layer": layer}
@@ -62,7 +63,7 @@ class _Pen:
 
 
 class _Entity(NamedTuple):
-    """A drawn entity on one of the layers: its kind, and the values of it that are used, in the drawing's unit."""
+    """An entity of a drawing: its kind, and its values as far as they are used, in the unit of the drawing."""
 
     kind: str
     circle: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -74,7 +75,8 @@ class _Entity(NamedTuple):
 
 
 def read_dxf(path: Path, outline: Domain | None) -> Layout:
-    """Read what `write_dxf` wrote, or a CAD program with the same layers. Raises `ValueError`."""
+    """Read a layout from a drawing with the layers of `write_dxf`. Raises `ValueError` for an invalid drawing, and
+    `ImportError` if the extra `cad` is not installed."""
     ezdxf = optional("ezdxf", *_DRAWINGS)
     check_size(path, MOST_BYTES)
     with read_as("this is not a DXF drawing that is read"):
@@ -108,8 +110,8 @@ def read_dxf(path: Path, outline: Domain | None) -> Layout:
 
 
 def _entity(entity, decode: Callable[[str], str]) -> _Entity:
-    """In the plane: mirrored entities have axes of their own. Older formats than 2007 write letters beyond Latin as
-    \\U+0162."""
+    """Convert an entity to plane coordinates of the drawing, since mirrored entities have coordinate axes of their own.
+    Texts are decoded, since formats before 2007 write letters outside Latin as \\U+0162."""
     kind = entity.dxftype()
     if kind == "CIRCLE":
         x, y, _ = entity.ocs().to_wcs(entity.dxf.center)
@@ -144,7 +146,8 @@ def _outline(entities: list[_Entity], unit: float) -> Domain | None:
 
 
 def _loop(entity: _Entity) -> np.ndarray:
-    """Vertices (k, 2) of a closed polyline of straight sides, in the drawing's unit; `ValueError` if it is none."""
+    """Vertices (k, 2) of a closed polyline with straight sides, in the unit of the drawing. Raises `ValueError` for
+    other entities."""
     advice = f"on the layer {_OUTLINE}; draw closed polylines of straight sides, or one circle."
     if entity.loop is None:
         raise ValueError(f"there is a {entity.kind[:40]} {advice}")

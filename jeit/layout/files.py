@@ -1,5 +1,7 @@
 """Reading and writing of layouts, in millimetres: CSV for spreadsheets, DXF and SVG for laser cutters.
 
+Contents of each format:
+
 | | electrodes | labels | contact impedance | outline |
 |---|---|---|---|---|
 | `.csv` | yes | yes | yes | no |
@@ -23,21 +25,25 @@ _WRITERS = {".csv": write_csv, ".dxf": write_dxf, ".svg": write_svg}
 
 
 def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
-    """Read a layout; the ending of the file's name says the format. It is called like the file.
+    """Read a layout from a file. The format is determined by the suffix; the name of the layout is that of the file.
 
-    - `.csv`: one electrode a line under the columns `x_mm`, `y_mm`, `diameter_mm` and, if wanted, `label` and
+    - `.csv`: one line per electrode, with the columns `x_mm`, `y_mm`, `diameter_mm` and optionally `label` and
       `contact_impedance_ohm_m2`. Lengths may also be in `cm` or `m`. Columns are separated by commas, or by semicolons
-      or tabs, between which a decimal comma is understood. Lines that begin with # are comments.
-    - `.dxf` (needs the extra `cad`): circles on the layer ELECTRODES; on OUTLINE closed polylines of straight sides,
-      the largest the skin and others holes in it, or one circle; text on LABELS that begins or is centred in a circle
-      is its label. In the unit that the drawing states, in millimetres if it states none.
-    - `.svg`: circles in the group ELECTRODES (its id, class or Inkscape layer), or all circles; in the group OUTLINE
-      shapes of straight sides, the largest the skin and others holes in it, or one circle; without that group the only
-      closed shape of straight sides; text in LABELS, in the electrodes' order. Moved by any transforms. The document
-      says its size with a unit (mm, cm, in, pt, or px of 1/96 inch); y is turned up, as `write_layout` turns it down.
+      or tabs, in which case decimal commas are accepted. Lines that begin with # are comments.
+    - `.dxf` (needs the extra `cad`): electrodes are circles on the layer ELECTRODES. The outline is on the layer
+      OUTLINE: closed polylines with straight sides, of which the largest is the skin and others are holes, or a single
+      circle. A text on the layer LABELS is the label of the circle in which it begins or is centred. Lengths are in the
+      unit of the drawing, or in millimetres if it states none.
+    - `.svg`: electrodes are circles in the group ELECTRODES (id, class or Inkscape layer), or all circles if there is
+      no such group. The outline is in the group OUTLINE: shapes with straight sides, of which the largest is the skin
+      and others are holes, or a single circle; without this group, it is the only closed shape with straight sides.
+      Texts in the group LABELS are labels in the order of the electrodes. Transforms are applied. The document must
+      state its size with a unit (mm, cm, in, pt, or px of 1/96 inch). The y axis points up in the layout and down in
+      the file.
 
-    `outline`: of the skin, in metres, for a file that has none. Raises `FileNotFoundError` if there is no such file,
-    `ImportError` if the extra is missing, and `ValueError` for what is no layout, naming the line or electrode.
+    `outline`: outline of the skin, metres, used if the file contains none. Raises `FileNotFoundError` if there is no
+    such file, `ImportError` if the extra is missing, and `ValueError` for an invalid layout, naming the line or
+    electrode.
     """
     path = Path(path)
     reader = _by_suffix(path, _READERS)
@@ -50,15 +56,15 @@ def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
 
 
 def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
-    """Write a layout in millimetres; the ending of the file's name says the format, as in `read_layout`.
+    """Write a layout to a file, in millimetres. The format is determined by the suffix, as in `read_layout`.
 
-    What is read back differs by rounding only (below a millionth of a millimetre), except that a rectangle comes back
-    as the polygon it is. DXF and SVG hold a drawing to scale, x to the right and y up: what is to be cut on layers
-    (groups in SVG) `OUTLINE` in red and `ELECTRODES` in blue, labels apart from it on `LABELS`. Inside the SVG file
-    y runs down, as in all SVG, so its y is minus the layout's. A `SurfaceLayout` goes into CSV, with a column `z_mm`,
-    for `read_surface_layout`.
+    A layout that is read back differs by rounding only (below a millionth of a millimetre), except that a rectangle is
+    read as a polygon. DXF and SVG files contain a drawing to scale, with x to the right and y up. The lines to be cut
+    are on the layers (groups in SVG) `OUTLINE`, in red, and `ELECTRODES`, in blue; labels are on `LABELS`. Coordinates
+    y in an SVG file are minus those of the layout, since the y axis of SVG points down. A `SurfaceLayout` is written to
+    CSV only, with a column `z_mm`, and is read with `read_surface_layout`.
 
-    Raises `ValueError` for another ending or a place that cannot be written; `ImportError` if the extra is missing.
+    Raises `ValueError` for another suffix or a path that cannot be written; `ImportError` if the extra is missing.
     """
     path = Path(path)
     writer = _by_suffix(path, _WRITERS)

@@ -1,4 +1,4 @@
-"""A layout of electrodes in a plane, and their labels."""
+"""`Layout`: round electrodes on a flat skin, with their labels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from jeit_solvers.engines import has_values
 
 
 def check_labels(labels: Sequence[str] | None, number: int) -> tuple[str, ...]:
-    """Labels of so many electrodes, "1", "2", … if None are given. Raises `ValueError` for others than one for each."""
+    """Check the labels of `number` electrodes and return them as a tuple; by default "1", "2", … Raises `ValueError`
+    for another number of labels, for invalid labels, and for labels that are repeated."""
     if labels is None:
         return tuple(str(index + 1) for index in range(number))
     labels = list(labels)
@@ -33,23 +34,26 @@ def check_labels(labels: Sequence[str] | None, number: int) -> tuple[str, ...]:
     return tuple(labels)
 
 
-# Range of sizes of skins: outside it, lengths are likely in millimetres, or have been divided by 1000 twice.
+# Minimum and maximum size of a skin: outside this range, lengths are probably in millimetres, or have been divided by
+# 1000 twice.
 SMALLEST, LARGEST = 1e-3, 5.0  # m
-# Lengths come and go as decimal millimetres; a disc may miss its bounds by so much.
+# Tolerance for discs that overlap or extend beyond the outline, since lengths are rounded to decimal millimetres in
+# files.
 _ROUNDING = 1e-9  # m
 
 
 class Layout(eqx.Module):
-    """Round electrodes on a flat skin: a design to be compared, optimised, and sent to the laser cutter.
+    """Round electrodes on a flat skin: a design that can be compared, optimised, and written to a file for a laser
+    cutter.
 
     **Fields**
 
-    - `centres`: (L, 2) metres.
-    - `diameters`: (L,) metres.
-    - `contact_impedance`: (L,) ohm·m², or None if it is not known.
-    - `outline`: of the skin, metres; None if it is not known.
-    - `labels`: (L,) names of the electrodes, all different, on one line each; "1", "2", … if not given.
-    - `name`: of the layout, for reports.
+    - `centres`: centres of the electrodes (L, 2), metres.
+    - `diameters`: diameters (L,), metres.
+    - `contact_impedance`: contact impedances (L,), ohm·m², or None if not known.
+    - `outline`: outline of the skin, metres, or None if not known.
+    - `labels`: labels of the electrodes (L,), all different and on one line each; by default "1", "2", …
+    - `name`: name of the layout, for reports.
     """
 
     centres: Float[Array, "L 2"]
@@ -69,10 +73,10 @@ class Layout(eqx.Module):
         labels: Sequence[str] | None = None,
         name: str = "layout",
     ):
-        """`diameters` and `contact_impedance` may be one number for all electrodes.
+        """`diameters` and `contact_impedance` may be one value for all electrodes.
 
-        Raises `ValueError` for electrodes that overlap or are not wholly inside the outline, for labels that are not
-        one for each and different, and for a skin so small or so large that its lengths cannot be metres.
+        Raises `ValueError` for electrodes that overlap or are not wholly inside the outline, if labels are repeated or
+        not one for each electrode, and for a skin so small or so large that its lengths cannot be in metres.
         """
         self.centres = as_positions(centres, (2,))
         number = self.num_electrodes
@@ -96,7 +100,7 @@ class Layout(eqx.Module):
 
     @property
     def known_outline(self) -> Domain:
-        """The outline, for what cannot do without. Raises `ValueError` if it is not known."""
+        """Outline of the skin, metres. Unlike `outline`, it is never None: raises `ValueError` if it is not known."""
         if self.outline is None:
             raise ValueError(
                 f"outline: '{self.name}' does not say the skin's; give it, as in read_layout(…, outline=…)."
@@ -105,20 +109,21 @@ class Layout(eqx.Module):
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Bounding box (x_min, x_max, y_min, y_max) in metres: of the outline, or of the discs if there is none."""
+        """Bounding box (x_min, x_max, y_min, y_max) of the outline, or of the electrodes if it is not known, metres."""
         if self.outline is not None:
             return self.outline.extent
         return bounds(np.asarray(self.centres), np.asarray(self.diameters))
 
     def lengths(self) -> Float[np.ndarray, "L L"]:
-        """Distances between the electrodes' centres, metres."""
+        """Distances (L, L) between the centres of the electrodes, metres."""
         centres = np.asarray(self.centres)
         return np.linalg.norm(centres[:, None] - centres, axis=-1)
 
     def sheet_discs(self, contact_impedance: ArrayLike | None = None) -> SheetDiscs:
-        """The electrodes for a forward model on a sheet; `contact_impedance` in ohm·m² replaces the layout's.
+        """Create the electrodes for a forward model on a sheet.
 
-        Raises `ValueError` if neither is known.
+        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if neither is
+        known.
         """
         chosen = self.contact_impedance if contact_impedance is None else contact_impedance
         if chosen is None:
@@ -127,7 +132,8 @@ class Layout(eqx.Module):
 
 
 def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain | None, called: Sequence[str]) -> None:
-    """Raise `ValueError` unless discs lie apart and inside `outline`, all in metres; `called` (L,) names them."""
+    """Raise `ValueError` if discs overlap or extend beyond `outline`; lengths in metres. `called` (L,): names of the
+    discs in the error message."""
     x_min, x_max, y_min, y_max = bounds(centres, diameters) if outline is None else outline.extent
     size = max(x_max - x_min, y_max - y_min)
     check_size(size)
@@ -157,7 +163,7 @@ def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain 
 
 
 def check_size(size: float) -> None:
-    """Raise `ValueError` for a skin of a `size`, metres, that is not known to exist."""
+    """Raise `ValueError` for an implausible `size` of a skin, metres."""
     if not SMALLEST - _ROUNDING <= size <= LARGEST + _ROUNDING:
         raise ValueError(
             f"centres: the skin would be {_length_text(size)} across; are millimetres taken for metres, or metres for "
@@ -170,7 +176,7 @@ def _length_text(length: float) -> str:
 
 
 def bounds(centres: np.ndarray, diameters: np.ndarray) -> tuple[float, float, float, float]:
-    """Box (x_min, x_max, y_min, y_max) round discs, in the unit of their centres (L, 2) and diameters (L,)."""
+    """Bounding box (x_min, x_max, y_min, y_max) of discs, in the unit of their centres (L, 2) and diameters (L,)."""
     low = (centres - diameters[:, None] / 2).min(axis=0)
     high = (centres + diameters[:, None] / 2).max(axis=0)
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])

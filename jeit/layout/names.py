@@ -1,4 +1,4 @@
-"""Layouts by name: rings, grids and other arrangements."""
+"""Arrangements of electrodes (rings, grids and others), and built-in layouts by name."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def ring(
     centre: tuple[float, float] = (0.0, 0.0),
     height: float | None = None,
 ) -> np.ndarray:
-    """Positions evenly spaced on a circle: (L, 2) metres, or (L, 3) at a `height` (3-D tanks).
+    """Positions evenly spaced on a circle: (L, 2) metres, or (L, 3) at a given `height` (3-D tanks).
 
-    `start_angle`: of the first electrode, radians counter-clockwise from +x (default: 12 o'clock). Raises
-    `ValueError` for a radius that is not positive or fewer than two electrodes.
+    `radius`, `centre` and `height` in metres; `start_angle`: angle of the first electrode, radians counter-clockwise
+    from +x (default: 12 o'clock). Raises `ValueError` for a radius that is not positive or fewer than two electrodes.
     """
     check_count(num_electrodes, 2)
     if not radius > 0:
@@ -39,9 +39,9 @@ def ring(
 
 
 def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.ndarray:
-    """A `ring` of electrodes and one more in its centre, which comes last: (num_electrodes + 1, d) metres.
+    """Positions of a `ring` of electrodes and of one more in its centre, the last: (num_electrodes + 1, d) metres.
 
-    For `jeit.protocol.reference_electrode`. `options` and errors are those of `ring`.
+    For use with `jeit.protocol.reference_electrode`. `options` and errors as in `ring`.
     """
     position = ring(radius, num_electrodes, **options)
     return np.vstack([position, position.mean(axis=0)])
@@ -50,9 +50,9 @@ def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.nd
 def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.ndarray:
     """Positions evenly spaced along the edge of an outline, counter-clockwise: (L, 2) metres.
 
-    `start`: arc length of the first electrode in metres, counted as in `domain.boundary` (a rectangle begins at its
-    lower left corner; half a pitch keeps electrodes off the corners when L is a multiple of four).
-    Raises `ValueError` for fewer than two.
+    `start`: arc length of the first electrode along `domain.boundary`, metres. The boundary of a rectangle begins at
+    its lower left corner; half a pitch keeps electrodes of a square away from the corners if L is a multiple of four.
+    Raises `ValueError` for fewer than two electrodes.
     """
     check_count(num_electrodes, 2)
     arc_length = start + domain.perimeter * np.arange(num_electrodes) / num_electrodes
@@ -62,9 +62,10 @@ def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.
 def grid(
     width: float, height: float, columns: int, rows: int, *, centre: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
-    """A regular grid of rows × columns positions that spans width × height metres, row by row from the lower left.
+    """Positions of a regular grid of rows × columns electrodes that spans width × height metres: (L, 2) metres, row by
+    row from the lower left.
 
-    (L, 2) metres. Raises `ValueError` for sides that are not positive and for no rows or columns.
+    Raises `ValueError` for sides that are not positive, and for fewer than one row or column.
     """
     check_count(columns, 1)
     check_count(rows, 1)
@@ -78,9 +79,10 @@ def grid(
 def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, iterations: int = 200) -> np.ndarray:
     """Positions spread evenly inside any outline: (L, 2) metres.
 
-    Centroids of a centroidal Voronoi tessellation (Lloyd's algorithm on a fine grid of sample points, begun from
-    farthest points), so every electrode serves about the same area. `margin`: least distance to the outline,
-    metres. Deterministic. Raises `ValueError` if the margin leaves no room.
+    The positions are the centroids of a centroidal Voronoi tessellation, so that the area around every electrode is
+    about the same. It is computed by Lloyd's algorithm on a fine grid of sample points, starting from farthest-point
+    sampling, and is deterministic. `margin`: minimum distance to the outline, metres; `iterations`: maximum number of
+    iterations. Raises `ValueError` if the margin leaves no room.
     """
     check_count(num_electrodes, 1)
     x_min, x_max, y_min, y_max = domain.extent
@@ -110,16 +112,16 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
 
 
 def check_count(number: int, least: int) -> None:
-    """Raise `ValueError` for what is no whole number of electrodes, or fewer than `least`."""
+    """Raise `ValueError` unless `number` is a whole number of at least `least`."""
     if not is_number(number) or int(number) != number or number < least:
         raise ValueError(f"Give a whole number of electrodes, at least {least}; got {describe(number)}.")
 
 
-# The paper's skin and the electrodes of its Fig. S4, in metres. It does not say how far the electrodes of its
-# conventional layout sit from the edge: here they leave 2 mm of hydrogel outside them.
+# Side of the skin of the paper, diameter of the electrodes in its Fig. S4, and distance of electrodes from the edge in
+# the conventional layout, metres. The paper does not state the distance: here 2 mm of hydrogel remain outside.
 _SIDE, DIAMETER, _FROM_EDGE = 0.2, 6e-3, 2e-3
 _PARK = ("park-inner", "park-boundary")
-# Electrodes of a made layout: each has its distance from every other looked at.
+# Maximum number of electrodes of a built-in layout, since the distances between all pairs are checked.
 _MOST = 1024
 
 BUILT_IN = {
@@ -131,32 +133,38 @@ NAMES = (*_PARK, "grid-CxR", "perimeter-N", "inner-N")
 
 
 def named_layout(name: str, outline: Domain | None = None, *, diameter: float = DIAMETER) -> Layout:
-    """A layout by its name, on a skin of `outline`, 200 × 200 mm about the origin unless given.
+    """Create a built-in layout by its name, on a skin with this `outline`, by default 200 × 200 mm about the origin.
 
-    - "park-inner" and "park-boundary": the two designs that text S4 of Park et al., Science Robotics 7, eabm7187 (2022)
-      compares, of that skin only. Its coordinates are not published, only "as evenly as possible in a square area" and
-      "about 40 mm" apart: here a centroidal Voronoi tessellation, nearest neighbours 31 to 38 mm apart. Around the
-      edge, electrodes lie 5 mm from it, 23.75 mm apart, none in a corner, counter-clockwise from the lower left.
-    - "grid-CxR": C columns and R rows, each electrode in the middle of an equal rectangle of the skin's box.
-    - "perimeter-N": along the edge of a rectangle or a disk, 2 mm of skin outside them.
-    - "inner-N": spread evenly inside any outline.
+    - "park-inner" and "park-boundary": the two designs compared in text S4 of Park et al., Science Robotics 7, eabm7187
+      (2022), for the default outline only. The coordinates of "park-inner" are not published; the paper states "as
+      evenly as possible in a square area" and "about 40 mm" apart. Here they are a centroidal Voronoi tessellation with
+      nearest neighbours 31 to 38 mm apart. The centres of "park-boundary" are 5 mm from the edge and 23.75 mm apart,
+      none in a corner, counter-clockwise from the lower left.
+    - "grid-CxR": C columns and R rows; each electrode is in the centre of one of C × R equal rectangles that fill the
+      bounding box of the skin.
+    - "perimeter-N": N electrodes along the edge of a rectangle or a disk, with 2 mm of skin outside them.
+    - "inner-N": N electrodes spread evenly inside any outline.
 
-    `diameter` of the electrodes, metres. Raises `ValueError` for another name, for a skin that has no such layout, and
-    for electrodes that would overlap.
+    `diameter`: diameter of the electrodes, metres. Raises `ValueError` for an unknown name, for a skin that the layout
+    does not exist for, and for electrodes that would overlap.
     """
     outline = Rectangle(_SIDE, _SIDE) if outline is None else outline
     made = re.fullmatch(r"(perimeter|inner)-(\d{1,4})", name) if isinstance(name, str) else None
     counts = re.fullmatch(r"grid-(\d{1,4})x(\d{1,4})", name) if isinstance(name, str) else None
     if name in _PARK:
         _check_park(name, outline)
-        centres = _park(name)
+        centres = _park_centres(name)
     elif counts is not None:
-        centres = _lattice(name, outline, diameter, int(counts[1]), int(counts[2]))
+        centres = _grid_centres(name, outline, diameter, int(counts[1]), int(counts[2]))
     elif made is not None:
         number = int(made[2])
         if number > _MOST:
             raise ValueError(f"name: {name!r} has {number} electrodes; give {_MOST} or fewer.")
-        centres = _inner(outline, number, diameter) if made[1] == "inner" else _around(name, outline, diameter, number)
+        centres = (
+            _inner_centres(outline, number, diameter)
+            if made[1] == "inner"
+            else _perimeter_centres(name, outline, diameter, number)
+        )
     else:
         meant = did_you_mean(name, [*_PARK, *NAMES[2:]])
         raise ValueError(
@@ -167,7 +175,7 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
 
 
 def same_outline(one: Domain | None, other: Domain) -> bool:
-    """Whether two outlines are the same but for rounding: lengths come as decimal millimetres."""
+    """Whether two outlines have the same bounding box and area, up to rounding of lengths to decimal millimetres."""
     return (
         one is not None
         and np.allclose(one.extent, other.extent, atol=1e-6)
@@ -176,7 +184,7 @@ def same_outline(one: Domain | None, other: Domain) -> bool:
 
 
 @lru_cache(maxsize=2)
-def _park(name: str) -> np.ndarray:
+def _park_centres(name: str) -> np.ndarray:
     if name == "park-inner":
         return quasi_uniform(Rectangle(_SIDE, _SIDE), 32)
     inset = DIAMETER + 2 * _FROM_EDGE
@@ -192,7 +200,7 @@ def _check_park(name: str, outline: Domain) -> None:
         raise ValueError(f"name: its skin spans {span} by {span}; on another take {other}.")
 
 
-def _lattice(name: str, outline: Domain, diameter: float, columns: int, rows: int) -> np.ndarray:
+def _grid_centres(name: str, outline: Domain, diameter: float, columns: int, rows: int) -> np.ndarray:
     if min(columns, rows) < 1:
         raise ValueError(f"name: {name!r} has no electrodes; give at least one column and one row.")
     if columns * rows > _MOST:
@@ -209,7 +217,7 @@ def _lattice(name: str, outline: Domain, diameter: float, columns: int, rows: in
     return grid(x_max - x_min - pitches[0], y_max - y_min - pitches[1], columns, rows, centre=middle)
 
 
-def _around(name: str, outline: Domain, diameter: float, number: int) -> np.ndarray:
+def _perimeter_centres(name: str, outline: Domain, diameter: float, number: int) -> np.ndarray:
     if not isinstance(outline, Disk | Rectangle):
         raise ValueError(f"name: {name!r} is of rectangles and disks, and this skin is neither; take inner-N.")
     x_min, x_max, y_min, y_max = outline.extent
@@ -224,8 +232,9 @@ def _around(name: str, outline: Domain, diameter: float, number: int) -> np.ndar
     return perimeter(track, number, start=track.perimeter / number / 2 if number else 0.0)
 
 
-def _inner(outline: Domain, number: int, diameter: float) -> np.ndarray:
-    """Kept for skins that are asked for again, as a study does for every diameter and contact impedance."""
+def _inner_centres(outline: Domain, number: int, diameter: float) -> np.ndarray:
+    """Centres spread evenly inside an outline. Those of rectangles are cached, since a study needs the same ones for
+    many parameters."""
     if isinstance(outline, Rectangle):
         return _spread(outline, number, diameter)
     return quasi_uniform(outline, number, margin=diameter / 2)

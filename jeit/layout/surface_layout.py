@@ -1,4 +1,4 @@
-"""Layouts on surfaces in space, and electrodes spread evenly over them."""
+"""`SurfaceLayout`: round electrodes on a surface in space, and positions spread evenly over a surface."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from jeit.mesh import Mesh
 from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit_solvers.engines import as_array, has_values
 
-# Nodes that each place is to have round it; more are made by halving triangles.
+# Minimum number of nodes per position: a coarser surface is refined by halving its triangles.
 _NODES = 30
-# Halved no further than this many nodes.
+# The surface is not refined any further once it has this many nodes.
 _MOST = 60_000
-# More places than this lie so near each other that ways between them are nearly straight: the nearest is found by
-# distance in space, and by the side that it faces.
+# Number of positions above which they are so close to each other that paths between them are nearly straight: the
+# nearest position is then found by the distance in space and the direction of the normal.
 _BY_WAYS = 128
 
 
@@ -37,12 +37,13 @@ def spread(
     margin: float = 0.0,
     iterations: int = 20,
 ) -> Float[np.ndarray, "L 3"]:
-    """Positions spread evenly over a surface: (L, 3) metres, on it.
+    """Positions on a surface, spread evenly over it: (L, 3) metres.
 
-    `quasi_uniform` for surfaces: each position is the middle of the part of the surface that is nearer to it than to
-    any other by ways along the surface (Lloyd's algorithm, begun from farthest points). `face`: of a shell, "inner" or
-    "outer". `margin`: least distance from the edge, metres. Deterministic. Raises `ValueError` for fewer than one, a
-    margin that leaves no room, and as `Triangles.of` does.
+    The counterpart of `quasi_uniform` for surfaces: each position is the centroid of the part of the surface that is
+    closer to it than to any other position, by distances along the surface. It is computed by Lloyd's algorithm,
+    starting from farthest-point sampling, and is deterministic. `face`: face of a shell, "inner" or "outer"; `margin`:
+    minimum distance from the edge, metres; `iterations`: maximum number of iterations. Raises `ValueError` for fewer
+    than one position, a margin that leaves no room, and as `Triangles.of` does.
     """
     check_count(number, 1)
     triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
@@ -68,7 +69,7 @@ def spread(
 
 
 def _nearest(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.ndarray:
-    """Nearest position of each node, by distance in space and by the side that they face."""
+    """Index of the nearest position of each node, by the distance in space and the difference of their normals."""
     half = 0.5 * np.sqrt(triangles.areas.sum() / len(position))
     facing = half * triangles.normals[triangles.nearest(position).triangle]
     tree = KDTree(np.hstack([position, facing]))
@@ -76,12 +77,12 @@ def _nearest(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.nda
 
 
 def _begin(ways: Geodesics, usable: np.ndarray, weight: np.ndarray, number: int) -> np.ndarray:
-    """Nodes to begin with."""
+    """Indices of the initial nodes: farthest-point sampling, or a random choice by area for many positions."""
     if number > _BY_WAYS:
         share = weight[usable] / weight.sum()
         return np.random.default_rng(0).choice(usable, number, replace=False, p=share)
     points = ways.surface.points
-    # Farthest from the middle: a way to begin that depends on nothing but the surface.
+    # The first node is the one farthest from the centroid, so that the result depends on the surface only.
     middle = np.average(points[usable], axis=0, weights=weight[usable])
     chosen = [usable[np.linalg.norm(points[usable] - middle, axis=1).round(9).argmax()]]
     lengths = ways.distances(points[chosen[:1]])[0]
@@ -92,23 +93,23 @@ def _begin(ways: Geodesics, usable: np.ndarray, weight: np.ndarray, number: int)
     return np.array(chosen)
 
 
-# Discs may overlap by so much.
+# Tolerance for discs that overlap.
 _ROUNDING = 1e-9  # m
 
 
 class SurfaceLayout(eqx.Module):
-    """Round electrodes on a surface in space: `Layout` of a curved skin, with the same uses.
+    """Round electrodes on a surface in space: the counterpart of `Layout` for a curved skin.
 
     **Fields**
 
-    - `centres`: (L, 3) metres, on the surface.
-    - `diameters`: (L,) metres.
-    - `contact_impedance`: (L,) ohm·m², or None if it is not known.
-    - `surface`: a mesh of triangles in space: a sheet, or the face of a layer that the electrodes are on.
-    - `outward`: whether a layer on that surface is outside of it, so that electrodes are on its inner face, the core,
-      and touches on its outer one; False where electrodes are on the outer face, and the layer inside.
-    - `labels`: (L,) names of the electrodes, all different, on one line each; "1", "2", … if not given.
-    - `name`: of the layout, for reports.
+    - `centres`: centres of the electrodes on the surface (L, 3), metres.
+    - `diameters`: diameters (L,), metres.
+    - `contact_impedance`: contact impedances (L,), ohm·m², or None if not known.
+    - `surface`: a mesh of triangles in space: the sheet itself, or the face of a layer that carries the electrodes.
+    - `outward`: whether a layer extends outwards from the surface, so that electrodes are on its inner face and touches
+      on its outer face. If False, it extends inwards, and electrodes are on its outer face.
+    - `labels`: labels of the electrodes (L,), all different and on one line each; by default "1", "2", …
+    - `name`: name of the layout, for reports.
     """
 
     centres: Float[Array, "L 3"]
@@ -130,12 +131,12 @@ class SurfaceLayout(eqx.Module):
         labels: Sequence[str] | None = None,
         name: str = "layout",
     ):
-        """`diameters` and `contact_impedance` may be one number for all electrodes. Centres are moved to the nearest
-        point of the surface, which may not be farther than an electrode's radius.
+        """`diameters` and `contact_impedance` may be one value for all electrodes. Centres are moved to the nearest
+        point of the surface, which must be within the radius of the electrode.
 
-        Raises `ValueError` for a mesh that is no surface in space, electrodes farther off it, over its edge, as large
-        as its radius of curvature, or that overlap, for labels that are not one for each and different, and for a
-        surface so small or so large that its lengths cannot be metres.
+        Raises `ValueError` for a mesh that is not a surface in space, for electrodes that are farther from the surface,
+        extend beyond its edge, are as large as its radius of curvature, or overlap, if labels are repeated or not one
+        for each electrode, and for a surface so small or so large that its lengths cannot be in metres.
         """
         check_kind("surface", surface, Mesh, "a surface in space, such as jeit.mesh.tube(0.03, 0.15)")
         if not surface.is_surface:
@@ -170,8 +171,12 @@ class SurfaceLayout(eqx.Module):
         contact_impedance: ArrayLike | None = None,
         name: str = "spread",
     ) -> "SurfaceLayout":
-        """`number` electrodes spread evenly over a surface by ways along it, as by `jeit.layout.spread`, `margin`
-        metres and their own radius from its edge. Raises `ValueError` as that and `SurfaceLayout` do."""
+        """Create a layout of `number` electrodes spread evenly over a surface, as by `jeit.layout.spread`.
+
+        `diameters`: diameters of the electrodes, metres; `margin`: minimum distance of their rims from the edge of the
+        surface, metres; other arguments as in `SurfaceLayout`. Raises `ValueError` as `jeit.layout.spread` and
+        `SurfaceLayout` do.
+        """
         check_kind("surface", surface, Mesh, "a surface in space, such as jeit.mesh.tube(0.03, 0.15)")
         room = margin + float(np.max(np.asarray(diameters, float))) / 2
         centres = spread(surface, number, margin=room)
@@ -185,16 +190,19 @@ class SurfaceLayout(eqx.Module):
 
     @property
     def face(self) -> str:
-        """Face of a layer that electrodes are on: "inner" or "outer"."""
+        """Face of a layer that carries the electrodes: "inner" or "outer"."""
         return "inner" if self.outward else "outer"
 
     def lengths(self) -> Float[np.ndarray, "L L"]:
-        """Lengths of the ways along the surface between the electrodes' centres, metres."""
+        """Distances (L, L) between the centres of the electrodes along the surface, metres."""
         return Geodesics.create(self.surface).between(self.centres)
 
     def discs(self, contact_impedance: ArrayLike | None = None, *, sheet: bool = True) -> SurfaceDiscs | FaceDiscs:
-        """The electrodes for a forward model, on the surface as a `sheet` or on a layer of it; `contact_impedance` in
-        ohm·m² replaces the layout's. Raises `ValueError` if neither is known."""
+        """Create the electrodes for a forward model of the surface as a `sheet`, or else of a layer on the surface.
+
+        `contact_impedance`: contact impedance, ohm·m², by default that of the layout. Raises `ValueError` if neither is
+        known.
+        """
         chosen = self.contact_impedance if contact_impedance is None else contact_impedance
         if chosen is None:
             raise ValueError(f"contact_impedance: '{self.name}' does not say it; give it in ohm·m².")
@@ -202,7 +210,8 @@ class SurfaceLayout(eqx.Module):
 
 
 def _check_apart(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[str]) -> None:
-    """Straight through space: discs that overlap are so near that it is as good as along the surface."""
+    """Raise `ValueError` for discs that overlap. Distances are straight lines, since between discs that overlap they
+    hardly differ from those along the surface."""
     gap = np.linalg.norm(centres[:, None] - centres, axis=-1) - (diameters[:, None] + diameters) / 2
     np.fill_diagonal(gap, np.inf)
     if gap.min() < -_ROUNDING:
@@ -214,12 +223,12 @@ def _check_apart(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[st
 
 
 def check_layout(name: str, given) -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no `Layout` or `SurfaceLayout`."""
+    """Raise `ValueError`, about the argument `name`, unless `given` is a `Layout` or `SurfaceLayout`."""
     check_kind(name, given, (Layout, SurfaceLayout), "a Layout, as of named_layout('park-inner') or read_layout(path)")
 
 
 def flat_layout(layout: Layout | SurfaceLayout) -> Layout:
-    """A layout that must be of a flat skin. Raises `ValueError` for another."""
+    """Return the layout of a flat skin unchanged. Raises `ValueError` for the layout of a curved skin."""
     if isinstance(layout, SurfaceLayout):
         raise ValueError(f"layout: '{layout.name}' is of a curved skin, and this is of flat ones; unroll it first.")
     return layout

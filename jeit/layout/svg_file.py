@@ -1,4 +1,4 @@
-"""Layouts in SVG drawings: the shapes of a drawing, read into electrodes, and layouts drawn."""
+"""Reading and writing of layouts as SVG drawings."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from jeit.layout.csv_file import MOST_BYTES, millimetres
 from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
-# Possessive: what is no number is found so in one pass, however long it is.
+# The quantifiers are possessive, so that a text that is not a number is rejected in one pass, however long it is.
 NUMBER = r"[-+]?+(?:\d++\.?+\d*+|\.\d++)(?:[eE][-+]?+\d++)?+"
-# Greatest number in a drawing: its square can still be computed after moving and scaling.
+# Maximum number in a drawing, so that its square can still be computed after transforms.
 LARGEST = 1e30
 ROUND = ("circle", "ellipse")
 
 
 def transform_of(element: ElementTree.Element) -> np.ndarray:
-    """The matrix (2, 3) of an element's transform. Raises `ValueError` for one that cannot be read."""
+    """Matrix (2, 3) of the transform of an element. Raises `ValueError` for a transform that cannot be read."""
     text, found = element.get("transform", "").strip(), np.eye(2, 3)
     if re.fullmatch(r"(\w++\s*+\([^()]*+\)[\s,]*+)*+", text) is None:
         raise ValueError(f"transform of {described(element)} is {describe(text)}, not a list of transforms.")
@@ -54,22 +54,22 @@ def transform_of(element: ElementTree.Element) -> np.ndarray:
 
 
 def composed(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """The matrix (2, 3) that moves by `inner`, then by `outer`."""
+    """Matrix (2, 3) that applies the transform `inner`, then `outer`."""
     return outer[:, :2] @ inner + np.column_stack([np.zeros((2, 2)), outer[:, 2]])
 
 
 def moved(points, to: np.ndarray) -> np.ndarray:
-    """Points (k, 2) moved by a matrix (2, 3)."""
+    """Apply the transform with matrix `to` (2, 3) to points (k, 2)."""
     return np.asarray(points, float).reshape(-1, 2) @ to[:, :2].T + to[:, 2]
 
 
 def tag_of(element: ElementTree.Element) -> str:
-    """The kind of an element."""
+    """Tag of an element without its namespace, such as "circle"."""
     return element.tag.split("}")[-1]
 
 
 def described(element: ElementTree.Element) -> str:
-    """An element as messages name it."""
+    """Text that names an element in messages."""
     return (
         f"<{tag_of(element)[:20]} id={describe(element.get('id'))}>"
         if "id" in element.attrib
@@ -78,7 +78,7 @@ def described(element: ElementTree.Element) -> str:
 
 
 def number_of(element: ElementTree.Element, name: str, text: str | None) -> float:
-    """The number that `text`, of the attribute `name`, is. Raises `ValueError`."""
+    """Convert `text`, the value of the attribute `name`, to a number. Raises `ValueError` if it is not one."""
     if text is None or re.fullmatch(NUMBER, text.strip()) is None:
         raise ValueError(f"{name} of {described(element)} is {describe(text)}, not a number.")
     value = float(text)
@@ -88,7 +88,8 @@ def number_of(element: ElementTree.Element, name: str, text: str | None) -> floa
 
 
 def disc_of(element: ElementTree.Element, to: np.ndarray) -> tuple[float, float, float]:
-    """Centre and radius of a circle in metres, y up. Raises `ValueError` for what is none."""
+    """Centre and radius of a circle in metres, with y up. `to`: matrix (2, 3) to metres. Raises `ValueError` if the
+    element is not a circle."""
     if tag_of(element) not in ROUND:
         raise ValueError(f"{described(element)} stands where a circle should: electrodes are circles.")
     x, y = (number_of(element, name, element.get(name, "0")) for name in ("cx", "cy"))
@@ -105,7 +106,8 @@ def disc_of(element: ElementTree.Element, to: np.ndarray) -> tuple[float, float,
 
 
 def loops_of(element: ElementTree.Element) -> list[np.ndarray]:
-    """Vertices (k, 2) of a closed shape of straight sides, in its own unit; `ValueError` if it is none."""
+    """Vertices (k, 2) of each loop of a closed shape with straight sides, in the units of the element. Raises
+    `ValueError` for other shapes."""
     tag = tag_of(element)
     if tag == "rect":
         x, y = (number_of(element, name, element.get(name, "0")) for name in ("x", "y"))
@@ -145,7 +147,7 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
             start, place = place, origin + np.array(step)
             if kind == "M" and index == 0:
                 loops.append(([place], False))
-            else:  # after a Z without an M, a line goes on from where the loop began
+            else:  # a line after Z without M starts a new loop where the closed loop began
                 if loops[-1][1]:
                     loops.append(([start], False))
                 loops[-1][0].append(place)
@@ -153,7 +155,7 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
 
 
 def _closed(element: ElementTree.Element, loop: np.ndarray, closed: bool) -> np.ndarray:
-    """Vertices of a loop, the first not repeated."""
+    """Vertices of a loop without a repetition of the first. Raises `ValueError` if the loop is not closed."""
     meets = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-6 * np.ptp(loop))
     if not (closed or meets):
         raise ValueError(f"{described(element)} is not closed; close the skin's outline.")
@@ -161,8 +163,8 @@ def _closed(element: ElementTree.Element, loop: np.ndarray, closed: bool) -> np.
 
 
 _SPACE = "http://www.w3.org/2000/svg"
-_MARGIN = 1e-3  # m, around the drawing, so that lines on its edge are seen whole
-# Metres; 96 pixels are an inch.
+_MARGIN = 1e-3  # m, around the drawing, so that lines on its edge are not cut off
+# Units in metres; 96 pixels are an inch.
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "in": 25.4e-3, "px": 25.4e-3 / 96, "pt": 25.4e-3 / 72}
 _ROLES = ("OUTLINE", "ELECTRODES", "LABELS")
 _INKSCAPE_LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
@@ -172,7 +174,8 @@ _STRAIGHT = ("rect", "polygon", "polyline", "path")
 
 
 def write_svg(layout: Layout, file: BinaryIO) -> None:
-    """Write a drawing whose y, running down, is minus the layout's; its origin is the layout's origin."""
+    """Write a layout as a drawing. Both have the same origin; y points down in the drawing, so its y is minus that of
+    the layout."""
     x_min, x_max, y_min, y_max = layout.extent
     left, top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
     width, height = millimetres(x_max - x_min + 2 * _MARGIN), millimetres(y_max - y_min + 2 * _MARGIN)
@@ -196,7 +199,8 @@ def write_svg(layout: Layout, file: BinaryIO) -> None:
 
 
 def read_svg(path: Path, outline: Domain | None) -> Layout:
-    """Read what `write_svg` wrote, or a drawing made by hand. Raises `ValueError` for what can be read in two ways."""
+    """Read a layout from a drawing, written by `write_svg` or by hand. Raises `ValueError` for an invalid or ambiguous
+    drawing."""
     check_size(path, MOST_BYTES)
     with read_as("this is not an SVG drawing that is read"):
         root = ElementTree.parse(path, ElementTree.XMLParser(target=_Builder())).getroot()
@@ -227,7 +231,7 @@ def _circle(centre, diameter) -> dict[str, str]:
 
 
 class _Pen:
-    """Draws outlines into a group."""
+    """Draws circles and polygons into a group of a drawing."""
 
     def __init__(self, group: ElementTree.Element):
         self.group = group
@@ -241,15 +245,15 @@ class _Pen:
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """Refuses a document type: the entities that it may define can grow without bounds."""
+    """Parser that rejects a document type declaration, since entities defined in it can expand without bounds."""
 
     def doctype(self, name, pubid, system) -> None:
         raise ValueError("the file has a <!DOCTYPE …>, which jeit does not read; remove it with a text editor.")
 
 
 def _shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str | None, np.ndarray]]:
-    """Shapes of a drawing, in their order: element, role (of it or of a group round it), matrix (2, 3) to metres, y
-    up."""
+    """Yield the shapes of a drawing in their order: element, role (that of the element or of an enclosing group), and
+    matrix (2, 3) from its units to metres, with y up."""
     waiting: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [(root, None, _to_metres(root))]
     while waiting:
         element, role, to = waiting.pop()
@@ -273,7 +277,8 @@ def _shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, st
 
 
 def _to_metres(root: ElementTree.Element) -> np.ndarray:
-    """The matrix (2, 3) from the drawing's unit to metres, y up. Raises `ValueError` if the drawing does not say it."""
+    """Matrix (2, 3) from the units of the drawing to metres, with y up. Raises `ValueError` if the drawing does not
+    state its size."""
     box = [number_of(root, "viewBox", part) for part in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if part]
     scales = []
     for name, inside in (("width", box[2:3]), ("height", box[3:4])):
@@ -299,7 +304,8 @@ def _style(element: ElementTree.Element) -> str:
 
 
 def _outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
-    """Outline from the content of the group OUTLINE: one circle, or shapes of straight sides, holes in the largest."""
+    """Outline from the content of the group OUTLINE: a single circle, or shapes with straight sides, of which the
+    largest is the skin and others are holes."""
     if len(drawn) == 1 and tag_of(drawn[0][0]) in ROUND:
         x, y, radius = disc_of(*drawn[0])
         return Disk(radius, (x, y))
@@ -309,7 +315,8 @@ def _outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
 
 
 def _only_outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain | None:
-    """The only closed shape of straight sides in a drawing without a group OUTLINE; None if nothing could be one."""
+    """Outline of a drawing without a group OUTLINE: its only closed shape with straight sides; None if it has no shape
+    with straight sides."""
     found, complaints = [], []
     for one, to in drawn:
         if tag_of(one) in _STRAIGHT:

@@ -1,9 +1,9 @@
-"""Meshes: outlines, meshes of them, their geometry, their quality, and files.
+"""Meshes and outlines: creation, geometry, quality, and file input and output.
 
-Outlines without a mesh: `Disk`, `Rectangle`, `Polygon`. Plane meshes: `disk`, `rectangle`, `polygon`, made finer where
-a `Refine` asks. Solids: `layer`, `box`, `cylinder`. Surfaces in space: `tube`, `forearm`, `sphere`, `cap`, `bend` and
-`surface_of` a solid, and what has a thickness on them, a `shell`. From elsewhere: `Mesh.create`, `read`, `from_gmsh`. A
-`Body`, on which measurements are made, is any of these: an outline, a `Solid` or an `OwnMesh`.
+Outlines without a mesh: `Disk`, `Rectangle`, `Polygon`. Plane meshes: `disk`, `rectangle`, `polygon`, refined locally
+with `Refine`. Solids: `layer`, `box`, `cylinder`. Surfaces in space: `tube`, `forearm`, `sphere`, `cap`, `bend`, and
+`surface_of` a solid; `shell` gives a surface a thickness. Meshes from other sources: `Mesh.create`, `read`,
+`from_gmsh`. Measurements are made on a `Body`, which is an outline, a `Solid` or an `OwnMesh`.
 """
 
 from __future__ import annotations

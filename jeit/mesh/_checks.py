@@ -1,4 +1,4 @@
-"""Checks on the raw arrays of a mesh, with errors that name the fault and what to do about it."""
+"""Checks of the arrays that define a mesh; each error names the fault and its remedy."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from scipy.spatial import KDTree
 from jeit.mesh import topology
 from jeit.mesh.sizes import warn_large
 
-# A cell flatter than this, relative to its longest edge, has gradients of no use in double precision.
+# Minimum area or volume of a cell, relative to that power of its longest edge: gradients on flatter cells are
+# inaccurate in double precision.
 _FLAT = 1e-10
-# Nodes closer than this, relative to the extent, count as one node given twice.
+# Nodes whose distance, relative to the extent of the mesh, is at most this are treated as coincident.
 _COINCIDING = 1e-10
 # Three node numbers of a facet are packed into one 64-bit integer.
 MOST_POINTS = 2_000_000
 
 
 def check_points(points: ArrayLike) -> np.ndarray:
-    """Coordinates as float64 (n, d); raises `ValueError` on a wrong shape, type or NaN."""
+    """Convert coordinates to float64 (n, d). Raises `ValueError` for a wrong shape or type and for NaN or infinity."""
     try:
         array = np.asarray(points, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -43,8 +44,8 @@ def check_points(points: ArrayLike) -> np.ndarray:
 
 
 def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray:
-    """Node indices as integers (m, k) of cells among points in `dimension` coordinates, k being `dimension` + 1, or 3
-    for a surface in space; raises `ValueError` on bad, duplicated or unused ones."""
+    """Convert the node indices of cells to integers (m, k). With `dimension` coordinates per point, k is `dimension` +
+    1, or 3 for a surface in space. Raises `ValueError` for invalid indices, duplicated cells and unused nodes."""
     array = np.asarray(cells)
     widths = (3,) if dimension == 2 else (4, 3)
     if array.ndim != 2 or array.shape[1] not in widths or not len(array):
@@ -85,7 +86,7 @@ def check_cells(cells: ArrayLike, num_points: int, dimension: int) -> np.ndarray
 
 
 def check_coinciding(points: np.ndarray) -> None:
-    """Raise `ValueError` if two nodes lie at the same place."""
+    """Raise `ValueError` if two nodes coincide."""
     if len(points) < 2:
         return
     distance, neighbour = map(np.asarray, KDTree(points).query(points, k=2))
@@ -100,7 +101,7 @@ def check_coinciding(points: np.ndarray) -> None:
 
 
 def signed_measures(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Signed areas or volumes (m,) of the cells; areas of triangles in space have no sign."""
+    """Signed areas or volumes (m,) of the cells; for triangles in space, the areas are always positive."""
     edges = points[cells[:, 1:]] - points[cells[:, :1]]
     if cells.shape[1] == points.shape[1]:
         return np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
@@ -108,7 +109,8 @@ def signed_measures(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Cells with positive measure; raises `ValueError` on cells without any."""
+    """Reorder the nodes of cells so that every cell has positive area or volume. Raises `ValueError` for degenerate
+    cells."""
     measure = signed_measures(points, cells)
     dimension = cells.shape[1] - 1
     corners = points[cells]
@@ -126,7 +128,8 @@ def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def check_connected(first: np.ndarray, second: np.ndarray, count: int) -> None:
-    """Raise `ValueError` if `count` cells, of which `first` and `second` share facets, do not hang together."""
+    """Raise `ValueError` if the `count` cells are not connected; `first` and `second` list the pairs that share a
+    facet."""
     graph = coo_array((np.ones(len(first)), (first, second)), shape=(count, count))
     parts, label = connected_components(graph, directed=False)
     if parts > 1:
@@ -138,7 +141,7 @@ def check_connected(first: np.ndarray, second: np.ndarray, count: int) -> None:
 
 
 def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, np.ndarray]:
-    """Tags as indices (t,) into `facets`; raises `ValueError` on facets that are not there."""
+    """Convert tags to indices (t,) into `facets`. Raises `ValueError` for facets that are not among `facets`."""
     located = {}
     for name, value in tags.items():
         if not isinstance(name, str) or not name:

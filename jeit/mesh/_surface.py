@@ -1,4 +1,4 @@
-"""Surfaces of bodies: triangles that bound them, their orientation, and where they cross."""
+"""Triangulated surfaces of bodies: orientation of the triangles and detection of self-intersection."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from scipy.spatial import KDTree
 
 from jeit.mesh import topology
 
-# Relative to the extent of the surface: closer is touching.
+# Distance, relative to the extent of the surface, below which triangles count as touching.
 _TOUCHING = 1e-9
-# Pairs of triangles that are looked at together.
+# Approximate number of pairs of triangles that are tested together.
 _PAIRS = 500_000
-# Corners in the order of the three edges.
+# For each corner of a triangle, the next corner.
 _NEXT = np.array([1, 2, 0])
 
 
 def first_crossing(points: np.ndarray, cells: np.ndarray) -> tuple[int, int] | None:
-    """The first found of the pairs of triangles (m, 3) that cross, touch, or lie on each other, but in what they share;
-    None where there is none."""
+    """Find a pair of triangles (m, 3) that cross, touch or overlap outside the nodes and edges they share; None if no
+    pair does."""
     tolerance = _TOUCHING * float(np.ptp(points, axis=0).max())
-    for pairs in _near(points[cells], tolerance):
+    for pairs in _near_pairs(points[cells], tolerance):
         shared = (cells[pairs[:, 0], :, None] == cells[pairs[:, 1], None, :]).sum(axis=(1, 2))
         meet = np.zeros(len(pairs), bool)
         apart, one, two = shared == 0, shared == 1, shared == 2
         meet[apart] = _cross(points, cells, pairs[apart], tolerance)
         meet[one] = _cross_opposite(points, cells, pairs[one], tolerance)
-        meet[two] = _folded(points, cells, pairs[two])
+        meet[two] = _overlap_at_edge(points, cells, pairs[two])
         if meet.any():
             first, second = np.sort(pairs[meet][0]).tolist()
             return first, second
     return None
 
 
-def _near(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
-    """Pairs (p, 2) of triangles whose boxes overlap, some at a time.
+def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
+    """Yield pairs (p, 2) of triangles whose bounding boxes overlap, in batches.
 
-    Triangles of about one size are looked up in a tree of their own, so that a few large ones do not widen the search
-    for all.
+    Triangles are grouped by size and each group has its own search tree, so that a few large triangles do not widen the
+    search for all others.
     """
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
@@ -58,14 +58,14 @@ def _near(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
             number = np.fromiter(map(len, found), int, len(found))
             first = np.repeat(asked, number)
             second = members[np.concatenate([np.asarray(each, int) for each in found])]
-            # Each pair within one size class is found twice.
+            # A pair of triangles of the same size class is found twice; keep it once.
             once = np.where(size[first] == size[second], first < second, True)
             overlap = (low[first] <= high[second]).all(axis=1) & (low[second] <= high[first]).all(axis=1)
             yield np.column_stack([first, second])[once & overlap]
 
 
 def _cross(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether triangles without a common node have a point in common (p,)."""
+    """Whether the two triangles of each pair intersect (p,); the triangles have no node in common."""
     first, second = points[cells[pairs[:, 0]]], points[cells[pairs[:, 1]]]
     meet = _overlap_in_plane(first, second, tolerance)
     for one, other in ((first, second), (second, first)):
@@ -75,7 +75,8 @@ def _cross(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: 
 
 
 def _cross_opposite(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether triangles with one common node have more than that in common: an edge away from it pierces the other."""
+    """Whether two triangles with one common node intersect elsewhere (p,): the edge of either triangle that is opposite
+    to the common node pierces the other triangle."""
     meet = np.zeros(len(pairs), bool)
     for one, other in (pairs.T, pairs.T[::-1]):
         mine = cells[one]
@@ -85,8 +86,8 @@ def _cross_opposite(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, to
     return meet
 
 
-def _folded(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Whether triangles with a common edge lie on each other."""
+def _overlap_at_edge(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Whether the two triangles of each pair overlap (p,); the triangles share an edge."""
     first, second = cells[pairs[:, 0]], cells[pairs[:, 1]]
     own = ~(first[:, :, None] == second[:, None, :]).any(axis=2)
     others = ~(second[:, :, None] == first[:, None, :]).any(axis=2)
@@ -100,7 +101,8 @@ def _folded(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray) -> np.ndar
 
 
 def _pierces(start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether segments from `start` to `end` (p, 3) meet triangles (p, 3, 3) whose plane they do not lie in (p,)."""
+    """Whether the segments from `start` to `end` (p, 3) intersect the triangles (p, 3, 3), as booleans (p,). A segment
+    that lies in the plane of its triangle does not count."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     normal = np.cross(a, b)
     size = np.linalg.norm(normal, axis=1)
@@ -116,7 +118,8 @@ def _pierces(start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance:
 
 
 def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether triangles (p, 3, 3) that lie in one plane overlap (p,): no edge of either has them on its two sides."""
+    """Whether pairs of triangles (p, 3, 3) are coplanar and overlap (p,): they do not if the line through an edge of
+    either separates them."""
     normal = np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
     unit = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     height = np.einsum("pki,pi->pk", second - first[:, :1], unit)
@@ -135,17 +138,18 @@ def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -
 
 
 def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
-    """Triangles (m, 3) turned so that neighbours agree which side is out.
+    """Orient triangles (m, 3) consistently, so that neighbours agree on which side is outside.
 
-    Of a closed surface that is the outside, of an open one the side that most of the triangles gave. Where `points` are
-    not known, most of the triangles decide. Raises `ValueError` for edges of more than two triangles, for a surface
-    with one side only, for sheets that meet in a node, and for triangles that cross; warns of a closed surface whose
-    triangles all faced inwards.
+    The triangles of a closed surface are made to face outwards; those of an open surface, or if `points` is None, the
+    way that most of them do already. Raises `ValueError` for an edge shared by more than two triangles, a one-sided
+    surface, sheets that meet only in a node, and triangles that cross. Warns if all triangles of a closed surface face
+    inwards.
     """
     first, second = _pair_edges(cells)
     row, other = first // 3, second // 3
     odd = topology.odd_permutation(topology.cell_facets(cells))
-    # Two triangles agree where they run along their edge in opposite directions; else one of them must be turned.
+    # Two triangles have the same orientation if they traverse their common edge in opposite directions; otherwise one
+    # of them must be turned.
     turn = odd[first] == odd[second]
     turned = _sides(row, other, turn, cells)
     _check_fans(cells, first, second)
@@ -174,13 +178,14 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
 
 
 def enclosed_volume(points: np.ndarray, cells: np.ndarray) -> float:
-    """Volume in m³ within a closed surface (Gauss's theorem), negative where its triangles face inwards."""
+    """Volume in m³ enclosed by a closed surface (Gauss's theorem); negative if its triangles face inwards."""
     corners = points[cells] - points.mean(axis=0)
     return float(np.linalg.det(corners).sum() / 6)
 
 
 def _pair_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of `cell_facets` that are the same edge."""
+    """Pairs of rows of `cell_facets` that are the same edge. Raises `ValueError` for an edge of more than two
+    triangles."""
     edges = topology.cell_facets(cells)
     first, second, crowded = topology.match_facets(edges, int(cells.max()) + 1)
     if crowded.size:
@@ -194,9 +199,10 @@ def _pair_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sides(first: np.ndarray, second: np.ndarray, turn: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Which triangles to turn (m,) for all to agree with triangle 0; `ValueError` where that cannot be.
+    """Which triangles to turn (m,) so that all agree with triangle 0. Raises `ValueError` for a one-sided surface.
 
-    Every triangle counts twice, as it is and turned: a surface with two sides falls into two parts.
+    The graph has two nodes per triangle, as given and turned. It falls into two components if the surface has two
+    sides.
     """
     count = len(cells)
     rows = np.concatenate([first, first + count])
@@ -212,7 +218,8 @@ def _sides(first: np.ndarray, second: np.ndarray, turn: np.ndarray, cells: np.nd
 
 
 def _check_fans(cells: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
-    """Raise `ValueError` where the triangles round a node are not one fan: sheets that meet in nothing but a node."""
+    """Raise `ValueError` if sheets of a surface meet only in a node, so that the triangles around it form several
+    fans."""
     corner = np.arange(cells.size).reshape(cells.shape)
     ends = topology.LOCAL_FACETS[2]
     pairs = []

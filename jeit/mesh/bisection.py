@@ -1,9 +1,9 @@
-"""Refinement of meshes of triangles, in the plane or in space, or tetrahedra: `bisect` refines where a size function
-asks for it, `cut` divides cells along a surface.
+"""Refinement of meshes of triangles, in the plane or in space, or of tetrahedra: `bisect` refines cells to the lengths
+that a size function allows, `cut` divides cells along a surface.
 
-Edges are split, each in all the cells round it, so that cells go on meeting side to side. At their middles only where
-they are the longest of all those cells: Rivara, International Journal for Numerical Methods in Engineering 20 (1984)
-745. So cells keep their shape.
+An edge is split in all the cells around it, so the mesh stays conforming. `bisect` splits an edge at its midpoint, and
+only if it is the longest edge of each of those cells, so that cells keep their shape: Rivara, International Journal for
+Numerical Methods in Engineering 20 (1984) 745.
 """
 
 from __future__ import annotations
@@ -20,32 +20,33 @@ from jeit.mesh._checks import MOST_POINTS
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.sizes import size_checked
 
-# If a surface crosses an edge nearer to its end than this share of its length, the end is moved onto the surface.
+# Maximum distance from the end of an edge to the point where a surface crosses the edge, divided by the edge's length,
+# at which the end is moved onto the surface.
 _NEAR = 0.25
-# Least volume of a cell, of what it was, after its corners have moved.
+# Minimum volume of a cell after its nodes have moved, divided by its volume before.
 _LEAST = 0.1
-# Halvings that find where an edge is crossed.
+# Number of bisection steps to locate the point where a surface crosses an edge.
 _HALVINGS = 30
 
 
 def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.ndarray, " m"]]) -> Mesh:
-    """The mesh, with no cell whose longest edge is longer than asked for.
+    """Refine a mesh until no cell's longest edge exceeds the length that `size` allows.
 
-    `size` takes the corners of cells (m, k, s), metres, and returns the greatest length allowed for the longest edge of
-    each, metres; infinite where cells stay as they are. Neighbours are divided as far as that needs. Tags stay; the
-    boundary is that of the given mesh, of more facets.
+    `size` takes the corners of cells (m, k, s), metres, and returns the maximum length of the longest edge of each cell
+    (m,), metres; infinity leaves a cell as it is. Neighbouring cells are divided as needed to keep the mesh conforming.
+    Tags are kept, and the boundary keeps its shape.
 
-    Raises `ValueError` for a `size` that is not one number per cell, above zero, or asks for more than 2,000,000 nodes.
+    Raises `ValueError` if `size` does not return one positive number per cell, or asks for more than 2,000,000 nodes.
     """
     return bisected(mesh, size)[0]
 
 
 def bisected(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]) -> tuple[Mesh, Int[np.ndarray, " m"]]:
-    """The mesh of `bisect`, and the cell of the given mesh that each of its cells comes from. Raises `ValueError` as
-    `bisect` does."""
+    """Refine a mesh as `bisect` does; also returns, for each new cell, the index of the given cell that contains it.
+    Raises `ValueError` as `bisect` does."""
     division = _Division.of(mesh)
     parent = np.arange(len(division.cells))
-    wanted = _too_long(division, slice(None), size)
+    wanted = _exceeds_size(division, slice(None), size)
     while wanted.any():
         points, cells = division.points, division.cells
         near = _nodes(cells[wanted], len(points))
@@ -55,7 +56,7 @@ def bisected(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]) -> tuple[
             longest = _first(number, rank)
             marked = np.zeros(len(edges), bool)
             marked[longest[wanted[some]]] = True
-            # Where a marked edge is not the longest of a cell, that cell's longest one is split first.
+            # If a marked edge is not the longest edge of a cell, mark that cell's longest edge, which is split first.
             while not marked[more := longest[marked[number].any(axis=1)]].all():
                 marked[more] = True
             if near[edges[marked]].all():
@@ -67,19 +68,19 @@ def bisected(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]) -> tuple[
         division, came = division.split(chosen, points[chosen].mean(axis=1))
         parent = parent[came]
         new, wanted = np.bincount(came)[came] > 1, wanted[came]
-        wanted[new] = _too_long(division, new, size)
+        wanted[new] = _exceeds_size(division, new, size)
     return division.mesh(mesh.tags), parent
 
 
 def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, " n"]]) -> Mesh:
-    """The mesh, with no cell on both sides of the surface on which `level`, of points (n, s), metres, is zero.
+    """Divide the cells of a mesh along the surface on which `level` is zero, so that no cell lies on both sides of it.
 
-    So a body's surface is made of sides of cells, and no cell holds it in part. Nodes that lie near the surface are
-    moved onto it, those of the boundary not. Cells should be small beside the body (`bisect`).
+    `level` takes points (n, s), metres, and returns one number per point (n,). Nodes near the surface are moved onto
+    it, except nodes of the boundary. Cells should be small relative to the body that the surface bounds (see `bisect`).
 
-    Raises `ValueError` for a `level` that is not one finite number per point.
+    Raises `ValueError` if `level` does not return one finite number per point.
     """
-    division, value = _moved_onto(_Division.of(mesh), level)
+    division, value = _move_nodes_onto(_Division.of(mesh), level)
     while True:
         points, cells = division.points, division.cells
         side = np.sign(value)[cells]
@@ -96,10 +97,10 @@ def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray
 
 @dataclass(frozen=True)
 class _Division:
-    """A mesh in arrays, while its edges are split.
+    """Arrays of a mesh whose edges are being split.
 
-    **Fields**: `points` (n, s), metres; `cells` (m, d + 1); `facets` (b, d); `side` (b,), the facet that each comes
-    from.
+    **Fields**: `points` (n, s): coordinates, metres; `cells` (m, d + 1): nodes of each cell; `facets` (b, d): nodes of
+    each boundary facet; `side` (b,): index of the original facet that contains each facet.
     """
 
     points: Float[np.ndarray, "n s"]
@@ -109,28 +110,29 @@ class _Division:
 
     @classmethod
     def of(cls, mesh: Mesh) -> _Division:
-        """The division of a mesh of which nothing is split yet."""
+        """Create from a mesh without splitting any edge."""
         check_kind("mesh", mesh, Mesh, "a mesh, such as jeit.mesh.disk or jeit.mesh.read return")
         points, cells, facets = (np.asarray(one) for one in (mesh.points, mesh.cells, mesh.facets))
         return cls(points, cells, facets, np.arange(len(facets)))
 
     def mesh(self, tags) -> Mesh:
-        """The mesh, with the `tags` of that which was divided."""
+        """Create the mesh, with the `tags` of the original mesh."""
         named = {name: self.facets[np.isin(self.side, np.asarray(index))] for name, index in tags.items()}
         with size_checked():
             return Mesh.create(self.points, self.cells, tags=named)
 
     def split(self, edges: Int[np.ndarray, "e 2"], middles: Float[np.ndarray, "e s"]) -> tuple[_Division, np.ndarray]:
-        """The division with `edges`, no two of one cell, split at their `middles`, metres; and the cell that each new
-        cell comes from."""
+        """Split `edges`, of which no cell may have two, at their `middles`, metres. Returns the new division, and for
+        each of its cells the index of the cell that contains it."""
         node = len(self.points) + np.arange(len(edges))
-        cells, came = _halved(self.cells, edges, node, len(self.points))
-        facets, side = _halved(self.facets, edges, node, len(self.points))
+        cells, came = _split_simplices(self.cells, edges, node, len(self.points))
+        facets, side = _split_simplices(self.facets, edges, node, len(self.points))
         return _Division(np.concatenate([self.points, middles]), cells, facets, self.side[side]), came
 
 
-def _too_long(division: _Division, some, size) -> Bool[np.ndarray, " m"]:
-    """Whether cells have longer edges than allowed. Raises `ValueError`."""
+def _exceeds_size(division: _Division, some, size) -> Bool[np.ndarray, " m"]:
+    """Whether the longest edge of each cell exceeds the allowed length. Raises `ValueError` for invalid results of
+    `size`."""
     cells = division.cells[some]
     most = np.asarray(size(division.points[cells]))
     if most.shape != (len(cells),) or not (most > 0).all():
@@ -141,9 +143,9 @@ def _too_long(division: _Division, some, size) -> Bool[np.ndarray, " m"]:
     return _longest(division.points, cells) > most
 
 
-def _moved_onto(division: _Division, level) -> tuple[_Division, Float[np.ndarray, " n"]]:
-    """The mesh with nodes near the surface moved onto it, along edges, except for those of the boundary and where cells
-    would be crushed; and the level at all nodes."""
+def _move_nodes_onto(division: _Division, level) -> tuple[_Division, Float[np.ndarray, " n"]]:
+    """Move nodes near the surface along edges onto it, except nodes of the boundary and nodes whose movement would
+    crush a cell. Also returns the level at all nodes."""
     points, cells = division.points, division.cells
     value = np.asarray(level(points))
     if value.shape != (len(points),) or not np.isfinite(value).all():
@@ -155,7 +157,7 @@ def _moved_onto(division: _Division, level) -> tuple[_Division, Float[np.ndarray
     edges = edges[np.prod(np.sign(value)[edges], axis=1) < 0]
     place = _crossing(points[edges], value[edges[:, 0]], level)
     distance = np.linalg.norm(points[edges] - place[:, None], axis=2) / _lengths(points[edges])[:, None]
-    ends, order = edges.ravel(), np.argsort(-distance.ravel())  # the nearest comes last, and stays
+    ends, order = edges.ravel(), np.argsort(-distance.ravel())  # a node's nearest crossing is assigned last
     nearest, target = np.full(len(points), np.inf), points.copy()
     nearest[ends[order]], target[ends[order]] = distance.ravel()[order], np.repeat(place, 2, axis=0)[order]
     moves = (nearest < _NEAR) & ~_nodes(division.facets, len(points))
@@ -169,7 +171,8 @@ def _moved_onto(division: _Division, level) -> tuple[_Division, Float[np.ndarray
 
 
 def _crossing(ends: Float[np.ndarray, "e 2 s"], first: Float[np.ndarray, " e"], level) -> Float[np.ndarray, "e s"]:
-    """Points on edges where the level, `first` (e,) at the first ends and of the other sign at the others, is zero."""
+    """Locate the point on each edge where the level is zero, by bisection. `first` (e,): levels at the first ends; the
+    level at the other ends has the opposite sign."""
     low, high = np.zeros((len(ends), 1)), np.ones((len(ends), 1))
     start, along = ends[:, 0], ends[:, 1] - ends[:, 0]
     for _ in range(_HALVINGS):
@@ -180,7 +183,8 @@ def _crossing(ends: Float[np.ndarray, "e 2 s"], first: Float[np.ndarray, " e"], 
 
 
 def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "m k"], Int[np.ndarray, " e"]]:
-    """All edges, the lower node first; the numbers of those of every simplex; and their ranks by length."""
+    """All edges, each with its lower node first; the indices of the edges of each simplex; and the ranks of the edges
+    by length."""
     ends = _ends(simplices).reshape(-1, 2)
     key, number = np.unique(ends[:, 0] * len(points) + ends[:, 1], return_inverse=True)
     edges = np.stack(np.divmod(key, len(points)), axis=1)
@@ -190,7 +194,7 @@ def _edges(points, simplices) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "
 
 
 def _ends(simplices) -> Int[np.ndarray, "m k 2"]:
-    """The nodes of every simplex's edges, the lower one first."""
+    """The two nodes of each edge of each simplex, the lower node first."""
     pairs = np.array(list(itertools.combinations(range(simplices.shape[1]), 2)))
     return np.sort(simplices[:, pairs].astype(np.int64), axis=2)
 
@@ -201,37 +205,39 @@ def _lengths(ends: Float[np.ndarray, "... 2 s"]) -> Float[np.ndarray, "..."]:
 
 
 def _longest(points, cells) -> Float[np.ndarray, " m"]:
-    """The length of every cell's longest edge, metres."""
+    """Length of the longest edge of each cell, metres."""
     return _lengths(points[_ends(cells)]).max(axis=1)
 
 
 def _first(number, rank) -> Int[np.ndarray, " m"]:
-    """The edge of the highest rank of every cell."""
+    """The edge of each cell that has the highest rank."""
     return np.take_along_axis(number, np.argmax(rank[number], axis=1)[:, None], axis=1)[:, 0]
 
 
 def _first_of_all(number, rank) -> Bool[np.ndarray, " e"]:
-    """Edges of the highest rank in all the cells round them."""
+    """Whether each edge has the highest rank in all the cells around it."""
     return np.bincount(_first(number, rank), minlength=len(rank)) == np.bincount(number.ravel(), minlength=len(rank))
 
 
 def _nodes(simplices, num_points: int) -> Bool[np.ndarray, " n"]:
-    """Nodes of some simplices."""
+    """Whether each node belongs to any of the simplices."""
     there = np.zeros(num_points, bool)
     there[simplices] = True
     return there
 
 
 def _volumes(points, cells) -> Float[np.ndarray, " m"]:
-    """Volumes of cells, up to a factor; negative where turned round, but for triangles in space, which have no sign."""
+    """Volumes of cells up to a constant factor, negative for inverted cells; areas of triangles in space are never
+    negative."""
     sides = points[cells[:, 1:]] - points[cells[:, :1]]
     if sides.shape[1] < sides.shape[2]:
         return np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     return np.linalg.det(sides)
 
 
-def _halved(simplices, edges, node, num_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Simplices, each in two where one of its edges is split at a `node`; and which each comes from."""
+def _split_simplices(simplices, edges, node, num_points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Split each simplex that has one of the `edges` into two at the new `node`. Also returns the index of the original
+    simplex that contains each result."""
     some = np.flatnonzero(_nodes(edges, num_points)[simplices].sum(axis=1) > 1)
     key = edges @ [num_points, 1]
     order = np.argsort(key)

@@ -1,4 +1,4 @@
-"""The quality of cells, and triangles without shared nodes welded into a mesh."""
+"""Shape quality of cells, merging of coincident nodes, and readers of .stl and .obj files."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from jeit.mesh.mesh import Mesh
 class Quality(eqx.Module):
     """Shape measures of a mesh, as NumPy arrays with one entry per cell.
 
-    **Fields**: `smallest_angle` (m,) in degrees, the smallest corner of a triangle or the smallest angle between two
-    faces of a tetrahedron; `radius_ratio` (m,), d times the radius of the inscribed over that of the circumscribed
-    circle or sphere, 1 for a regular cell, 0 for a flat one; `shortest_edge`, `longest_edge` (m,) in metres.
+    **Fields**: `smallest_angle` (m,): the smallest angle of a triangle, or the smallest angle between two faces of a
+    tetrahedron, degrees; `radius_ratio` (m,): d times the radius of the inscribed circle or sphere divided by the
+    radius of the circumscribed one, from 0 for a flat cell to 1 for a regular one; `shortest_edge`, `longest_edge`
+    (m,): lengths in metres.
     """
 
     dimension: int
@@ -41,7 +42,7 @@ class Quality(eqx.Module):
 
 
 def quality(mesh: Mesh) -> Quality:
-    """Measure the shape of every cell of a mesh; see `Quality`."""
+    """Compute shape measures of every cell of a mesh; see `Quality`."""
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     corners = points[cells]
     first, second = np.triu_indices(mesh.dimension + 1, 1)
@@ -72,7 +73,7 @@ def _triangles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _tetrahedra(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     a, b, c = (corners[:, k] - corners[:, 0] for k in (1, 2, 3))
-    # Inward normals of the faces opposite nodes 1, 2, 3 and 0, as long as twice the area of the face.
+    # Inward normals of the faces opposite to nodes 1, 2, 3 and 0; the length of each is twice the area of its face.
     normals = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     normals = np.concatenate([normals, -normals.sum(axis=1, keepdims=True)], axis=1)
     area = np.linalg.norm(normals, axis=2)
@@ -81,22 +82,22 @@ def _tetrahedra(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     cosine = np.clip(-(unit[:, first] * unit[:, second]).sum(axis=2), -1.0, 1.0)
     angle = np.degrees(np.arccos(cosine)).min(axis=1)
     volume = np.abs((a * normals[:, 0]).sum(axis=1))
-    # r = 3 V / ΣA; the centre of the circumscribed sphere is Σ |x_i|² n_i / (2 · 6 V) from node 0.
+    # r = 3 V / ΣA; the centre of the circumscribed sphere relative to node 0 is Σ |x_i|² n_i / (2 · 6 V).
     squares = np.stack([(a**2).sum(1), (b**2).sum(1), (c**2).sum(1)], axis=1)
     circumradius = np.linalg.norm((squares[..., None] * normals[:, :3]).sum(axis=1), axis=1) / (2 * volume)
     return angle, 3 * (volume / area.sum(axis=1)) / circumradius
 
 
 def merged(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, d) without those within `tolerance` metres of an earlier one, and cells (m, k) that use these.
+    """Merge points (n, d) closer than `tolerance` metres to each other, and renumber the cells (m, k).
 
-    Cells that lose a corner by it are left out.
+    The first point of each group is kept. Cells of which two corners are merged are removed.
     """
     close = KDTree(points).query_pairs(tolerance, output_type="ndarray")
     graph = coo_array((np.ones(len(close)), close.T), shape=(len(points), len(points)))
     _, label = connected_components(graph, directed=False)
     _, first, number = np.unique(label, return_index=True, return_inverse=True)
-    # In the order in which they first occur.
+    # Number the groups in the order of their first points.
     order = np.argsort(first)
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))
@@ -106,23 +107,23 @@ def merged(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tuple[np.
     return points[first[order]], renumbered[whole]
 
 
-# The bytes of a triangle in a binary .stl file: a normal, three corners, and two that some give a meaning.
+# Layout of a triangle in a binary .stl file: a normal, three corners, and two bytes of attributes.
 _TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
-# Nodes that are nearer, relative to the largest coordinate, are one: such files keep six digits of them.
+# Distance, relative to the largest coordinate, below which nodes are merged: these files store six digits.
 _SEAM = 2e-6
-# Greatest number of letters of messages about a file's content.
+# Maximum number of characters of an error message about the content of a file.
 _LONGEST = 120
-# Greatest memory that a file takes when read, over the file's size: faces of an .obj file are written in few letters.
+# Maximum memory needed to read a file, divided by the file's size; an .obj file describes a face in few characters.
 _GROWTH = {".stl": 8, ".obj": 16}
 
 
 def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3), those at one place made one, and triangles (m, 3) of an .stl or .obj file, in the file's unit.
+    """Read points (n, 3) and triangles (m, 3) from an .stl or .obj file, in the file's unit, merging coincident points.
 
-    Polygons are cut into triangles from their first corner on; triangles without an area are left out. Raises
-    `ValueError`, about `name`, for a file that holds none.
+    Polygons are divided into triangles that share the polygon's first corner; degenerate triangles are removed. Raises
+    `ValueError` with the file's `name` if the file contains no valid triangles.
     """
     ending = path.suffix.lower()
     check_memory(name, _GROWTH[ending] * path.stat().st_size)
@@ -182,7 +183,8 @@ def _obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _index(value: bytes, count: int) -> int:
-    """Of what a face says of a corner, vertex/texture/normal; negative numbers count back from the last vertex."""
+    """Vertex index of a corner of a face, given as vertex/texture/normal; negative numbers count back from the last
+    vertex."""
     number = int(value.split(b"/")[0])
     if number == 0 or number < -count:
         raise ValueError(f"a face names vertex {number}, and {count} came before it")

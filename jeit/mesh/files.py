@@ -1,4 +1,4 @@
-"""Mesh files, through meshio where the format is not our own, checked before anything is built."""
+"""Read and write mesh files, most of them with meshio; files are checked before they are read."""
 
 from __future__ import annotations
 
@@ -31,8 +31,9 @@ from jeit.mesh.mesh import Mesh
 if TYPE_CHECKING:
     import meshio
 
-# Formats of one file each, by the endings of names, as meshio calls them. Others may lead to further files (links in
-# HDF5), or have readers that wait for ever for a bracket that is not there (Ansys, Nastran, OFF, PLY).
+# Formats that consist of a single file: file name extensions and meshio's names of the formats. Other formats may refer
+# to further files (links in HDF5), or have readers that can loop forever on a missing bracket (Ansys, Nastran, OFF,
+# PLY).
 FORMATS = {
     ".inp": "abaqus",
     ".mesh": "medit",
@@ -45,26 +46,27 @@ FORMATS = {
     ".xdmf": "xdmf",
     ".xmf": "xdmf",
 }
-# Memory that a mesh takes, over its size in the file.
+# Memory needed to read a mesh, divided by the size of its file.
 _GROWTH = 4
 _INCLUDE = re.compile(rb"^[ \t]*\*[ \t]*include", re.IGNORECASE | re.MULTILINE)
-# Sets of an Abaqus file given by their first and last number; the counts in a VTK file, of a grid along each axis.
+# First pattern: sets in an Abaqus file that are given by their first and last number. Second pattern: counts in a VTK
+# file, including the numbers of grid points along each axis.
 _GENERATED = re.compile(rb"^[ \t]*\*.*generate", re.IGNORECASE | re.MULTILINE)
 _VTK_COUNTS = re.compile(
     rb"^[ \t]*(DIMENSIONS|POINTS|CELLS|CELL_TYPES|\w+_COORDINATES)((?:[ \t]+\d+)+)", re.IGNORECASE | re.MULTILINE
 )
-# Counts, and whole numbers of so many digits, in a .msh file; and its nodes as bytes.
+# In a .msh file: sections that start with a count, integers of at least eight digits, and the layout of a binary node.
 _COUNTED = re.compile(rb"^\$(Nodes|Elements|PhysicalNames)\s*?\n\s*(\d+)\r?\n", re.MULTILINE)
 _LONG = re.compile(rb"(?<![\w.+-])\d{8,}(?![\d.eE])")
 _NODE = np.dtype([("number", "<i4"), ("place", "<f8", 3)])
-# Numbers of nodes are looked up in an array as long as the largest.
+# Maximum accepted node number: meshio allocates an array as long as the largest node number.
 _LARGEST = 10**7
 _reading = threading.Lock()
 
 
 def check_foreign(path: Path) -> str:
-    """Name that meshio uses for the format of a file. Raises `ValueError` for a format that is not among `FORMATS`, for
-    a file that leads to others or declares entities, and for one too large for memory."""
+    """Name that meshio uses for the format of a file. Raises `ValueError` if the format is not in `FORMATS`, or if the
+    file refers to other files, declares entities, or is too large for memory."""
     kind = FORMATS.get(path.suffix.lower())
     if kind is None:
         raise ValueError(
@@ -88,8 +90,8 @@ def check_foreign(path: Path) -> str:
 
 
 def _check_numbers(path: Path) -> None:
-    """Raise `ValueError` for a .msh file with more nodes or cells, or larger numbers of them, than a file of its size
-    has."""
+    """Raise `ValueError` for a .msh file whose counts or node numbers are larger than a file of its size can
+    contain."""
     content = path.read_bytes()
     version, binary = [*content[:64].split(), b"", b"", b""][1:3]
     if content.startswith(b"$MeshFormat") and binary == b"1" and not version.startswith(b"2"):
@@ -114,7 +116,7 @@ def _check_numbers(path: Path) -> None:
 
 
 def _check_counts(path: Path) -> None:
-    """Raise `ValueError` for a VTK file that counts more points or cells than a file of its size has."""
+    """Raise `ValueError` for a VTK file that declares more points or cells than a file of its size can contain."""
     content = path.read_bytes()
     for found in _VTK_COUNTS.finditer(content):
         counts = [int(one[:20]) for one in found[2].split()]
@@ -127,7 +129,7 @@ def _check_counts(path: Path) -> None:
 
 
 class _Begun(Exception):
-    """The first element was reached."""
+    """Raised to stop parsing at the first XML element."""
 
 
 def _check_prologue(path: Path) -> None:
@@ -147,11 +149,11 @@ def _check_prologue(path: Path) -> None:
     except _Begun:
         return
     except expat.ExpatError:
-        return  # meshio says what is wrong
+        return  # meshio reports the error
 
 
 def _check_inline(path: Path) -> None:
-    """Raise `ValueError` for an XDMF file whose numbers are in other files."""
+    """Raise `ValueError` for an XDMF file that stores its arrays in other files or declares entities."""
     try:
         root = ElementTree.parse(path).getroot()
     except (ElementTree.ParseError, ValueError, LookupError):
@@ -168,7 +170,7 @@ def _check_inline(path: Path) -> None:
 
 @contextmanager
 def bounded_inflation(path: Path) -> Iterator[None]:
-    """While it lasts, what meshio unpacks of a VTU file is as much as memory may hold, or it raises `ValueError`."""
+    """Context in which meshio raises `ValueError` if the decompressed data of a VTU file exceed the memory limit."""
     from meshio.vtu import _vtu  # takes a tenth of a second
 
     own, left = _vtu.__dict__, most_bytes()
@@ -197,26 +199,28 @@ def bounded_inflation(path: Path) -> Iterator[None]:
 
 _CELLS = {2: "triangle", 3: "tetra"}
 _FACETS = {2: "line", 3: "triangle"}
-# Files of triangles whose neighbours are to be found.
+# Formats that list triangles without connectivity, so that coincident nodes must be merged.
 _LOOSE = (".stl", ".obj")
-# Errors that meshio raises for content that it does not check; and greatest number of letters of their messages.
+# Exceptions that meshio raises for invalid content, and maximum number of characters of their messages.
 _FAULTS = (LookupError, TypeError, AttributeError, ArithmeticError, MemoryError)
 _SAID = 80
 
 
 def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh:
     """Read a mesh of triangles (2-D) or tetrahedra (3-D) from a .vtu, .vtk, .msh (Gmsh), .inp, .xdmf or other file, or
-    a surface in space from one of these, from a scan or from CAD (.stl, .obj; for .step see `jeit.mesh.from_gmsh`).
+    a surface in space from one of these formats or from a scan or CAD file (.stl, .obj; for .step see
+    `jeit.mesh.from_gmsh`).
 
     `scale` is the length of the file's unit in metres: 1e-3 for millimetres, 0.0254 for inches. Groups of boundary
-    facets (Gmsh's physical groups, or meshio's cell sets) become tags; groups that hold no boundary facet are left out,
-    and so are nodes that no cell uses. A flat mesh in the plane z = constant becomes 2-D; other triangles are a surface
-    in space, and in .stl and .obj files nodes at one place are made one. Nothing but the file itself is read, and no
-    more of it than memory may hold (the environment variable JEIT_FILE_GB), unless it is `trusted`: then whatever
-    meshio knows is read as meshio reads it, with the files that it leads to.
+    facets (Gmsh's physical groups, or meshio's cell sets) become tags. Groups without boundary facets and nodes without
+    cells are omitted. A flat mesh in a plane z = constant becomes 2-D; other triangles become a surface in space. In
+    .stl and .obj files, coincident nodes are merged.
 
-    Raises `FileNotFoundError` if there is no such file and `ValueError` if it is not a mesh file, leads to others,
-    holds other cells than linear triangles or tetrahedra, or a mesh that `Mesh.create` refuses.
+    By default only the file itself is read, within the memory limit (environment variable JEIT_FILE_GB). If `trusted`,
+    all formats of meshio are read, without checks, including files that the file refers to.
+
+    Raises `FileNotFoundError` if the file does not exist, and `ValueError` if it is not a mesh file, refers to other
+    files, contains cells other than linear triangles or tetrahedra, or a mesh that `Mesh.create` rejects.
     """
     path = Path(path)
     if not path.is_file():
@@ -228,7 +232,7 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
     kind = None if trusted else check_foreign(path)
     if path.suffix.lower() in _LOOSE:
         points, cells = read_loose(path, path.name[:80])
-        return _created(points * float(scale), cells, {})
+        return _create_mesh(points * float(scale), cells, {})
     with bounded_inflation(path) if kind == "vtu" else nullcontext():
         content = _quietly(path, lambda meshio: meshio.read(path, file_format=kind))
     try:
@@ -244,11 +248,11 @@ def write(
     cell_data: Mapping[str, ArrayLike] | None = None,
     point_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write a mesh, with values per cell (m, …) and per node (n, …), in the format its file name ends with.
+    """Write a mesh, with values per cell (m, …) and per node (n, …), in the format given by the file name's extension.
 
-    `.msh` files (Gmsh 2.2) keep the tags, as physical groups, but no values per cell; other formats keep both
-    kinds of values, but no tags. Plane meshes are written at z = 0. Raises `ValueError` on an unknown
-    format and on data of the wrong length or complex.
+    `.msh` files (Gmsh 2.2) keep the tags, as physical groups, and values per node, but not values per cell; other
+    formats keep both kinds of values, but not the tags. Plane meshes are written at z = 0. Raises `ValueError` for an
+    unknown format, and for data of the wrong length or complex data.
     """
     path = Path(path)
     points = np.asarray(mesh.points, dtype=float)
@@ -296,7 +300,7 @@ def _data(argument: str, name: str, value: ArrayLike, length: int) -> np.ndarray
 
 
 def _quietly(path: Path, action: Any, *, writing: bool = False) -> Any:
-    """Do something with meshio: it prints, and leaves the interpreter, where it should raise."""
+    """Call `action` with meshio: raise `ValueError` where meshio prints a message or exits the interpreter."""
     import meshio  # takes a tenth of a second
 
     said = io.StringIO()
@@ -319,7 +323,7 @@ def _quietly(path: Path, action: Any, *, writing: bool = False) -> Any:
 
 
 def _short(error: BaseException | str) -> str:
-    """A message in one short line."""
+    """Shorten a message to one line."""
     said = " ".join(str(error).split()).rstrip(".") or type(error).__name__
     return said if len(said) <= _SAID else f"{said[: _SAID - 1]}…"
 
@@ -343,7 +347,7 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
     points = points[used]
     number = np.full(len(content.points), -1)
     number[used] = np.arange(len(used))
-    # The cells may still be turned either way: a boundary facet is one that occurs once.
+    # The cells are not yet oriented, so boundary facets are found as the facets that occur once.
     keys, occurrences = np.unique(topology.facet_keys(topology.cell_facets(cells), len(used)), return_counts=True)
     boundary = keys[occurrences == 1]
     tags = {}
@@ -353,11 +357,11 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
         nodes = nodes[np.isin(topology.facet_keys(nodes, len(used)), boundary)]
         if len(nodes):
             tags[name] = nodes
-    return _created(points, cells, tags)
+    return _create_mesh(points, cells, tags)
 
 
-def _created(points: np.ndarray, cells: np.ndarray, tags: Mapping[str, ArrayLike]) -> Mesh:
-    """A mesh, in two dimensions if its triangles lie in a plane z = constant."""
+def _create_mesh(points: np.ndarray, cells: np.ndarray, tags: Mapping[str, ArrayLike]) -> Mesh:
+    """Create a mesh; it is two-dimensional if its triangles lie in a plane z = constant."""
     if cells.shape[1] == 3 and points.shape[1] == 3 and np.ptp(points[:, 2]) <= 1e-9 * np.ptp(points, axis=0).max():
         points = points[:, :2]
     return Mesh.create(points, cells, tags=tags)

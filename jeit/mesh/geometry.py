@@ -1,4 +1,5 @@
-"""Measures and P1 gradients of cells and facets: differentiable in the points, and at once where they have values."""
+"""Measures, centroids, normals and P1 gradients of cells and facets. They are differentiable in the points, and
+computed immediately if the points have values."""
 
 from __future__ import annotations
 
@@ -14,7 +15,8 @@ from jeit_solvers.engines import either_engine, has_values, namespace
 
 
 def check_flat(mesh: Mesh, what: str) -> None:
-    """Raise `ValueError` for a surface in space: `what`, a plural such as "rasters", are of flat sheets and solids."""
+    """Raise `ValueError` for a surface in space. `what`: a plural noun, such as "rasters", for what requires a flat
+    sheet or a solid."""
     if mesh.is_surface:
         raise ValueError(
             f"mesh is a surface in space, and {what} are of flat sheets and solids; take the flat sheet that it was "
@@ -24,7 +26,7 @@ def check_flat(mesh: Mesh, what: str) -> None:
 
 @either_engine
 def measures(mesh: Mesh) -> Float[Array, " m"]:
-    """Area in m² (2-D) or volume in m³ (3-D) of every cell, (m,), positive for a valid mesh."""
+    """Area in m² (2-D) or volume in m³ (3-D) of every cell (m,); positive for a valid mesh."""
     corners = mesh.points[mesh.cells]
     edges = corners[:, 1:] - corners[:, :1]
     xp = namespace(mesh.points)
@@ -37,12 +39,13 @@ def measures(mesh: Mesh) -> Float[Array, " m"]:
 
 @either_engine
 def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
-    """Gradients in 1/m of the d + 1 linear basis functions on every cell, (m, d + 1, s), s being the space dimension.
+    """Gradients (m, d + 1, s), in 1/m, of the d + 1 linear basis functions on every cell, where s is the space
+    dimension.
 
-    φ_i is 1 at node i of the cell and 0 at the others, so with E the matrix of edges x_i − x_0 the
-    gradients of φ_1 … φ_d are the columns of E⁻¹, and that of φ_0 is minus their sum. E⁻¹ is written out:
-    cross products of edges over the determinant. On a triangle in space, with normal n = a × b of its edges, they lie
-    in its plane: ∇φ_1 = b × n / |n|² and ∇φ_2 = n × a / |n|².
+    φ_i is 1 at node i of the cell and 0 at the others. With E the matrix of edges x_i − x_0, the gradients of φ_1 … φ_d
+    are the columns of E⁻¹, and the gradient of φ_0 is minus their sum. E⁻¹ is computed from cross products of edges
+    divided by the determinant. On a triangle in space with edges a, b and normal n = a × b, the gradients lie in its
+    plane: ∇φ_1 = b × n / |n|² and ∇φ_2 = n × a / |n|².
     """
     xp = namespace(mesh.points)
     corners = mesh.points[mesh.cells]
@@ -62,21 +65,22 @@ def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
         determinant = xp.sum(a * normal, axis=-1)[:, None]
         others = xp.stack([normal, xp.cross(c, a), xp.cross(a, b)], axis=1)
     others = others / determinant[:, :, None]
-    # Written out, for XLA makes a slow matrix product of a sum over so short an axis.
+    # Explicit sum, because XLA converts a sum over such a short axis into a slow matrix product.
     first = -functools.reduce(operator.add, [others[:, k] for k in range(mesh.dimension)])
     return xp.concatenate([first[:, None], others], axis=1)
 
 
 @either_engine
 def centroids(mesh: Mesh) -> Float[Array, "m s"]:
-    """Centre of gravity in metres of every cell, (m, s)."""
+    """Centroid (m, s) of every cell, in metres."""
     return mesh.points[mesh.cells].mean(axis=1)
 
 
 def normals(mesh: Mesh) -> Float[Array, "m 3"]:
-    """Unit normals of the triangles of a surface in space, (m, 3): outward where it is closed.
+    """Unit normals (m, 3) of the triangles of a surface in space; outward if it is closed.
 
-    Of a plane mesh they are (0, 0, 1). Raises `ValueError` for a solid, whose facets have normals, not its cells.
+    For a plane mesh they are (0, 0, 1). Raises `ValueError` for a solid, which has normals on its facets but not its
+    cells.
     """
     if mesh.dimension != 2:
         raise ValueError("mesh: a solid's cells have no normals; take those of its surface, surface_of(mesh).")
@@ -95,7 +99,7 @@ def _normals(mesh: Mesh):
 
 @either_engine
 def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
-    """Length in m (2-D) or area in m² (3-D) of every boundary facet, (b,)."""
+    """Length in m (2-D) or area in m² (3-D) of every boundary facet (b,)."""
     corners = mesh.points[mesh.facets]
     edges = corners[:, 1:] - corners[:, :1]
     xp = namespace(mesh.points)
@@ -107,16 +111,17 @@ def facet_measures(mesh: Mesh) -> Float[Array, " b"]:
 
 
 def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
-    """For each boundary edge of a 2-D mesh: the number of its loop, and the arc length in metres where it starts.
+    """For each boundary edge (b,) of a 2-D mesh, the number of its loop and the arc length (b,) in metres at which it
+    starts.
 
-    Both (b,). Arc length counts along `mesh.facets` from the first node of each loop, counter-clockwise on the outer
-    one; the perimeter of a loop is the sum of its `facet_measures`. Raises `ValueError` in 3-D.
+    Arc length is measured along `mesh.facets` from the first node of each loop, counter-clockwise on the outer loop;
+    the perimeter of a loop is the sum of its `facet_measures`. Raises `ValueError` in 3-D.
     """
     if mesh.dimension != 2:
         raise ValueError("mesh: arc length is defined on the boundary of 2-D meshes only, this one is 3-D.")
     xp = namespace(mesh)
     first = xp.concatenate([xp.ones(1, bool), mesh.facets[1:, 0] != mesh.facets[:-1, 1]])
-    # Sums over all pairs of facets: XLA turns a cumulative sum into dozens of small operations.
+    # Sums over all pairs of facets, because XLA converts a cumulative sum into dozens of small operations.
     order = np.arange(mesh.num_facets)
     loop = xp.sum((order <= order[:, None]) & first, axis=1)
     earlier = (order < order[:, None]) & (loop == loop[:, None])
@@ -124,7 +129,7 @@ def boundary_loops(mesh: Mesh) -> tuple[Int[Array, " b"], Float[Array, " b"]]:
 
 
 def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of cells that share a facet, (f, 2), and the nodes of that facet, (f, d). NumPy; once per mesh.
+    """Pairs of cells (f, 2) that share a facet, and the nodes (f, d) of that facet, as NumPy arrays.
 
     Raises `ValueError` for a mesh that is being traced.
     """
@@ -136,7 +141,7 @@ def interior_facets(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _length(vectors):
-    """Lengths (m,) of vectors (m, 3), written out for XLA."""
+    """Lengths (m,) of vectors (m, 3), with an explicit sum for XLA."""
     return namespace(vectors).sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2 + vectors[:, 2] ** 2)
 
 

@@ -16,15 +16,15 @@ from jeit_solvers.engines import as_array, has_values
 class Mesh(eqx.Module):
     """A conforming mesh of triangles in the plane or in space (2-D), or of tetrahedra (3-D).
 
-    Build one with `jeit.mesh.disk` and its siblings, `jeit.mesh.read`, or from raw arrays with
-    `Mesh.create`, which checks and orients them. All array fields are pytree leaves, so a mesh can be
-    traced, batched over its points, and differentiated with respect to them.
+    Create one with functions such as `jeit.mesh.disk` or `jeit.mesh.read`, or from arrays with `Mesh.create`, which
+    checks and orients them. All array fields are pytree leaves, so a mesh can be traced, batched over its points, and
+    differentiated with respect to them.
 
-    **Fields**: `points` (n, s) in metres, s = 2 or 3; `cells` (m, d + 1) node indices, positively oriented;
-    `facets` (b, d) boundary edges or triangles, oriented with the domain on the left (2-D) or the normal
-    outward (3-D), and in 2-D ordered head to tail, loop after loop, the outer loop first; `tags` maps a
-    name to indices into `facets`. Triangles in space are a surface: counter-clockwise as seen from outside, with edges
-    (0, 2) where it is closed.
+    **Fields**: `points` (n, s): coordinates in metres, s = 2 or 3; `cells` (m, d + 1): node indices, positively
+    oriented; `facets` (b, d): boundary edges or triangles, oriented with the domain on the left (2-D) or with outward
+    normals (3-D), and in 2-D ordered head to tail, one loop after the other, the outer loop first; `tags`: names of
+    groups of facets, with their indices into `facets`. Triangles in space form a surface: they are counter-clockwise as
+    seen from outside, and `facets` has shape (0, 2) if the surface is closed.
     """
 
     points: Float[Array, "n s"]
@@ -34,17 +34,17 @@ class Mesh(eqx.Module):
 
     @property
     def dimension(self) -> int:
-        """Dimension of the cells: 2 of triangles, 3 of tetrahedra."""
+        """Dimension of the cells: 2 for triangles, 3 for tetrahedra."""
         return self.cells.shape[1] - 1
 
     @property
     def space_dimension(self) -> int:
-        """Number of coordinates of a point, 2 or 3."""
+        """Number of coordinates per point, 2 or 3."""
         return self.points.shape[1]
 
     @property
     def is_surface(self) -> bool:
-        """Whether these are triangles in space."""
+        """Whether the cells are triangles in space."""
         return self.space_dimension > self.dimension
 
     @property
@@ -64,23 +64,23 @@ class Mesh(eqx.Module):
 
     @staticmethod
     def create(points: ArrayLike, cells: ArrayLike, *, tags: Mapping[str, ArrayLike] | None = None) -> Mesh:
-        """Check raw arrays, orient the cells, find the boundary, and make a `Mesh`.
+        """Create a `Mesh` from arrays: check them, orient the cells and find the boundary.
 
-        **Arguments**: `points` (n, 2) or (n, 3) in metres; `cells` (m, 3) triangles, in the plane or in space, or
-        (m, 4) tetrahedra: zero-based node indices in either orientation (clockwise cells are turned round); `tags` maps
-        a name to boundary facets, given either as their nodes, (t, d) integers in any order, or as indices (t,) into
-        the resulting `facets`.
+        **Arguments**: `points` (n, 2) or (n, 3): coordinates in metres; `cells`: zero-based node indices of triangles
+        (m, 3), in the plane or in space, or of tetrahedra (m, 4), in either orientation; `tags`: names of groups of
+        boundary facets, each given by the facets' nodes, (t, d) integers in any order, or by indices (t,) into the
+        resulting `facets`.
 
-        In 2-D each loop of `facets` starts at its lowest-numbered node; the outer loop runs
-        counter-clockwise, holes clockwise; of a surface in space the longest loop comes first. A closed surface faces
-        outward, an open one to the side that most of its triangles gave. `points` may be traced by JAX: the checks on
-        values are then skipped and the cells are taken to be positively oriented already.
+        In 2-D each loop of `facets` starts at its node of the lowest index; the outer loop runs counter-clockwise,
+        holes clockwise. For a surface in space the longest loop comes first. The triangles of a closed surface are
+        oriented outward, those of an open surface the way most of them are given. `points` may be traced by JAX; then
+        checks of their values are skipped, and the cells must already be positively oriented.
 
-        Raises `ValueError` if the arrays have the wrong shape or type, hold NaN or indices out of range,
-        or describe a mesh with degenerate, duplicated or overlapping cells, unused or coinciding nodes,
-        facets shared by three cells, or several separate parts; a surface with one side only, or one that touches or
-        crosses itself. Warns of a closed surface that came inside out, and if the extent exceeds 10 m, which
-        almost always means millimetres.
+        Raises `ValueError` if arrays have the wrong shape or type, or contain NaN or indices out of range; if the mesh
+        has degenerate, duplicated or overlapping cells, unused or coincident nodes, facets shared by three cells, or
+        several disconnected parts; and if a surface is one-sided, or touches or crosses itself. Warns if all triangles
+        of a closed surface face inwards, and if the extent exceeds 10 m, which usually means that coordinates are in
+        millimetres.
         """
         if not has_values(cells):
             raise ValueError(

@@ -1,5 +1,4 @@
-"""Check of sizes: those of more than ten metres are nearly always in another unit, and warned of once, where they are
-given."""
+"""Warning about sizes above ten metres, which are nearly always given in another unit."""
 
 from __future__ import annotations
 
@@ -9,13 +8,14 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 LARGE = 10.0
-"""Metres. No tank or skin is larger."""
+"""Size in metres above which a warning is given: no tank or skin is larger."""
 _CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
 
 
 @contextmanager
 def size_checked() -> Iterator[None]:
-    """Within it no size is warned of: meshes of a body or of another mesh, whose own size was. Decorates functions."""
+    """Context, or decorator of a function, in which sizes are not warned about: for meshes made from a body or another
+    mesh, whose size has been checked before."""
     before = _CHECKED.set(True)
     try:
         yield
@@ -24,8 +24,11 @@ def size_checked() -> Iterator[None]:
 
 
 def warn_large(extent: float, name: str, across: float = 1.0, *, of_file: bool = False) -> None:
-    """Warn if a length in metres, of something `across` times as large, looks like one of another unit, unless a
-    warning was given already; `of_file`: where it may come from a file, which can be read in its own unit."""
+    """Warn if a length of `extent` metres is probably in another unit, because the object is too large.
+
+    `across`: size of the object divided by this length; `of_file`: whether the length may come from a file, for which
+    the message suggests a scale. Inside `size_checked` there is no warning.
+    """
     if not across * extent > LARGE or _CHECKED.get():
         return
     scale = [f" (a file is read with scale={one})" if of_file else "" for one in ("1e-3", "1e-2", "0.0254")]

@@ -1,4 +1,4 @@
-"""`Solid` and `OwnMesh`: bodies other than a plane outline."""
+"""`Solid` and `OwnMesh`: bodies that are not plane outlines."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jeit_solvers.engines import as_array
 
 
 class Solid(Body):
-    """Solid that stands upright above a plane outline, from z = 0 up to `thickness`, metres: a tank, a box, a layer.
+    """An upright solid above a plane outline, from z = 0 to `thickness` metres: a tank, a box, a layer.
 
     `Solid(Disk(radius), height)` is a cylinder, `Solid(Rectangle(width, depth), height)` a box.
     """
@@ -26,28 +26,28 @@ class Solid(Body):
     thickness: float
 
     def __init__(self, outline: Domain, thickness: float):
-        """Raises `ValueError` for what is no outline, and a thickness that is not positive."""
+        """Raises `ValueError` if `outline` is not an outline, or the thickness is not positive."""
         check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
         self.outline, self.thickness = outline, check_length("thickness", thickness)
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Bounding box of the outline."""
+        """Bounding box of the outline, (x_min, x_max, y_min, y_max) in metres."""
         return self.outline.extent
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """None: electrodes on a solid do not follow each other along an edge."""
+        """Empty, because a solid has no edge along which electrodes follow each other."""
         return ()
 
     def describe(self) -> dict[str, Any]:
-        """The outline, and the thickness."""
+        """Description of the outline, and the thickness."""
         return {**self.outline.describe(), "thickness": float(self.thickness)}
 
     @size_checked()
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
-        """Layers of tetrahedra above a mesh of the outline, about as high as its cells are wide; see `jeit.mesh.box`.
+        """Mesh the solid with layers of tetrahedra that are about as high as the cells of the outline's mesh are wide.
 
-        Tags: 'bottom', 'top', 'side', and those of the outline's mesh. Raises as `jeit.mesh.box`.
+        Tags: 'bottom', 'top', 'side', and those of the outline's mesh. Raises `ValueError` as `jeit.mesh.box` does.
         """
         from jeit.mesh.solids import choose_layers, in_plane, layer
 
@@ -58,32 +58,32 @@ class Solid(Body):
 
 
 class OwnMesh(Body):
-    """A body that comes as a mesh, and is imaged on it as it is."""
+    """A body given as a mesh, which is used without remeshing."""
 
     given: Mesh
 
     def __init__(self, given: Mesh):
-        """Raises `ValueError` for what is no mesh."""
+        """Raises `ValueError` if `given` is not a mesh."""
         check_kind("given", given, Mesh, "a Mesh, such as jeit.mesh.read('tank.msh', scale=1e-3)")
         self.given = given
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Bounding box of the nodes."""
+        """Bounding box of the nodes seen from above, (x_min, x_max, y_min, y_max) in metres."""
         points = np.asarray(self.given.points)[:, :2]
         (x_min, y_min), (x_max, y_max) = points.min(axis=0), points.max(axis=0)
         return float(x_min), float(x_max), float(y_min), float(y_max)
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """The edges of a plane mesh; none of a solid one, or of a surface in space."""
+        """Vertices of the boundary loops of a plane mesh; empty for a solid, and for a surface in space."""
         if self.given.space_dimension == 3:
             return ()
         points, facets = np.asarray(self.given.points), np.asarray(self.given.facets)
-        begins = np.flatnonzero(facets[1:, 0] != facets[:-1, 1]) + 1  # facets follow each other, loop after loop
+        begins = np.flatnonzero(facets[1:, 0] != facets[:-1, 1]) + 1  # facets are ordered head to tail, loop by loop
         return tuple(as_array(points[loop[:, 0]]) for loop in np.split(facets, begins))
 
     def describe(self) -> dict[str, Any]:
-        """Dimension, nodes and cells."""
+        """Dimensions, and numbers of nodes and cells."""
         return {
             "shape": "mesh",
             "dimension": self.given.dimension,
@@ -93,12 +93,12 @@ class OwnMesh(Body):
         }
 
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
-        """The mesh itself, whatever is asked for."""
+        """The given mesh; all arguments are ignored."""
         return self.given
 
 
 def as_body(given: Body | Mesh) -> Body:
-    """A body, or a mesh as one. Raises `ValueError` for something else."""
+    """Convert a mesh to a body; a body is returned unchanged. Raises `ValueError` for anything else."""
     if isinstance(given, Mesh):
         return OwnMesh(given)
     check_kind("domain", given, Body, "an outline such as Disk(0.05), a Solid, or a Mesh")

@@ -1,4 +1,4 @@
-"""Meshes of solid bodies, and of the surfaces of spheres, caps and tubes."""
+"""Meshes of plane shapes (`disk`, `rectangle`, `polygon`) and of solids above them (`layer`, `box`, `cylinder`)."""
 
 from __future__ import annotations
 
@@ -26,20 +26,19 @@ def disk(
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh of a disk of `radius` metres; its boundary nodes lie on the circle.
+    """Mesh a disk of `radius` metres; its boundary nodes lie on the circle.
 
-    Without refinement the mesh is made of concentric rings, and node 0 lies at angle 0. Otherwise it is
-    unstructured, and node 0 is the first boundary node counter-clockwise from angle 0.
+    Without refinement the mesh consists of concentric rings, and node 0 lies at angle 0. Otherwise it is unstructured,
+    and node 0 is the first boundary node counter-clockwise from angle 0.
 
-    **Arguments**: `num_points`, number of nodes, met within about 5 % (1,200 if nothing is said), or
-    `cell_size`, edge length in metres; `centre` (x, y) in metres; `refine`, see `Refine`: one, several, or a function
-    that takes points (p, 2) and returns the edge length wanted there (p,) in metres (with `num_points`, up to a common
-    factor); `num_boundary`, number of nodes on the circle, cells growing from there inwards;
-    `boundary_points`, angles in radians at which there must be nodes; `interior_points` (k, 2), places in metres
-    at which there must be nodes.
+    **Arguments**: `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in
+    metres; `centre` (x, y): in metres; `refine`: one or several `Refine`, or a function that takes points (p, 2) and
+    returns the requested edge lengths there (p,) in metres, which are scaled by a common factor if `num_points` is
+    given; `num_boundary`: number of nodes on the circle, from which cells grow inwards; `boundary_points`: angles in
+    radians at which nodes are placed; `interior_points` (k, 2): positions in metres at which nodes are placed.
 
-    The mesh is the polygon inscribed in the circle: with N boundary nodes its area falls short by the fraction
-    (2 π² / 3) / N². Every angle is at least 25°. Raises `ValueError` on bad or contradicting arguments.
+    The mesh is a polygon inscribed in the circle: with N boundary nodes, the relative deficit of its area is (2 π² / 3)
+    / N². Every angle is at least 25°. Raises `ValueError` for invalid or contradictory arguments.
     """
     return Disk(radius, centre).mesh(
         num_points=num_points,
@@ -62,11 +61,11 @@ def rectangle(
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh of a rectangle of `width` (along x) by `height` (along y) metres.
+    """Mesh a rectangle of `width` (along x) by `height` (along y) metres.
 
-    Without refinement the mesh is made of rows of nearly equilateral cells. Node 0 is the lower left corner. The sides
-    are tagged 'left', 'right', 'bottom', 'top'. `boundary_points` are arc lengths in metres, counter-clockwise from
-    the lower left corner; the other arguments are those of `disk`, and so are the errors.
+    Without refinement the mesh consists of rows of nearly equilateral cells. Node 0 is the lower left corner. The sides
+    are tagged 'left', 'right', 'bottom', 'top'. `boundary_points` are arc lengths in metres, counter-clockwise from the
+    lower left corner; the other arguments and the errors raised are those of `disk`.
     """
     return Rectangle(width, height, centre).mesh(
         num_points=num_points,
@@ -87,13 +86,13 @@ def polygon(
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh of the inside of a simple polygon with `vertices` (k, 2) in metres, outside its `holes`.
+    """Mesh the inside of a simple polygon with `vertices` (k, 2) in metres, without its `holes`.
 
-    The vertices are nodes, the first of them node 0. Every angle is at least 25°, except the polygon's own sharper
-    corners, each of which is cut off as one cell with two equal sides. `boundary_points` are arc lengths in metres
-    along the outer outline, counter-clockwise from the first vertex; the other arguments are those of `disk`.
+    The vertices are nodes, the first vertex is node 0. Every angle is at least 25°, except at sharper corners of the
+    polygon, each of which is cut off by a single isosceles cell. `boundary_points` are arc lengths in metres along the
+    outer outline, counter-clockwise from the first vertex; the other arguments are those of `disk`.
 
-    Raises `ValueError` on an outline that is not simple, and on bad or contradicting arguments.
+    Raises `ValueError` for an outline that is not simple, and for invalid or contradictory arguments.
     """
     return Polygon(vertices, holes).mesh(
         num_points=num_points,
@@ -107,8 +106,8 @@ def polygon(
 def stacked_cells(cells: np.ndarray, count: int, num_layers: int) -> np.ndarray:
     """Tetrahedra (3 m num_layers, 4) of the prisms above triangles (m, 3); node k · count + i is node i after k layers.
 
-    Every prism is cut along the diagonals that rise from its lower-numbered to its higher-numbered node, so that
-    neighbours agree.
+    Every prism is divided along the diagonals that rise from its lower-numbered to its higher-numbered node, so that
+    the tetrahedra of neighbouring prisms match.
     """
     a, b, c = np.sort(cells.astype(np.int64), axis=1).T
     up = count
@@ -124,28 +123,28 @@ def stacked_cells(cells: np.ndarray, count: int, num_layers: int) -> np.ndarray:
 
 
 def stacked_wall(edges: np.ndarray, count: int, num_layers: int) -> np.ndarray:
-    """Triangles (2 e num_layers, 3) of the wall above edges (e, 2), cut as the prisms are."""
+    """Triangles (2 e num_layers, 3) of the wall above edges (e, 2), divided like the prisms in `stacked_cells`."""
     low, high = np.sort(edges.astype(np.int64), axis=1).T
     lower = np.stack([low, high, high + count], axis=1)
     upper = np.stack([low, low + count, high + count], axis=1)
     return np.concatenate([face + k * count for k in range(num_layers) for face in (lower, upper)])
 
 
-# In a solid 'bottom' and 'top' are the faces across z, so the sides of a rectangle across y get new names.
+# In a solid, 'bottom' and 'top' are the horizontal faces, so the sides of a rectangle with these names are renamed.
 _RENAMED = {"bottom": "front", "top": "back"}
 
 
 def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLike | None = None) -> Mesh:
-    """A plate: a plane mesh times [0, thickness], its prisms cut into three tetrahedra each.
+    """Extrude a plane mesh to a plate from z = 0 to `thickness` metres; each prism is divided into three tetrahedra.
 
-    Node k · n + i is node i of the plane mesh at height z = k · thickness / num_layers, or at the k-th of `heights` if
-    those are given, from 0 to the thickness. Tags: 'bottom' (z = 0),
-    'top' (z = thickness), 'side', and those of the plane mesh as parts of the side; its 'bottom' and 'top'
-    (across y) are then called 'front' and 'back'.
+    Node k · n + i is node i of the plane mesh at the height z = k · thickness / num_layers, or at the k-th of
+    `heights`, which rise from 0 to the thickness. Tags: 'bottom' (z = 0), 'top' (z = thickness), 'side', and the tags
+    of the plane mesh for the parts of the side above its edges; tags 'bottom' and 'top' of the plane mesh are renamed
+    to 'front' and 'back'.
 
-    Every prism is cut along the diagonals that rise from its lower-numbered to its higher-numbered node, so that
-    neighbours agree. Raises `ValueError` on a solid mesh, a thickness that is not positive, no layers, or
-    heights that do not rise from 0 to the thickness.
+    Every prism is divided along the diagonals that rise from its lower-numbered to its higher-numbered node, so that
+    the tetrahedra of neighbouring prisms match. Raises `ValueError` for a mesh that is not plane, a thickness that is
+    not positive, no layers, or heights that do not rise from 0 to the thickness.
     """
     if mesh.is_surface:
         raise ValueError(
@@ -202,12 +201,12 @@ def box(
     num_layers: int | None = None,
     refine: Refinement = None,
 ) -> Mesh:
-    """Mesh of a box of `width` (x) by `depth` (y) by `height` (z) metres, centred at x = y = 0, from z = 0 up.
+    """Mesh a box of `width` (x) by `depth` (y) by `height` (z) metres, centred at x = y = 0, from z = 0 up.
 
-    Give `num_points`, the number of nodes (4,000 by default; met within about 10 %), or `cell_size` in metres;
-    `num_layers` along z follows from them unless given. `refine` as in `jeit.mesh.disk`, seen from above. Tags: 'left',
-    'right' (across x), 'front', 'back' (across y), 'bottom', 'top' (across z), and 'side'. Raises `ValueError` on bad
-    or contradicting arguments.
+    Give `num_points`, the number of nodes (default 4,000, met within about 10 %), or `cell_size` in metres;
+    `num_layers` along z is derived from them unless given. `refine` is that of `jeit.mesh.disk`, as seen from above.
+    Tags: 'left', 'right' (across x), 'front', 'back' (across y), 'bottom', 'top' (across z), and 'side'. Raises
+    `ValueError` for invalid or contradictory arguments.
     """
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
@@ -228,12 +227,12 @@ def cylinder(
     num_boundary: int | None = None,
     boundary_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh of an upright cylinder of `radius` and `height` metres around the z axis, from z = 0 up.
+    """Mesh an upright cylinder of `radius` and `height` metres around the z axis, from z = 0 up.
 
-    Give `num_points`, the number of nodes (4,000 by default; met within about 10 %), or `cell_size` in metres;
-    `num_layers` along z follows from them unless given. `refine`, `num_boundary` and `boundary_points` (angles) as in
-    `jeit.mesh.disk`, seen from above. Tags: 'bottom', 'top', 'side'. Raises `ValueError` on bad or contradicting
-    arguments.
+    Give `num_points`, the number of nodes (default 4,000, met within about 10 %), or `cell_size` in metres;
+    `num_layers` along z is derived from them unless given. `refine`, `num_boundary` and `boundary_points` (angles) are
+    those of `jeit.mesh.disk`, as seen from above. Tags: 'bottom', 'top', 'side'. Raises `ValueError` for invalid or
+    contradictory arguments.
     """
     radius, height = check_length("radius", radius, 2), check_length("height", height)
     base_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)
@@ -250,21 +249,22 @@ def cylinder(
 
 
 def in_plane(area: float, height: float, num_layers: int | None) -> Callable[[int], int]:
-    """Number of a solid's nodes in its base."""
+    """Function that returns how many nodes the base of a solid has, given the number of nodes of the solid."""
     return lambda number: choose_layers(area, height, number, None, num_layers)[0] or number
 
 
 def choose_layers(
     area: float, height: float, num_points: int | None, cell_size: float | None, num_layers: int | None
 ) -> tuple[int | None, int]:
-    """Nodes of the base of `area` m² (None if a cell size is given), and number of layers up to `height` metres."""
+    """Number of nodes of the base of `area` m² (None if a cell size is given), and number of layers up to `height`
+    metres."""
     target = unstructured.Target.create(num_points, cell_size)
     if num_layers is not None:
         num_layers = unstructured.check_count("num_layers", num_layers, 1)
     if target.cell_size is not None:
         return None, num_layers or max(1, round(height / target.cell_size))
     number = target.num_points if target.asked else 4000
-    # Of n nodes with spacing h in the plane and along z: n = (1.1 A / h² ) (H / h + 1).
+    # With spacing h in the plane and along z, the number of nodes is n = (1.1 A / h²) (H / h + 1).
     if num_layers is None:
         spacing = np.cbrt(1.1 * area * height / number)
         for _ in range(20):

@@ -1,4 +1,4 @@
-"""The topology of meshes: edges, faces, neighbours, and loops of boundary edges."""
+"""Topology of meshes: facets of cells, neighbouring cells and boundary loops; and geometric checks of polygon loops."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-# Facets of a positively oriented simplex, each with the simplex on its left (2-D) or its normal outward (3-D).
+# Facets of a positively oriented simplex, each with the simplex on its left (2-D) or with an outward normal (3-D).
 LOCAL_FACETS = {
     2: np.array([[0, 1], [1, 2], [2, 0]]),
     3: np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]),
@@ -15,13 +15,13 @@ LOCAL_FACETS = {
 
 
 def cell_facets(cells: np.ndarray) -> np.ndarray:
-    """All facets of all cells, (m (d + 1), d), cell after cell, oriented outward."""
+    """All facets (m (d + 1), d) of all cells, in the order of the cells, oriented outward."""
     dimension = cells.shape[1] - 1
     return cells[:, LOCAL_FACETS[dimension]].reshape(-1, dimension)
 
 
 def facet_keys(facets: np.ndarray, num_points: int) -> np.ndarray:
-    """One integer per facet that does not depend on the order of its nodes."""
+    """One integer per facet, independent of the order of its nodes."""
     key = np.zeros(len(facets), dtype=np.int64)
     for column in np.sort(facets.astype(np.int64), axis=1).T:
         key = key * num_points + column
@@ -29,7 +29,7 @@ def facet_keys(facets: np.ndarray, num_points: int) -> np.ndarray:
 
 
 def odd_permutation(facets: np.ndarray) -> np.ndarray:
-    """True where sorting the nodes of a facet reverses its orientation."""
+    """Whether sorting the nodes of each facet reverses its orientation."""
     if facets.shape[1] == 2:
         return facets[:, 0] > facets[:, 1]
     a, b, c = facets.T
@@ -37,7 +37,8 @@ def odd_permutation(facets: np.ndarray) -> np.ndarray:
 
 
 def match_facets(facets: np.ndarray, num_points: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows of `facets` with the same nodes, in pairs (first, second), and three of one facet if any occurs so often."""
+    """Pairs of rows of `facets` with the same nodes, as (first, second, crowded). If a facet occurs three times,
+    `crowded` contains its rows, and no pairs are returned."""
     key = facet_keys(facets, num_points)
     order = np.argsort(key, kind="stable")
     ordered = key[order]
@@ -50,10 +51,10 @@ def match_facets(facets: np.ndarray, num_points: int) -> tuple[np.ndarray, np.nd
 
 
 def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Interior facets as pairs of rows of `cell_facets`, and the rows that have no partner.
+    """Interior facets as pairs of rows of `cell_facets`, and the rows of boundary facets, as (first, second, single).
 
-    Returns (first, second, single). Raises `ValueError` if a facet belongs to more than two cells, or if
-    the two cells of a facet lie on the same side of it.
+    Raises `ValueError` if a facet belongs to more than two cells, or if the two cells of a facet lie on the same side
+    of it.
     """
     facets = cell_facets(cells)
     width = cells.shape[1]
@@ -78,11 +79,10 @@ def pair_facets(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def order_loops(facets: np.ndarray, points: np.ndarray | None) -> np.ndarray:
-    """Boundary edges of triangles sorted head to tail, loop after loop, the outer loop first.
+    """Sort the boundary edges of triangles head to tail, one loop after the other, the outer loop first.
 
-    Each loop starts at its lowest-numbered node. The outer loop is the one that encloses a positive area; where
-    `points` are not known, that of most edges, and of a surface in space, the longest one. Raises `ValueError` where
-    loops meet in a node.
+    Each loop starts at its node of the lowest index. The outer loop is the loop with positive area; without `points`,
+    the loop with the most edges; for a surface in space, the longest loop. Raises `ValueError` if loops meet in a node.
     """
     start, counts = np.unique(facets[:, 0], return_counts=True)
     if np.any(counts > 1):
@@ -114,12 +114,13 @@ def signed_area(outline: np.ndarray) -> float:
     return 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
 
 
-# Pairs of sides that are compared at once.
+# Maximum number of pairs of sides that are compared at once.
 _PAIRS = 250_000
 
 
 def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray:
-    """Vertices (k, 2) of a simple loop turned the way asked, its first vertex kept; `ValueError` if it is none."""
+    """Check that vertices (k, 2) form a simple loop, and orient it as requested, keeping the first vertex. Raises
+    `ValueError` if they do not."""
     try:
         loop = np.asarray(vertices, dtype=float)
     except (TypeError, ValueError) as error:
@@ -147,7 +148,7 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
 
 
 def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
-    """Raise `ValueError` unless every hole lies inside the outline and apart from the others."""
+    """Raise `ValueError` unless every hole lies inside the outline and separate from the others."""
     for k, hole in enumerate(holes):
         if not inside(hole, [outer]).all() or _touching(hole, outer):
             raise ValueError(f"holes[{k}]: does not lie strictly inside the outline. Move or shrink it.")
@@ -157,7 +158,7 @@ def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
 
 
 def inside(points: np.ndarray, loops: Sequence[np.ndarray]) -> np.ndarray:
-    """True for points (p, 2) inside an odd number of loops (even-odd rule), (p,)."""
+    """Whether points (p, 2) lie inside an odd number of loops (even-odd rule), as booleans (p,)."""
     result = np.zeros(len(points), bool)
     x, y = points.T
     for loop in loops:
@@ -169,7 +170,8 @@ def inside(points: np.ndarray, loops: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def along(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
-    """Arc length (p,) from the first vertex of a loop to where it comes nearest to points (p, 2)."""
+    """Arc length (p,) from the first vertex of a loop to the point of the loop that is nearest to each of points (p,
+    2)."""
     sides = np.roll(loop, -1, axis=0) - loop
     offset = points[:, None] - loop
     fraction = np.clip((offset * sides).sum(-1) / (sides**2).sum(-1), 0.0, 1.0)
@@ -179,7 +181,7 @@ def along(points: np.ndarray, loop: np.ndarray) -> np.ndarray:
 
 
 def distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distance (p, s) of points (p, 2) from segments given by `start` and `end` (s, 2)."""
+    """Distances (p, s) of points (p, 2) from segments with end points `start` and `end` (s, 2)."""
     along = end - start
     offset = points[:, None] - start
     fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
@@ -191,8 +193,8 @@ def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def _meeting(first: np.ndarray, second: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
-    """Pairs (p, 2) of a side of one loop and a side of another that cross or come within `tolerance` of each other, in
-    order, some at a time: only sides whose boxes do are looked at, and never all with all at once."""
+    """Yield, in order and in batches, pairs (p, 2) of a side of the first loop and a side of the second that cross or
+    come within `tolerance` of each other. Only sides whose bounding boxes overlap are tested."""
     a, b, c, d = first, np.roll(first, -1, axis=0), second, np.roll(second, -1, axis=0)
     low, high = np.minimum(a, b) - tolerance, np.maximum(a, b) + tolerance
     other_low, other_high = np.minimum(c, d), np.maximum(c, d)
@@ -206,14 +208,15 @@ def _meeting(first: np.ndarray, second: np.ndarray, tolerance: float) -> Iterato
 
 
 def _meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, tolerance: float) -> np.ndarray:
-    """Whether each segment from a to b crosses or comes within `tolerance` of that from c to d, all (p, 2)."""
+    """Whether each segment from a to b crosses the segment from c to d or comes within `tolerance` of it; all (p,
+    2)."""
     crosses = (_turn(a, b, c) * _turn(a, b, d) < 0) & (_turn(c, d, a) * _turn(c, d, b) < 0)
     near = (_apart(a, c, d) <= tolerance) | (_apart(b, c, d) <= tolerance)
     return crosses | near | (_apart(c, a, b) <= tolerance) | (_apart(d, a, b) <= tolerance)
 
 
 def _apart(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Distance (p,) of each of points (p, 2) from its own segment."""
+    """Distance (p,) of each of points (p, 2) from the segment of the same index."""
     along, offset = end - start, points - start
     fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
     return np.linalg.norm(offset - fraction[:, None] * along, axis=-1)
@@ -226,7 +229,7 @@ def _first_crossing(loop: np.ndarray) -> tuple[int, int] | None:
         others = pairs[(apart > 1) & (apart < count - 1)]
         if len(others):
             return int(others[0].min()), int(others[0].max())
-    # Neighbouring sides share a vertex and can only meet elsewhere by folding back onto each other.
+    # Neighbouring sides share a vertex, and can overlap elsewhere only by folding back onto each other.
     before, after = np.roll(loop, 1, axis=0) - loop, np.roll(loop, -1, axis=0) - loop
     cosine = (before * after).sum(1) / (np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1))
     folded = np.flatnonzero(cosine > 1 - 1e-12)

@@ -1,8 +1,8 @@
-"""Pictures, with matplotlib: meshes, images, solids and surfaces in space, electrodes, sensitivity, taxels, layouts,
-voltages, microphones, touches, contacts, self-organising maps, damage, gestures in time, depths.
+"""Plots with matplotlib: meshes, images, solids and surfaces in space, electrodes, sensitivity, voltages, series of
+frames, and choices of the hyperparameter.
 
-Every function takes `ax`, makes a figure of its own where none is given, and returns the axes it drew on. Lengths are
-in metres in the arguments and in millimetres in the pictures.
+Most functions take `ax`, create a new figure if it is not given, and return the axes. Lengths are in metres in the
+arguments and in millimetres in the plots.
 """
 
 from __future__ import annotations

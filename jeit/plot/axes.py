@@ -1,4 +1,4 @@
-"""Axes, scale bars and colour scales that all pictures share."""
+"""Axes, scale bars and colour scales shared by all plots."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from jeit.arguments import check_kind, describe, is_number
 
 INK = "#26292e"
 SOFT = "#8b9098"
-# Red is more conductive, blue more resistive; white is no change.
+# Colour map of changes: red is more conductive, blue more resistive, and white no change.
 DIVERGING = "RdBu_r"
 SEQUENTIAL = "viridis"
-# Colours of series drawn side by side: up to six methods.
+# Colours of curves in one plot, at most six.
 SERIES_COLOURS = ("#1f6fb4", "#d1495b", "#2a9d6f", "#8a5cb8", "#d98a1c", "#5b6470")
 SERIES_MARKERS = ("o", "s", "^", "D", "v", "P")
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 
 
 def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes:
-    """`ax`, or the axes of a new pyplot figure of `size` inches."""
+    """Return `ax`, or, if it is None, the axes of a new pyplot figure of `size` inches."""
     if ax is not None:
         return ax
     from matplotlib import pyplot
@@ -34,13 +34,13 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes
     return pyplot.subplots(figsize=size, layout="constrained")[1]
 
 
-# Distance of numbers from a body, and length of a digit in a small picture, over the size of the body.
+# Distance of numbers from a body, and width of a digit in a small picture, divided by the size of the body.
 _AWAY, _LETTER = 0.04, 0.021
 
 
 def bare(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
-    """Equal scales, no frame and no ticks; round the `extent` (metres) room for a scale bar and, if electrodes are
-    `numbered`, for that: as much as numbers that begin beside it are long."""
+    """Set equal scales, and remove frame and ticks. Around the `extent` (metres), space is left for a scale bar and, if
+    electrodes are `numbered`, for their numbers, as much as the longest text beside the body needs."""
     x_min, x_max, y_min, y_max = extent
     size = max(x_max - x_min, y_max - y_min)
     room = (0.12 if numbered else 0.06) * size
@@ -57,26 +57,26 @@ def bare(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool 
 
 
 def extent_of(points: np.ndarray) -> tuple[float, float, float, float]:
-    """(x_min, x_max, y_min, y_max) of points (n, 2 or 3)."""
+    """Extent (x_min, x_max, y_min, y_max) of points (n, 2) or (n, 3)."""
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     return (low[0], high[0], low[1], high[1])
 
 
 def soften_axes(ax: Axes) -> None:
-    """Style the axes of a graph: lines at the left and below only, in grey, and labels of the ticks in ink."""
+    """Style the axes of a graph: spines only at the left and at the bottom, in grey, and dark tick labels."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_color(SOFT)
     ax.tick_params(color=SOFT, labelcolor=INK, which="both")
 
 
 def draw_horizontal_grid(ax: Axes) -> None:
-    """Faint lines behind what is drawn, to read heights by."""
+    """Draw faint horizontal grid lines behind the plot."""
     ax.grid(axis="y", color="#e6e8eb", linewidth=0.6)
     ax.set_axisbelow(True)
 
 
 def draw_legend_above(ax: Axes) -> None:
-    """A legend in room of its own above what is drawn from zero up, whatever that is."""
+    """Draw a legend above the curves; the y axis begins at zero, and its upper limit is raised to make room."""
     entries = len(ax.get_legend_handles_labels()[1])
     ax.autoscale_view()
     ax.set_ylim(0, ax.get_ylim()[1] * (1.02 + 0.08 * entries))
@@ -84,7 +84,7 @@ def draw_legend_above(ax: Axes) -> None:
 
 
 def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
-    """A bar of a round length, about a quarter of the picture, below its lower left corner."""
+    """Draw a scale bar of a round length, about a quarter of the width of the picture, below its lower left corner."""
     x_min, x_max, y_min, y_max = extent
     size = max(x_max - x_min, y_max - y_min)
     length = _round_down(0.27 * (x_max - x_min))
@@ -98,7 +98,8 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
 def draw_colour_bar(
     ax: Axes, drawn: ScalarMappable, label: str, *, signed: bool = False, place: Axes | None = None
 ) -> None:
-    """A slim colour bar at the right, or on the axes `place`; its ticks signed if the quantity is a difference."""
+    """Draw a slim colour bar at the right of `ax`, or on the axes `place`; `signed`: whether tick labels have a sign,
+    for differences."""
     where: dict[str, Any] = {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if place is None else {"cax": place}
     bar = ax.figure.colorbar(drawn, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **where)
     if signed:
@@ -111,7 +112,8 @@ def draw_colour_bar(
 
 
 def prefixed(largest: float, unit: str) -> tuple[float, str]:
-    """Factor to multiply values of up to `largest` with, and the unit with its SI prefix: (1e3, "mS")."""
+    """Choose the SI prefix for values up to `largest`; return the factor to multiply values with, and the unit with its
+    prefix, such as (1e3, "mS")."""
     if not unit or unit == "%" or not (math.isfinite(largest) and largest > 0):
         return 1.0, unit
     exponent = 3 * math.floor(math.log10(largest) / 3 + 1e-9)
@@ -129,16 +131,16 @@ class ColourScale(eqx.Module):
 
     **Fields**
 
-    - `difference`: values are changes, drawn on a diverging map centred at zero; otherwise on a perceptually uniform
-      sequential one, from the least to the greatest.
-    - `quantity`: label of the colour bar, the conductivity or its change unless given.
-    - `unit`: of the values, that of the conductivity unless given ("S" of a sheet, "S/m" of a body), "" for none; the
-      colour bar finds the prefix.
-    - `limit`: value at the end of the colour bar, in `unit`; the largest magnitude drawn unless given.
-    - `colour_map`: name of a matplotlib colour map, for another than the two.
+    - `difference`: whether values are changes, drawn with a diverging colour map centred at zero; otherwise, they are
+      drawn with a perceptually uniform sequential colour map from the minimum to the maximum.
+    - `quantity`: label of the colour bar; default: conductivity or its change.
+    - `unit`: unit of the values, "" for none; default: that of conductivity ("S" for a sheet, "S/m" for a body). The
+      colour bar adds an SI prefix.
+    - `limit`: value at the end of the colour bar, in `unit`; default: the maximum magnitude.
+    - `colour_map`: name of a matplotlib colour map to use instead of these.
     - `bar`: whether to draw the colour bar.
 
-    Raises `ValueError` for a limit that is not a finite number from zero up.
+    Raises `ValueError` for a limit that is negative or not finite.
     """
 
     difference: bool = True
@@ -153,7 +155,7 @@ class ColourScale(eqx.Module):
             raise ValueError(f"limit must be finite and positive, in the values' unit; it is {describe(self.limit)}.")
 
     def of(self, values: np.ndarray, unit: str) -> "FittedScale":
-        """The scale for `values` (any shape), without NaN, whose unit is `unit` unless this scale has one.
+        """Fit the scale to `values` of any shape; `unit`: their unit, if this scale has none.
 
         Raises `ValueError` for values that are not finite.
         """
@@ -177,7 +179,8 @@ class ColourScale(eqx.Module):
 
 
 class FittedScale(eqx.Module):
-    """A scale for certain values: the `factor` to the unit on the colour bar, its `label`, matplotlib's `keywords`."""
+    """A colour scale fitted to values. **Fields**: `factor`: conversion of values to the unit of the colour bar;
+    `label`: of the colour bar; `keywords`: arguments of matplotlib functions; `scale`: the original scale."""
 
     factor: float
     label: str
@@ -185,13 +188,13 @@ class FittedScale(eqx.Module):
     scale: ColourScale
 
     def draw_bar(self, ax: Axes, drawn: ScalarMappable) -> None:
-        """The colour bar of what was drawn beside `ax`, where the scale has one."""
+        """Draw the colour bar of the mappable `drawn` beside `ax`, unless the scale has none."""
         if self.scale.bar:
             draw_colour_bar(ax, drawn, self.label, signed=self.scale.difference)
 
 
 def check_scale(scale: ColourScale) -> None:
-    """Raises `ValueError` for what is no `ColourScale`."""
+    """Check that `scale` is a `ColourScale`. Raises `ValueError` otherwise."""
     check_kind("scale", scale, ColourScale, "a ColourScale, such as ColourScale(colour_map='viridis')")
 
 

@@ -1,4 +1,4 @@
-"""Protocols: which currents are driven and which voltages are read, as matrices with names and units."""
+"""Protocols: matrices of driven currents and of measured voltages, with names and units."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Protocols that drive all electrodes at once, by matrices of patterns, and potentials against ground.
+"""Protocols with drive patterns that use all electrodes at once, from matrices or named families, and readings of the
+potentials of all electrodes.
 
-Every one of them can read the potentials as `jeit.protocol.measurement_patterns` says. They count electrodes along a
-ring, or as a solid's electrodes are numbered: any L - 1 independent patterns determine the transfer impedance, and with
-it what every other protocol would read (`jeit.data.driven_by`).
+Each of the named protocols can measure the potentials in any of the ways of `measurement_patterns`. Electrodes are
+numbered along a ring, or in any order on a solid. Any L - 1 independent drive patterns determine the transfer
+impedance, and with it the voltages of every other protocol (`jeit.data.driven_by`).
 """
 
 from __future__ import annotations
@@ -27,19 +28,20 @@ from jeit_solvers.engines import has_values
 
 Reading = Literal["adjacent", "mean", "mean-removed", "against"]
 READINGS = ("adjacent", "mean", "mean-removed", "against")
-"""What can be read of the potentials of all electrodes."""
+"""Ways to measure the potentials of all electrodes."""
 
 
 def measurement_patterns(num_electrodes: int, measurement: Reading, reference: int | None = None) -> np.ndarray:
     """Measurement patterns (K, L) for the potentials of all electrodes.
 
     - "adjacent": each electrode against the next, K = L; their sum is zero for every body.
-    - "mean-removed": each potential less the mean of all, K = L, as instruments publish that drive every electrode;
-      their sum is zero too, so that L potentials hold L - 1 facts.
-    - "mean": each against the mean of all others, L / (L - 1) times as large.
-    - "against": each against electrode `reference` (0-based; the last unless given), K = L - 1.
+    - "mean-removed": each potential minus the mean of all, K = L, as published for instruments that drive every
+      electrode; their sum is also zero, so only L - 1 of the L values are independent.
+    - "mean": each potential minus the mean of all others, K = L; L / (L - 1) times the "mean-removed" values.
+    - "against": each electrode against electrode `reference` (0-based, by default the last), K = L - 1.
 
-    Raises `ValueError` for a bad count or option, and for a `reference` that has no use or does not exist.
+    Raises `ValueError` for an invalid count or option, and for a `reference` that does not exist or is given for
+    another `measurement` than "against".
     """
     count = check_count(num_electrodes, "measurement_patterns", 2)
     check_choice(measurement, READINGS, "measurement_patterns", "measurement")
@@ -64,17 +66,16 @@ def from_matrices(
     name: str = "custom",
     large_currents: bool = False,
 ) -> Protocol:
-    """Every drive pattern crossed with every measurement pattern, drive by drive.
+    """Combine every drive pattern with every measurement pattern, drive by drive.
 
     - `drive`: (S, L) currents in amperes, one row per drive.
     - `measurement`: (K, L) weights, one row per measurement.
-    - `select`: (S, K) boolean, which combinations are read; all when not given.
-    - `large_currents`: accept currents above 1 A (else taken for a mistake of units).
+    - `select`: (S, K) booleans, which combinations are measured; by default all.
+    - `large_currents`: accept currents above 1 A, which are otherwise taken for an error of units.
 
     Channels are in the order of `select.ravel()`: all measurements of the first drive, then of the second.
 
-    Raises `ValueError` for patterns that `Protocol` refuses, currents above 1 A and a `select` of another
-    shape.
+    Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A, and a `select` of another shape.
     """
     drive, measurement = _as_matrix(drive, "drive"), _as_matrix(measurement, "measurement")
     if not large_currents:
@@ -100,14 +101,14 @@ def from_channels(
     name: str = "custom",
     large_currents: bool = False,
 ) -> Protocol:
-    """One measurement row and one drive number per channel, as measured data often come.
+    """Create a protocol from one measurement pattern and one drive index per channel, as is common for measured data.
 
     - `drive`: (S, L) currents in amperes, one row per drive.
     - `channel_measurement`: (M, L) weights, one row per channel; equal rows are stored once.
     - `drive_index`: (M,) 0-based index of the drive of each channel.
 
-    Raises `ValueError` for patterns that `Protocol` refuses, currents above 1 A (unless `large_currents`),
-    and a `drive_index` of another length.
+    Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A (unless `large_currents`), and a
+    `drive_index` of another length.
     """
     drive, rows = _as_matrix(drive, "drive"), _as_matrix(channel_measurement, "measurement")
     if not large_currents:
@@ -121,7 +122,7 @@ def from_channels(
     if not np.all(np.isfinite(rows)):
         raise ValueError("from_channels: the measurement patterns contain NaN or infinity. Mask channels instead.")
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    # In order of first appearance, so that a file's own numbering of its patterns survives.
+    # Keep the order of first appearance, so that a file's numbering of its patterns is preserved.
     appearance = np.argsort(first)
     rank = np.empty_like(appearance)
     rank[appearance] = np.arange(len(appearance))
@@ -147,7 +148,7 @@ def _check_currents(drive, where: str) -> None:
         check_amplitude(float(np.max(np.abs(drive))), where)
 
 
-# Patterns whose effect is a smaller share than this of the best one's are rounding.
+# Drive patterns whose distinguishability, relative to the maximum, is below this value are due to rounding.
 _NOTHING = 1e-12
 
 
@@ -160,19 +161,20 @@ def trigonometric(
 ) -> Protocol:
     """Sinusoidal currents in all electrodes at once: L - 1 drives, L(L - 1) channels.
 
-    Drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L and amplitude `current` in amperes: the patterns
-    that best distinguish a centred inclusion in a disk (Isaacson 1986; Gisser, Isaacson and Newell 1988). 16
-    electrodes: 240. On a solid θ goes by the electrodes' numbers: complete, but no longer the best.
+    The drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L and amplitude `current` in amperes: the patterns
+    that best distinguish a centred inclusion in a disk (Isaacson 1986; Gisser, Isaacson and Newell 1988). 16 electrodes
+    give 240 channels. On a solid, θ follows the electrodes' numbers: the drives are still complete, but no longer
+    optimal.
 
     - `measurement`, `reference`: as in `measurement_patterns`.
 
-    Raises `ValueError` for a bad count, current or option.
+    Raises `ValueError` for an invalid count, current or option.
     """
     count = check_count(num_electrodes, "trigonometric", 3)
     angle = 2 * np.pi * np.arange(count) / count
     waves = [wave(k * angle) for k in range(1, count // 2 + 1) for wave in (np.cos, np.sin)]
     drive = np.array(waves[: count - 1])
-    drive -= drive.mean(axis=1, keepdims=True)  # the last rounding errors of Kirchhoff's law
+    drive -= drive.mean(axis=1, keepdims=True)  # removes rounding errors that violate Kirchhoff's law
     return _read_everywhere("trigonometric", drive, measurement, reference, current)
 
 
@@ -183,15 +185,17 @@ def haar(
     reference: int | None = None,
     current: Current = 1e-3,
 ) -> Protocol:
-    """Haar wavelets over the electrodes' numbers: L - 1 orthogonal drives, coarse to fine, `current` amperes at most.
+    """Haar wavelets over the electrodes' numbers: L - 1 orthogonal drives, coarse to fine, with currents of at most
+    `current` amperes.
 
-    The first drive sends current from the first half of the electrodes to the second, the next two do so within each
-    half, and so on (Haar 1910). Where L is no power of two, halves differ by one electrode, and each of the larger one
-    carries less, so that the sum is zero (unbalanced wavelets: Girardi and Sweldens 1997). Every L from 2 on.
+    The first drive sends current from the first half of the electrodes to the second, the next two drives do so within
+    each half, and so on (Haar 1910). If L is not a power of two, halves differ by one electrode, and each electrode of
+    the larger half carries less current, so that the sum is zero (unbalanced wavelets: Girardi and Sweldens 1997). L is
+    at least 2.
 
     - `measurement`, `reference`: as in `measurement_patterns`.
 
-    Raises `ValueError` for a bad count, current or option.
+    Raises `ValueError` for an invalid count, current or option.
     """
     count = check_count(num_electrodes, "haar", 2)
     parts, drives = [np.arange(count)], []
@@ -200,7 +204,7 @@ def haar(
         first, second = np.array_split(part, 2)
         pattern = np.zeros(count)
         pattern[first], pattern[second] = len(second), -len(first)
-        drives.append(pattern / len(first))  # the first half is never the smaller one
+        drives.append(pattern / len(first))  # the first half is at least as large as the second
         parts += [half for half in (first, second) if len(half) > 1]
     drive = np.array(drives)
     return _read_everywhere("haar", drive / np.abs(drive).max(axis=1, keepdims=True), measurement, reference, current)
@@ -219,28 +223,28 @@ def optimal(
     """The currents that best distinguish two bodies, best first: at most L - 1 drives.
 
     - `transfer`, `other`: (L, L) ohm, the transfer impedances of both bodies (`ForwardModel.transfer_impedance`, or
-      measured: `jeit.data.transfer_impedance`). Without `other`, the eigenvectors of `transfer` itself.
-    - `number`: of drives, all unless given; a difference of low rank has fewer.
-    - Unless `power` is given: the I that make ‖(Z₁ - Z₂) I‖ largest for a given ‖I‖, singular vectors of the difference
-      (Isaacson 1986; Gisser, Isaacson and Newell 1990), each then as large as `current`, the most that any electrode
-      may carry, in amperes, lets it be.
-    - `power`, watts: the I that make ‖(Z₁ - Z₂) I‖ largest for a given power Iᵀ Z₁ I (Cheney and Isaacson 1992), each
-      dissipating so much in the first body. It needs `other`. `current` has no part in it.
+      measured: `jeit.data.transfer_impedance`). Without `other`, the drives are the eigenvectors of `transfer`.
+    - `number`: maximum number of drives, by default all; a difference of low rank has fewer.
+    - `current`: unless `power` is given, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed ‖I‖: they are singular vectors
+      of the difference (Isaacson 1986; Gisser, Isaacson and Newell 1990), each scaled so that the maximum current of an
+      electrode is `current` amperes.
+    - `power`: if given, in watts, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed power Iᵀ Z₁ I (Cheney and Isaacson
+      1992), and each dissipates this power in the first body. It requires `other`, and `current` is not used.
     - `measurement`, `reference`: as in `measurement_patterns`.
 
-    Raises `ValueError` for matrices that are not square, symmetric to a tenth, real and finite, or that are equal, for
-    a `transfer` that dissipates nothing where `power` is given, and for bad options.
+    Raises `ValueError` for matrices that are not square, real, finite, and symmetric to within a tenth; for equal
+    matrices; if `power` is given and some currents dissipate no power in `transfer`; and for invalid options.
     """
-    first = _checked("transfer", transfer)
+    first = _check_transfer("transfer", transfer)
     count = len(first)
     check_current(current, "optimal")
     most = count - 1 if number is None else check_count(number, "optimal: number", 1)
-    # In an orthonormal basis of currents that sum to zero.
+    # Project to an orthonormal basis of the currents that sum to zero.
     basis = scipy.linalg.null_space(np.ones((1, count)))
     dissipated = basis.T @ first @ basis
     change = dissipated
     if other is not None:
-        second = _checked("other", other)
+        second = _check_transfer("other", other)
         if second.shape != first.shape:
             raise ValueError(
                 f"other: its shape is {second.shape}, and that of transfer {first.shape}; give one body's."
@@ -249,12 +253,12 @@ def optimal(
     if np.linalg.norm(change) <= _NOTHING * np.linalg.norm(dissipated):
         raise ValueError("other: it equals transfer, and no current distinguishes them.")
     if power is None:
-        values, directions = _sorted(np.linalg.eigh(change @ change))
+        values, directions = _largest_first(np.linalg.eigh(change @ change))
     else:
         directions, values = _for_power(dissipated, change, power, other is None)
     keep = values > _NOTHING * values[0]
     drive = (basis @ directions[:, keep][:, :most]).T
-    # An eigenvector has no sign: positive where it is largest.
+    # The sign of an eigenvector is arbitrary: make its largest component positive.
     drive *= np.sign(drive[np.arange(len(drive)), np.abs(drive).argmax(axis=1)])[:, None]
     if power is None:
         drive /= np.abs(drive).max(axis=1, keepdims=True)
@@ -265,7 +269,7 @@ def optimal(
 
 
 def _for_power(dissipated, change, power: float, alone: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Directions and their squared distinguishability, best first, for a given power."""
+    """Drive directions for a given power and their squared distinguishabilities, best first."""
     if alone:
         raise ValueError("power needs other: with one body alone the currents for a given power are those of no power.")
     if isinstance(power, bool) or not isinstance(power, int | float) or not 0 < power < np.inf:
@@ -273,17 +277,17 @@ def _for_power(dissipated, change, power: float, alone: bool) -> tuple[np.ndarra
     symmetric = (dissipated + dissipated.T) / 2
     if np.linalg.eigvalsh(symmetric)[0] <= 0:
         raise ValueError("transfer: some currents dissipate no power in it; is it the transfer impedance of a body?")
-    values, directions = _sorted(scipy.linalg.eigh(change @ change, symmetric))
+    values, directions = _largest_first(scipy.linalg.eigh(change @ change, symmetric))
     return directions, values
 
 
-def _sorted(found) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and vectors, the largest first."""
+def _largest_first(found) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and eigenvectors, largest first."""
     values, vectors = found
     return values[::-1], vectors[:, ::-1]
 
 
-def _checked(name: str, given: ArrayLike) -> np.ndarray:
+def _check_transfer(name: str, given: ArrayLike) -> np.ndarray:
     matrix = np.asarray(given)
     if matrix.ndim == 3 and matrix.shape[1] == matrix.shape[2]:
         raise ValueError(
@@ -301,7 +305,7 @@ def _checked(name: str, given: ArrayLike) -> np.ndarray:
 
 
 def _read_everywhere(kind: str, drive, measurement: Reading, reference: int | None, current: Current) -> Protocol:
-    """Every drive with every reading."""
+    """Protocol that combines every drive with every measurement pattern."""
     check_current(current, kind)
     rows = measurement_patterns(drive.shape[1], measurement, reference)
     return from_matrices(current * drive, rows, name=f"{kind}, {measurement} measurement, {drive.shape[1]} electrodes")

@@ -1,7 +1,7 @@
-"""Drive and measurement patterns of electrode pairs.
+"""Protocols with drive and measurement patterns that are pairs of electrodes.
 
-All count electrodes from 0, drive `+current` into the first electrode of a pair and take it out of the
-second, and measure the first minus the second.
+Electrodes are counted from 0. For each pair, `+current` enters at the first electrode and leaves at the second, and
+voltages are the potential of the first electrode minus that of the second.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from jeit.protocol.reciprocity import reciprocal_channel_pairs
 
 Order = Literal["rotating", "fixed"]
 Reciprocal = Literal["all", "half"]
-# Amperes; an array, possibly traced, when something is differentiated with respect to it.
+# Current in amperes: a number, or an array, which may be traced to differentiate with respect to the current.
 Current = float | Float[Array, ""]
 
 
 def pair_patterns(pairs: np.ndarray, num_electrodes: int) -> np.ndarray:
-    """Pairs (P, 2) as patterns (P, L): +1 on the first electrode, -1 on the second."""
+    """Convert pairs (P, 2) to patterns (P, L): +1 at the first electrode, -1 at the second."""
     patterns = np.zeros((len(pairs), num_electrodes))
     rows = np.arange(len(pairs))
     patterns[rows, pairs[:, 0]] = 1.0
@@ -40,17 +40,18 @@ def pair_patterns(pairs: np.ndarray, num_electrodes: int) -> np.ndarray:
 
 
 def ring_pairs(count: int, step: int) -> np.ndarray:
-    """Every electrode of a ring with the one `step` further on, (L, 2)."""
+    """Pairs (L, 2) of every electrode of a ring with the electrode `step` positions further."""
     start = np.arange(count)
     return np.stack([start, (start + step) % count], axis=1)
 
 
 @dataclass(frozen=True)
 class CrossedPairs:
-    """Every drive pair with every measurement pair, as the protocol function called `where` makes them.
+    """Combinations of every drive pair with every measurement pair.
 
-    - `num_electrodes`: L; `drive` (S, 2) and `measurement` (K, 2): electrodes, counted from 0.
-    - `where`: what errors begin with.
+    - `where`: name of the protocol function, with which error messages begin.
+    - `num_electrodes`: number of electrodes L.
+    - `drive` (S, 2) and `measurement` (K, 2): pairs of electrodes, counted from 0.
     """
 
     where: str
@@ -67,9 +68,10 @@ class CrossedPairs:
         reciprocal: Reciprocal = "all",
         order: Order = "fixed",
     ) -> Protocol:
-        """The channels asked for, in the order asked for; options as in `jeit.protocol.adjacent`.
+        """Create the protocol, with the requested channels in the requested order; options as in
+        `jeit.protocol.adjacent`.
 
-        Raises `ValueError` for a bad current or option, and where no channel is left.
+        Raises `ValueError` for an invalid current or option, and if no channel is left.
         """
         check_current(current, self.where)
         check_choice(reciprocal, ("all", "half"), self.where, "reciprocal")
@@ -78,9 +80,9 @@ class CrossedPairs:
         drive_index = np.repeat(np.arange(len(self.drive)), num_rows)
         measurement_index = np.tile(np.arange(num_rows), len(self.drive))
         if order == "rotating":
-            # Drive i begins with measurement pair i: pairs are in ring order, one per electrode.
+            # Drive i begins with measurement pair i: the pairs are in ring order, one per electrode.
             measurement_index = (measurement_index + drive_index) % num_rows
-        # Channels are chosen with NumPy at unit current, so that the current itself may be traced.
+        # Channels are selected with NumPy at unit current, so that the current itself may be traced.
         drive = pair_patterns(self.drive, self.num_electrodes)
         measurement = pair_patterns(self.measurement, self.num_electrodes)
         keep = np.ones(len(drive_index), dtype=bool)
@@ -111,18 +113,17 @@ def adjacent(
     reciprocal: Reciprocal = "all",
     order: Order = "rotating",
 ) -> Protocol:
-    """Neighbouring electrodes drive, neighbouring electrodes measure: L(L - 3) channels.
+    """Adjacent drive and adjacent measurement: neighbouring electrodes drive and measure; L(L - 3) channels.
 
-    16 electrodes: 208 voltages, 104 with `reciprocal="half"`. Brown and Seagar 1987.
+    16 electrodes give 208 voltages, or 104 with `reciprocal="half"`. Brown and Seagar 1987.
 
     - `num_electrodes`: L, at least 4.
     - `current`: amplitude in amperes.
-    - `driven_electrodes`: also measure where current flows (L² channels).
-    - `reciprocal`: "half" keeps the first of each two channels that reciprocity makes equal.
-    - `order`: "rotating" measures from the driven pair onwards, drive by drive; "fixed" always from electrode
-      0.
+    - `driven_electrodes`: also measure on electrodes that carry current (L² channels).
+    - `reciprocal`: "half" keeps the first of every two channels that are equal by reciprocity.
+    - `order`: "rotating" starts the measurements of each drive at the driven pair, "fixed" always at electrode 0.
 
-    Raises `ValueError` for a bad count, current or option.
+    Raises `ValueError` for an invalid count, current or option.
     """
     return skip(
         num_electrodes,
@@ -144,11 +145,11 @@ def skip(
     reciprocal: Reciprocal = "all",
     order: Order = "rotating",
 ) -> Protocol:
-    """Pairs that leave out `skipped` electrodes drive, pairs that leave out `measurement_skipped` measure.
+    """Drive pairs that skip `skipped` electrodes, and measurement pairs that skip `measurement_skipped`.
 
-    Skip-0 is adjacent. `measurement_skipped` is `skipped` unless given. Options as in `adjacent`.
+    Skip-0 is adjacent. `measurement_skipped` equals `skipped` unless given. Options as in `adjacent`.
 
-    Raises `ValueError` for a skip that is negative or leads back to the same electrode, and as `adjacent`.
+    Raises `ValueError` for a skip that is negative or leads back to the same electrode, and as `adjacent` does.
     """
     where = "adjacent" if skipped == 0 else "skip"
     count = check_count(num_electrodes, where, 4)
@@ -179,12 +180,12 @@ def opposite(
     driven_electrodes: bool = False,
     order: Order = "rotating",
 ) -> Protocol:
-    """Electrodes across the ring drive, neighbours measure: L(L - 4)/2 channels from the L/2 distinct drives.
+    """Opposite drive and adjacent measurement: L(L - 4)/2 channels from the L/2 distinct drives.
 
-    16 electrodes: 96 voltages; 8 electrodes: 16. `drives="all"` also drives each pair the other way round,
-    which doubles the voltages (192 and 32) without a new one among them. Options as in `adjacent`.
+    16 electrodes give 96 voltages, 8 electrodes 16. `drives="all"` also drives each pair in the opposite direction,
+    which doubles the number of voltages (192 and 32) without adding information. Options as in `adjacent`.
 
-    Raises `ValueError` for an odd number of electrodes, and as `adjacent`.
+    Raises `ValueError` for an odd number of electrodes, and as `adjacent` does.
     """
     count = check_count(num_electrodes, "opposite", 4)
     if count % 2:
@@ -212,15 +213,15 @@ def all_against_one(
     driven_electrodes: bool | None = None,
     reciprocal: Reciprocal = "all",
 ) -> Protocol:
-    """Every electrode in turn drives against the electrode `common`: L - 1 drives.
+    """Drive every electrode in turn against the electrode `common`: L - 1 drives.
 
-    - `measurement`: "common" reads every electrode against `common` too ((L - 1)² channels; all of them on a
-      driven electrode); "adjacent" reads neighbouring pairs.
-    - `driven_electrodes`: measure where current flows; by default only where `measurement="common"` leaves no
-      choice.
+    - `measurement`: "common" also measures every electrode against `common` ((L - 1)² channels, all of which are on a
+      driven electrode); "adjacent" measures neighbouring pairs.
+    - `driven_electrodes`: measure on electrodes that carry current; by default only for `measurement="common"`, which
+      requires it.
 
-    Raises `ValueError` for `common` that is no electrode, for `measurement="common"` with
-    `driven_electrodes=False`, and as `adjacent`.
+    Raises `ValueError` if `common` is not an electrode, for `measurement="common"` with `driven_electrodes=False`, and
+    as `adjacent` does.
     """
     count = check_count(num_electrodes, "all_against_one", 3)
     check_choice(measurement, ("common", "adjacent"), "all_against_one", "measurement")
@@ -246,17 +247,16 @@ def reference_electrode(
     driven_electrodes: bool = False,
     order: Order = "rotating",
 ) -> Protocol:
-    """Boundary electrodes drive in pairs and are each measured against one reference electrode.
+    """Drive pairs of boundary electrodes, and measure each boundary electrode against one reference electrode.
 
-    The protocol has `num_boundary + 1` electrodes. 16 boundary electrodes and a centre one, adjacent drive:
-    16 · 14 = 224 voltages (Silvera Tawil et al. 2011, "centre measurement pattern").
+    The protocol has `num_boundary + 1` electrodes. 16 boundary electrodes and a central one give 16 · 14 = 224 voltages
+    with adjacent drive (Silvera Tawil et al. 2011, "centre measurement pattern").
 
-    - `num_boundary`: electrodes of the boundary, at least 4.
-    - `skipped`: electrodes left out between the two driven ones.
+    - `num_boundary`: number of boundary electrodes, at least 4.
+    - `skipped`: number of electrodes between the two driven ones.
     - `reference`: index of the reference electrode among the `num_boundary + 1`; by default the last.
 
-    Other options as in `adjacent`. Raises `ValueError` for a `reference` that does not exist, and as
-    `adjacent`.
+    Other options as in `adjacent`. Raises `ValueError` for a `reference` that does not exist, and as `adjacent` does.
     """
     count = check_count(num_boundary, "reference_electrode", 4)
     reference = count if reference is None else reference
@@ -283,12 +283,12 @@ def two_terminal(
     *,
     current: Current = 1e-3,
 ) -> Protocol:
-    """Current and voltage on the same two electrodes, pair by pair.
+    """Drive and measure on the same two electrodes, pair by pair.
 
-    All L(L - 1)/2 pairs, unless `pairs` (P, 2) says which. Each voltage contains the contact impedance of
-    both electrodes.
+    All L(L - 1)/2 pairs are used, or those in `pairs` (P, 2). Each voltage includes the voltage drop at the contact
+    impedances of both electrodes.
 
-    Raises `ValueError` for a pair of an electrode with itself, or with one that does not exist.
+    Raises `ValueError` if a pair contains an electrode twice, or one that does not exist.
     """
     count = check_count(num_electrodes, "two_terminal", 2)
     check_current(current, "two_terminal")
@@ -316,12 +316,11 @@ def bipolar(
     reciprocal: Reciprocal = "all",
     name: str = "bipolar",
 ) -> Protocol:
-    """Any drive pairs (S, 2) crossed with any measurement pairs (K, 2), drive by drive.
+    """Combine any drive pairs (S, 2) with any measurement pairs (K, 2), drive by drive.
 
     Options as in `adjacent`.
 
-    Raises `ValueError` for a pair of an electrode with itself, or with one that
-    does not exist.
+    Raises `ValueError` if a pair contains an electrode twice, or one that does not exist.
     """
     count = check_count(num_electrodes, "bipolar", 2)
     drive = check_pairs(drive_pairs, count, "bipolar: drive_pairs")

@@ -1,4 +1,4 @@
-"""The protocol: what is driven and what is measured, and checks of it."""
+"""`Protocol`: drive patterns, measurement patterns and channels; and checks of them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jeit_solvers.engines import as_array, either_engine, has_values
 
 
 def check_patterns(patterns, what: str) -> None:
-    """Raise `ValueError` unless patterns (rows, L) are finite, without zero rows, and every row sums to zero."""
+    """Raise `ValueError` unless patterns (rows, L) are finite, no row is zero, and every row sums to zero."""
     if patterns.ndim != 2 or patterns.shape[0] == 0 or patterns.shape[1] < 2:
         raise ValueError(
             f"Protocol: {what} patterns have shape {tuple(patterns.shape)}. Give a matrix with one row per "
@@ -69,7 +69,8 @@ def check_indices(index, size: int, name: str, of: str) -> None:
 
 
 def check_current(current, where: str) -> None:
-    """Raise `ValueError` unless an amplitude in amperes is positive, and not in milliamperes by mistake."""
+    """Raise `ValueError` unless an amplitude in amperes is positive and at most 1 A, above which it is probably in
+    milliamperes."""
     if not has_values(current):
         return
     value = np.asarray(current)
@@ -79,7 +80,7 @@ def check_current(current, where: str) -> None:
 
 
 def check_amplitude(value: float, where: str) -> None:
-    """Raise `ValueError` for a current above one ampere: the number is in milliamperes or microamperes."""
+    """Raise `ValueError` for a current above one ampere, which is probably in milliamperes or microamperes."""
     if value > 1.0 + 1e-9:
         raise ValueError(
             f"{where}: a current of {value:.6g} A is far above what a tank or a skin carries. Currents are "
@@ -109,7 +110,8 @@ def electrode_indices(electrodes, num_electrodes: int) -> np.ndarray:
 
 
 def check_pairs(pairs, num_electrodes: int, what: str) -> np.ndarray:
-    """Return electrode pairs (P, 2), 0-based. Raises `ValueError` for an electrode paired with itself."""
+    """Return electrode pairs (P, 2), 0-based. Raises `ValueError` for other arrays, electrodes that do not exist, and
+    an electrode paired with itself."""
     values = np.asarray(pairs)
     if values.ndim != 2 or values.shape[1] != 2 or values.shape[0] == 0 or values.dtype.kind not in "iu":
         raise ValueError(
@@ -125,7 +127,7 @@ def check_pairs(pairs, num_electrodes: int, what: str) -> np.ndarray:
 
 
 def check_choice(value, choices: tuple[str, ...], where: str, name: str) -> None:
-    """Raise `ValueError` unless the argument `name` is one of `choices`."""
+    """Raise `ValueError` unless the value of the argument `name` is one of `choices`."""
     if value not in choices:
         meant = did_you_mean(value, choices)
         raise ValueError(f"{where}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}{meant}.")
@@ -142,29 +144,29 @@ def _as_index(values) -> Array:
 
 
 @either_engine
-def _chosen(patterns, index):
+def _select_rows(patterns, index):
     return patterns[index]
 
 
 class Protocol(eqx.Module):
-    """Drive and measurement patterns, and the channels made of them.
+    """Drive patterns, measurement patterns, and channels that combine them.
 
-    Channel `k` reads `measurement[measurement_index[k]] @ U`, where `U` (L,) are the electrode potentials in
-    volts while the currents `drive[drive_index[k]]` flow. Positive current enters the body.
+    Channel `k` measures `measurement[measurement_index[k]] @ U`, where `U` (L,) are the electrode potentials in volts
+    while the currents `drive[drive_index[k]]` flow. Positive current enters the body.
 
-    Use the constructors (`adjacent`, `opposite`, `from_matrices`, ...) rather than this class, unless you
-    have all four arrays.
+    Use the functions that create protocols (`adjacent`, `opposite`, `from_matrices`, ...) rather than this class,
+    unless all four arrays are known.
 
     **Fields**
 
     - `drive`: (S, L) amperes; each row sums to zero.
     - `measurement`: (K, L) dimensionless weights, the distinct measurement patterns; each row sums to zero.
-    - `drive_index`: (M,) which row of `drive` is driven for each channel.
-    - `measurement_index`: (M,) which row of `measurement` is read for each channel.
-    - `name`: what to call it in reports.
+    - `drive_index`: (M,) row of `drive` for each channel.
+    - `measurement_index`: (M,) row of `measurement` for each channel.
+    - `name`: name in reports.
 
-    **Raises** `ValueError` for patterns with NaN, with a zero row, with a row that does not sum to zero, of
-    differing numbers of electrodes, and for indices out of range.
+    **Raises** `ValueError` for patterns with NaN, with a zero row, with a row that does not sum to zero, or with
+    different numbers of electrodes, and for indices out of range.
     """
 
     drive: Float[Array, "S L"] = eqx.field(converter=_as_float)
@@ -202,21 +204,21 @@ class Protocol(eqx.Module):
 
     @property
     def num_measurements(self) -> int:
-        """Number of channels M: voltages in one frame."""
+        """Number of channels M, i.e. of voltages in one frame."""
         return self.drive_index.shape[-1]
 
     @property
     def channel_drive(self) -> Float[Array, "M L"]:
-        """(M, L) the currents in amperes that flow while each channel is read."""
-        return _chosen(self.drive, self.drive_index)
+        """Currents (M, L), in amperes, that flow while each channel is measured."""
+        return _select_rows(self.drive, self.drive_index)
 
     @property
     def channel_measurement(self) -> Float[Array, "M L"]:
-        """(M, L) the measurement weights of each channel."""
-        return _chosen(self.measurement, self.measurement_index)
+        """Measurement weights (M, L) of each channel."""
+        return _select_rows(self.measurement, self.measurement_index)
 
     def channels_touching(self, electrodes: int | Sequence[int]) -> Bool[np.ndarray, " M"]:
-        """(M,) True where a channel drives or measures any of `electrodes` (0-based indices).
+        """Whether each channel (M,) drives or measures any of `electrodes` (0-based indices).
 
         Raises `ValueError` for an index that is not an electrode.
         """
@@ -226,22 +228,22 @@ class Protocol(eqx.Module):
         return np.logical_or(driven[np.asarray(self.drive_index)], measured[np.asarray(self.measurement_index)])
 
     def mask_without(self, electrodes: int | Sequence[int]) -> Bool[np.ndarray, " M"]:
-        """(M,) True where a channel stays usable when `electrodes` (0-based) are missing or broken."""
+        """Whether each channel (M,) is still usable when `electrodes` (0-based) are missing or broken."""
         return ~self.channels_touching(electrodes)
 
     def channels_on_driven_electrodes(self) -> Bool[np.ndarray, " M"]:
-        """(M,) True where a channel measures on an electrode that carries current.
+        """Whether each channel (M,) measures on an electrode that carries current.
 
-        Such a channel sees the contact impedance's voltage drop as well as the body.
+        The voltage of such a channel includes the voltage drop at the contact impedance.
         """
         shared = shares_electrode(np.asarray(self.drive), np.asarray(self.measurement))
         return shared[np.asarray(self.drive_index), np.asarray(self.measurement_index)]
 
     def subset(self, keep: ArrayLike) -> "Protocol":
-        """The protocol of the channels kept, with the drives and measurement patterns they use.
+        """Protocol with only the channels `keep`, and the drive and measurement patterns that they use.
 
-        `keep` is a boolean mask (M,) or a sequence of channel indices. Voltages follow as `voltages[...,
-        keep]`. Raises `ValueError` for a mask of another length, or one that keeps nothing.
+        `keep` is a boolean mask (M,) or a sequence of channel indices; the corresponding voltages are `voltages[...,
+        keep]`. Raises `ValueError` for a mask of another length, or if no channel is kept.
         """
         channels = np.asarray(keep)
         if channels.dtype == bool:
@@ -262,19 +264,20 @@ class Protocol(eqx.Module):
         drives, drive_index = np.unique(np.asarray(self.drive_index)[channels], return_inverse=True)
         rows, measurement_index = np.unique(np.asarray(self.measurement_index)[channels], return_inverse=True)
         return Protocol(
-            drive=_chosen(self.drive, drives),
-            measurement=_chosen(self.measurement, rows),
+            drive=_select_rows(self.drive, drives),
+            measurement=_select_rows(self.measurement, rows),
             drive_index=drive_index,
             measurement_index=measurement_index,
             name=f"{self.name}, {channels.size} of {self.num_measurements} channels",
         )
 
     def repeated_facts(self, channels: ArrayLike | None = None) -> int:
-        """Number of channels, of all or of these (K,) indices, that are linear combinations of others of their drive.
+        """Number of channels that are linear combinations of other channels of the same drive.
 
-        Where readings are computed from the potentials of many electrodes, such as less their mean, L of them hold L -
-        1 independent values, and their noise as many. Where a drive is read by differences of two electrodes alone,
-        these are taken for measured one by one, each with noise of its own, though they may close a ring.
+        `channels` (K,): indices of the channels that are considered, by default all. If voltages are computed from the
+        potentials of many electrodes, for example by subtracting their mean, L of them contain L - 1 independent values
+        with L - 1 independent noises. If all measurements of a drive are differences of two electrodes, they are
+        assumed to be measured one by one with independent noise, even if the pairs form a ring, and are not counted.
         """
         rows = np.asarray(self.measurement)
         kept = np.arange(self.num_measurements) if channels is None else np.asarray(channels)
@@ -292,11 +295,11 @@ class Protocol(eqx.Module):
         return repeated
 
     def reciprocal_pairs(self) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
-        """Pairs of channels that reciprocity ties together, and the ratio of their voltages.
+        """Pairs of channels whose voltages are proportional by reciprocity, and the ratios of their voltages.
 
-        Returns `pairs` (P, 2) and `ratio` (P,) such that `v[pairs[:, 1]] = ratio * v[pairs[:, 0]]` for any
-        body without magnetic bias: channels whose drive and measurement patterns are each other's, up to
-        scale. Empty when the patterns allow no pair (opposite drive with adjacent measurement, say). See
+        Returns `pairs` (P, 2) and `ratio` (P,) such that `v[pairs[:, 1]] = ratio * v[pairs[:, 0]]` for any body without
+        magnetic bias. In each pair, the drive pattern of either channel is proportional to the measurement pattern of
+        the other. There are none for some protocols, for example opposite drive with adjacent measurement. See
         `jeit.protocol.reciprocity` for combinations of channels.
         """
         return reciprocal_channel_pairs(
@@ -307,7 +310,7 @@ class Protocol(eqx.Module):
         )
 
     def same_patterns(self, other: "Protocol") -> bool:
-        """True when both drive and read the same channels in the same order, whatever their names."""
+        """Whether both protocols have the same channels in the same order; names are ignored."""
         return (
             self.num_electrodes == other.num_electrodes
             and self.num_measurements == other.num_measurements
@@ -324,10 +327,10 @@ class Protocol(eqx.Module):
 
 
 def _rows(patterns, index) -> np.ndarray:
-    """The pattern of each channel, in NumPy: JAX would compile the gather."""
+    """Pattern of each channel, with NumPy, because JAX would compile the indexing."""
     return np.asarray(patterns)[np.asarray(index)]
 
 
 def shares_electrode(drive: Float[np.ndarray, "S L"], measurement: Float[np.ndarray, "K L"]) -> Bool[np.ndarray, "S K"]:
-    """(S, K) True where a measurement pattern reads an electrode that the drive pattern drives."""
+    """Whether each measurement pattern uses an electrode that each drive pattern drives, as booleans (S, K)."""
     return (drive != 0).astype(int) @ (measurement != 0).T.astype(int) > 0

@@ -1,7 +1,7 @@
-"""Reciprocity: driving at a and reading at b gives what driving at b and reading at a gives.
+"""Reciprocity: driving at a and measuring at b gives the same voltage as driving at b and measuring at a.
 
-The transfer impedance S (L, L) of any body of (symmetric) conductivity is symmetric: `m @ S @ d = d @ S @ m`.
-So two channels (d, m) and (d', m') with d' = a m and m' = b d have voltages v' = a b v. Geselowitz 1971, Lehr
+The transfer impedance S (L, L) of any body with (symmetric) conductivity is symmetric: `m @ S @ d = d @ S @ m`.
+Therefore two channels (d, m) and (d', m') with d' = a m and m' = b d have voltages v' = a b v. Geselowitz 1971, Lehr
 1972.
 """
 
@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, Inexact, Int
 
 
 def _direction_keys(patterns: np.ndarray) -> tuple[list[bytes], np.ndarray]:
-    """A hashable key per row, equal for proportional rows; and the scale with row = scale * unit row."""
-    # The first entry that is not tiny fixes scale and sign, so that proportional rows (also negative) meet.
+    """A hashable key for each row, the same for proportional rows, and the scale of each row: row = scale * unit
+    row."""
+    # The first entry that is not tiny determines scale and sign, so that proportional rows have the same unit row.
     size = np.max(np.abs(patterns), axis=1, keepdims=True)
     first = np.argmax(np.abs(patterns) > 1e-9 * size, axis=1)
     scale = patterns[np.arange(len(patterns)), first]
@@ -26,7 +27,8 @@ def reciprocal_channel_pairs(
 ) -> tuple[Int[np.ndarray, "P 2"], Float[np.ndarray, " P"]]:
     """Channel pairs (P, 2), first < second, and ratios (P,) with `v[second] = ratio * v[first]`.
 
-    Arguments are those of `Protocol`. A channel read twice pairs with the last of its mirror images only.
+    The arguments are those of `Protocol`. Each channel is paired only with the last of the channels that are reciprocal
+    to it.
     """
     drive_key, drive_scale = _direction_keys(drive)
     measurement_key, measurement_scale = _direction_keys(measurement)
@@ -53,17 +55,16 @@ def transfer_between_drives(
     mask: np.ndarray,
     deviation: np.ndarray | None = None,
 ) -> tuple[Inexact[np.ndarray, "F S S"], Bool[np.ndarray, "S S"], Float[np.ndarray, "S S"]]:
-    """Voltage that every drive pattern, used as a measurement, reads while every other drive flows: symmetric for any
-    body.
+    """Voltage that every drive pattern, used as a measurement pattern, would measure while each drive flows: a
+    symmetric matrix for any body.
 
-    `voltages` (F, M) volts and `mask` (M,) usable channels; `deviation` (M,) of each channel's independent noise, one
-    volt unless given; the other arguments are those of `Protocol`.
-    Returns
+    `voltages` (F, M): volts; `mask` (M,): usable channels; `deviation` (M,): standard deviation of the independent
+    noise of each channel, volts, by default one; the other arguments are those of `Protocol`. Returns
 
-    - `transfer` (F, S, S) watts: `drive[i] @ S @ drive[j]` in entry (i, j), combined from the channels read
-      while j flows. A drive of skip-1 read by neighbours, for instance, is the sum of two neighbours.
-    - `known` (S, S): where the measurement patterns of drive j do span drive i.
-    - `noise` (S, S) watts: the standard deviation of `transfer`.
+    - `transfer` (F, S, S), watts: `drive[i] @ S @ drive[j]` in entry (i, j), combined from the channels measured while
+      drive j flows. For example, a skip-1 drive pattern measured by adjacent pairs is the sum of two of them.
+    - `known` (S, S): whether the measurement patterns of drive j span drive i.
+    - `noise` (S, S), watts: standard deviation of `transfer`.
     """
     num_drives = drive.shape[0]
     transfer = np.zeros((voltages.shape[0], num_drives, num_drives), dtype=voltages.dtype)
@@ -76,7 +77,7 @@ def transfer_between_drives(
         if channels.size == 0:
             continue
         rows, scale = measurement[measurement_index[channels]], deviation[channels]
-        # Of all combinations that read a drive, the one of least noise.
+        # Among all combinations of channels that equal a drive, choose the one with the least noise.
         combination = drive @ np.linalg.pinv(rows / scale[:, None], rcond=1e-10) / scale
         known[:, flowing] = np.linalg.norm(combination @ rows - drive, axis=1) <= 1e-8 * size
         transfer[:, :, flowing] = voltages[:, channels] @ combination.T

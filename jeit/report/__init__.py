@@ -1,5 +1,4 @@
-"""Reports of results and the files written to a folder: measurements, images, streams, compared rules, calibrations of
-microphones, tracks, layouts, studies, learnt skins, gestures, watched skins, networks that image."""
+"""Reports of measurements, images, series, streams and compared rules, and the files of results written to a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reports of rules for the hyperparameter side by side, and of measured files."""
+"""Reports that compare the rules for the hyperparameter, and reports of measured files."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from jeit.imaging.wiring import MOST_MISFIT, find_wiring
 from jeit.mesh import Mesh
 from jeit.report.folder import describe_domain, describe_electrodes, describe_measurement, plain, results, write_json
 
-# Number of nodes of the mesh on which wirings are compared.
+# Number of mesh nodes for the comparison of wirings.
 _NODES = 1000
 
 
 def report_measurement(measurement: Measurement) -> dict[str, Any]:
-    """Report that `jeit info` prints: frames, body, electrodes, protocol and noise of a measurement, in SI units; what
-    is not known is None."""
+    """Report of a measurement, as printed by `jeit info`: frames, body, electrodes, protocol and noise, in SI units.
+    Unknown values are None."""
     protocol, noise, signs = measurement.protocol, estimate_noise(measurement), impossible_signs(measurement)
     content = {
         **describe_measurement(measurement),
@@ -47,8 +47,8 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
 
 
 def _wiring(measurement: Measurement) -> str | None:
-    """Estimated wiring of electrodes and channels, from the reference, or else the first frame; None where the file
-    does not say where electrodes are."""
+    """Description of the estimated wiring, in words, from the frame named "reference", or else the first frame; None if
+    the body or the places of the electrodes are not known."""
     domain, electrodes = measurement.domain, measurement.electrodes
     if domain is None or electrodes is None:
         return None
@@ -67,14 +67,14 @@ def _wiring(measurement: Measurement) -> str | None:
     return "nothing speaks against the description"
 
 
-# Inclusions in one image of the picture; more lie over each other.
+# Maximum number of inclusions marked in one image, so that the marks do not overlap.
 _MOST_MARKED = 8
 
 
 def write_choice(result: ComparedRules, folder: str | Path) -> None:
-    """Write `choice.png` and `choice.json` into `folder`, made if need be.
+    """Write `choice.png` and `choice.json` to `folder`, which is created if needed.
 
-    Raises `ValueError` for what cannot be one.
+    Raises `ValueError` for a path that cannot be a folder.
     """
     with results(folder, ("choice.png", "choice.json")) as made:
         draw_choice(result).savefig(made / "choice.png", dpi=120)
@@ -82,7 +82,7 @@ def write_choice(result: ComparedRules, folder: str | Path) -> None:
 
 
 def draw_choice(result: ComparedRules):
-    """The image of every rule above the curves that they were chosen by, as a matplotlib `Figure`."""
+    """Draw the image of every rule, above the curves from which each rule chose λ; return a matplotlib `Figure`."""
     from matplotlib.figure import Figure
 
     from jeit.plot import plot_choice
@@ -100,7 +100,8 @@ def draw_choice(result: ComparedRules):
 
 
 def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
-    """One rule's image on a scale of its own; inclusions are marked where there are few enough to be distinguished."""
+    """Draw the image of one rule on its own colour scale, with inclusions marked unless there are more than
+    `_MOST_MARKED`."""
     from jeit.plot import ColourScale, plot_image
     from jeit.plot.axes import INK
     from jeit.plot.imaging.hyperparameter import COLOURS
@@ -113,7 +114,7 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
 
 
 def _draw_scale(ax, largest: float, unit: str) -> None:
-    """A small colour bar below an image, its ends named."""
+    """Draw a small colour bar below an image, with labels at its ends and at zero."""
     from jeit.plot.axes import INK, SOFT, prefixed
 
     factor, unit = prefixed(largest, unit)

@@ -1,4 +1,4 @@
-"""Folders of results, and descriptions of a mesh and its electrodes for reports."""
+"""Folders of results, and descriptions of measurements, bodies and electrodes for reports."""
 
 from __future__ import annotations
 
@@ -19,34 +19,35 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.files import whole_files
 from jeit.mesh import Body
 
-# Names of files may hold what is no letter in any script.
-_UNSAID = "backslashreplace"
+# Handling of characters that cannot be encoded, such as invalid bytes in the names of files.
+_ENCODING_ERRORS = "backslashreplace"
 
 
 @contextmanager
 def results(folder: str | Path, names: tuple[str, ...]) -> Iterator[Path]:
-    """A folder to write files of these `names` to; in `folder`, made if need be, they take their places together, once
-    all are written. Raises `ValueError` if it cannot be one."""
+    """Context manager with a temporary folder for files of the given `names`. They are moved to `folder` together once
+    all are written; it is created if needed. Raises `ValueError` if the path cannot be a folder."""
     with whole_files(results_folder(folder, names)) as beside:
         yield beside
 
 
 def write_json(report: dict[str, Any], path: Path) -> None:
-    """Write a report of plain numbers, strings, lists and dictionaries."""
+    """Write a report of plain numbers, strings, lists and dictionaries as JSON."""
     text = json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False)
-    path.write_text(text + "\n", "utf-8", errors=_UNSAID)
+    path.write_text(text + "\n", "utf-8", errors=_ENCODING_ERRORS)
 
 
 def write_rows(path: Path, columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> None:
-    """Write a table (CSV) under the names of its columns."""
-    with path.open("w", newline="", encoding="utf-8", errors=_UNSAID) as file:
+    """Write a table as CSV, with the names of its `columns` in the first line."""
+    with path.open("w", newline="", encoding="utf-8", errors=_ENCODING_ERRORS) as file:
         table = csv.writer(file)
         table.writerow(columns)
         table.writerows(rows)
 
 
 def results_folder(folder: str | Path, names: tuple[str, ...]) -> Path:
-    """The folder for files of these `names`, made if need be. Raises `ValueError` if it cannot be one."""
+    """Check the folder for files of the given `names`, and create it if needed. Raises `ValueError` if it cannot be
+    written to, or contains a folder of one of these names."""
     path = Path(folder)
     if path.exists() and not path.is_dir():
         raise ValueError(f"folder {path} is a file; give a folder for the results.")
@@ -64,7 +65,7 @@ def results_folder(folder: str | Path, names: tuple[str, ...]) -> Path:
 
 
 def describe_measurement(measurement: Measurement) -> dict[str, Any]:
-    """Name, source, channels and notes of a measurement."""
+    """Describe a measurement by its name, source, number of channels and notes."""
     mask = np.asarray(measurement.mask)
     return {
         "name": measurement.name,
@@ -77,19 +78,19 @@ def describe_measurement(measurement: Measurement) -> dict[str, Any]:
 
 
 def describe_domain(domain: Body | None) -> dict[str, Any]:
-    """Shape and size in metres of a body."""
+    """Describe a body by its shape and its size in metres."""
     return {"shape": "not known"} if domain is None else {**domain.describe(), "unit": "m"}
 
 
 def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]:
-    """Kind, number, place and size in metres of electrodes."""
+    """Describe electrodes by their kind, number, places and sizes in metres."""
     if electrodes is None:
         return {"kind": "at places not known"}
     return plain(electrodes.describe())
 
 
 def version_of(package: str) -> str | None:
-    """The version of an installed package; None if it is not."""
+    """Version of an installed package; None if it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -97,8 +98,8 @@ def version_of(package: str) -> str | None:
 
 
 def plain(value: Any) -> Any:
-    """Arrays as lists, complex numbers by their parts, and None for numbers that JSON does not know (NaN,
-    infinity)."""
+    """Convert a value for JSON: arrays to lists, complex numbers to their real and imaginary part, and numbers that are
+    not finite to None."""
     if isinstance(value, dict):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""Files that grow with a stream of any length, in memory that does not grow with it."""
+"""Files that grow with a stream of any length, written with constant memory."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ from numpy.typing import ArrayLike
 from jeit.arguments import counted
 from jeit.files import written_whole
 
-# Bytes that are read, and compressed, at once; and values of a sample at most.
+# Number of bytes read and compressed at once, and maximum number of values of a `Sample`.
 _BLOCK, _MOST = 2**20, 2**16
 
 
 class GrowingTable:
-    """A CSV file of whole lines: each is on the disk when it has been written, or, killed or on a full disk, not at
-    all. What is at its place, a link too, is replaced. Raises `OSError` where it cannot be written."""
+    """A CSV file that is written line by line. Each line is on the disk when `write` returns; if the process is killed
+    or the disk is full, the line is missing, never incomplete. An existing file or link is replaced. Raises `OSError`
+    if the file cannot be written."""
 
     def __init__(self, path: Path, columns: Sequence[str]):
         path.unlink(missing_ok=True)
@@ -34,7 +35,7 @@ class GrowingTable:
         self.write(columns)
 
     def write(self, row: Iterable[Any]) -> None:
-        """Write one line, in one piece."""
+        """Write one line, completely or not at all."""
         text = io.StringIO()
         csv.writer(text).writerow(row)
         line = text.getvalue().encode("utf-8", "backslashreplace")
@@ -54,20 +55,20 @@ class GrowingTable:
 
 
 class GrowingRows:
-    """Arrays (n, *shape) of single precision, row by row in a file without a name: the system takes it back, however
-    this process ends. Raises `OSError` where the disk of `folder` is full."""
+    """Array (n, *shape) of single precision, stored row by row in a temporary file in `folder`. The system deletes the
+    file when the process ends. Raises `OSError` if the disk is full."""
 
     def __init__(self, folder: Path, shape: tuple[int, ...]):
         self.folder, self.shape, self.number = folder, shape, 0
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (closed by the context that this is)
+        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (closed in __exit__)
 
     def append(self, row: Float[np.ndarray, "*shape"]) -> None:
-        """Append one more row."""
+        """Append one row."""
         self._file.write(np.asarray(row, np.float32).tobytes())
         self.number += 1
 
     def read(self, numbers: Iterable[int]) -> Float[np.ndarray, "k *shape"]:
-        """Read some of the rows, after the last has been appended."""
+        """Read the rows of the given `numbers`; call it only after the last `append`."""
         size, rows = 4 * int(np.prod(self.shape)), []
         for number in numbers:
             self._file.seek(size * number)
@@ -77,8 +78,8 @@ class GrowingRows:
     def write_npz(
         self, path: Path, name: str, others: Mapping[str, ArrayLike], progress: Callable[[str], None] | None = None
     ) -> None:
-        """An NPZ file with all rows under `name`, and `others`, whole or not at all; the rows never are in memory.
-        `progress` is called with how far it is, where that takes a while."""
+        """Write an NPZ file, completely or not at all, with all rows as array `name`, and with the arrays `others`. The
+        rows are copied block by block; for large files, `progress` is called with the percentage written."""
         header = {"descr": "<f4", "fortran_order": False, "shape": (self.number, *self.shape)}
         with written_whole(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
@@ -92,7 +93,7 @@ class GrowingRows:
                     np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
 
     def _blocks(self) -> Iterator[tuple[float, bytes]]:
-        """The file, with the share of it that each ends."""
+        """Blocks of the file, each with the share of the file that has been read with it."""
         size = self._file.seek(0, os.SEEK_END)
         self._file.seek(0)
         while block := self._file.read(_BLOCK):
@@ -102,13 +103,14 @@ class GrowingRows:
         return self
 
     def __exit__(self, *_) -> None:
-        with contextlib.suppress(OSError):  # what could not be written is not wanted any more
+        with contextlib.suppress(OSError):  # data not yet written are not needed any more
             self._file.close()
 
 
 @contextlib.contextmanager
 def saying_what_is_left(rows: GrowingRows) -> Iterator[None]:
-    """Raise an `OSError` that comes within, of a full disk, as one that says what there is."""
+    """Context manager that adds to an `OSError`, such as for a full disk, which frames have been written. Raises
+    `OSError`."""
     try:
         yield
     except OSError as error:
@@ -118,14 +120,14 @@ def saying_what_is_left(rows: GrowingRows) -> Iterator[None]:
 
 
 class Sample:
-    """Numbers as they come, all of them while they are few, then every second, every fourth …: some 30,000 to 65,000,
-    evenly chosen."""
+    """Evenly spaced sample of a series of numbers of any length: all numbers up to 65,536, then every second, then
+    every fourth, and so on, so that 32,768 to 65,536 are stored."""
 
     def __init__(self) -> None:
         self._values, self._step, self._number = array("d"), 1, 0
 
     def append(self, value: float) -> None:
-        """The next."""
+        """Add the next number of the series, and store it if it belongs to the sample."""
         if self._number % self._step == 0:
             if len(self._values) == _MOST:
                 self._values, self._step = self._values[::2], 2 * self._step
@@ -133,5 +135,5 @@ class Sample:
         self._number += 1
 
     def values(self) -> Float[np.ndarray, " k"]:
-        """The values that are kept."""
+        """Return the stored values."""
         return np.array(self._values)

@@ -1,4 +1,4 @@
-"""Files of an imaged difference: a picture, arrays, and a report."""
+"""Files of an imaged difference: picture, arrays, and report."""
 
 from __future__ import annotations
 
@@ -26,20 +26,28 @@ from jeit.report.folder import (
 from jeit.report.saved_image import saved_extras
 
 IMAGE_FILES = ("image.png", "image.npz", "report.json", "image.vtu")
-"""What `write_image` writes; the last of solids only."""
+"""Names of the files written by `write_image`; the last is written only for solids."""
 _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix", "matplotlib")
 
 
 def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, float] | None = None) -> None:
-    """Write `image.png`, `image.npz`, `report.json`, and of a solid `image.vtu`, into `folder`, made if need be.
+    """Write `image.png`, `image.npz`, `report.json` and, for a solid, `image.vtu` to `folder`, which is created if
+    needed.
 
-    The NPZ holds `raster` (rows, columns), the change of conductivity (S; 3-D: S/m, half way up), NaN outside the body,
-    row 0 at the top, column 0 at the left; `extent` (x_min, x_max, y_min, y_max) in metres; `conductivity` (m,), the
-    same change per cell; `background`, the conductivity it is a change of; `points` (n, d) and `cells` (m, d + 1); and
-    `labels` (rows, columns), if the image was segmented: 0 background, 1 resistive, 2 conductive; and electrodes and
-    inclusions as `jeit.report.saved_image` says, for `jeit view`. The VTU has the same values per cell, and under which
-    electrode nodes lie. `truth`: a known position (x, y) in metres, marked in the picture of a sheet. Raises
-    `ValueError` for what cannot be a folder.
+    Arrays of the NPZ:
+
+    - `raster`: (rows, columns), change of conductivity, S (3-D: S/m, at half the height), NaN outside the body; row 0
+      is at the top, column 0 at the left.
+    - `extent`: (x_min, x_max, y_min, y_max) in metres.
+    - `conductivity`: (m,), the change of conductivity per cell.
+    - `background`: the conductivity of the reference.
+    - `points`: (n, d); `cells`: (m, d + 1).
+    - `labels`: (rows, columns), if the image was segmented: 0 background, 1 resistive, 2 conductive.
+    - `departure`: (m,), for iterative images, logarithm to base 10 of conductivity divided by background.
+    - electrodes and inclusions, see `jeit.report.saved_image.saved_extras`, for `jeit view`.
+
+    The VTU has the conductivity and its change per cell, and the electrode of each node. `truth`: a known position
+    (x, y) in metres, marked in the picture of a sheet. Raises `ValueError` for a path that cannot be a folder.
     """
     with results(folder, IMAGE_FILES) as made:
         draw_image(result, truth=truth).savefig(made / "image.png", dpi=150)
@@ -54,7 +62,7 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
 
 
 def _arrays(result: ImagedDifference) -> dict[str, Any]:
-    """Arrays of the NPZ."""
+    """Arrays of the NPZ file, by name."""
     arrays: dict[str, Any] = {
         "raster": np.asarray(result.raster),
         "extent": np.asarray(result.extent),
@@ -71,13 +79,14 @@ def _arrays(result: ImagedDifference) -> dict[str, Any]:
 
 
 def _drawn(result: ImagedDifference) -> np.ndarray:
-    """Values of the picture in every cell: iterative images, which range from a hundredth to a hundred times the
-    background, are drawn on a logarithmic scale."""
+    """Values per cell for the picture: the change of conductivity, or, for iterative images, which range from 0.01 to
+    100 times the background, the change of its logarithm to base 10."""
     return np.asarray(result.departure) / (math.log(10) if result.iterative else 1)
 
 
 def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = None):
-    """The picture of a result, as a matplotlib `Figure` that needs no display; both parts of one of admittivity."""
+    """Draw a result, and return a matplotlib `Figure` that needs no display. For an image of admittivity, the real and
+    imaginary part are drawn."""
     from matplotlib.figure import Figure
 
     from jeit.plot.axes import CHANGE, LOGARITHM
@@ -179,7 +188,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
 
 
 def _frame(result: ImagedDifference) -> dict[str, Any]:
-    """The frame that was imaged, of how many: its name, or its number from 0 where it has none."""
+    """Name of the imaged frame, or else its number from 0; and number of frames in the file."""
     names = result.measurement.frame_names
     return {"frame": names[0] if names else result.frame, "frames": result.num_frames}
 
@@ -200,7 +209,7 @@ def _protocol(protocol: Protocol) -> dict[str, Any]:
 
 
 def _calibration(result: ImagedDifference) -> dict[str, Any]:
-    """How the model was fitted to the reference."""
+    """Report of the fit of the model to the reference."""
     calibration = result.calibration
     electrodes = calibration.model.electrodes
     return {
@@ -231,14 +240,14 @@ def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]
 
 
 def _size(inclusion: Inclusion) -> dict[str, Any]:
-    """The volume of an inclusion of a solid, or the area of one of a sheet."""
+    """Size of an inclusion: its volume in a solid, its area in a sheet."""
     if inclusion.is_solid:
         return {"volume": inclusion.area, "volume_unit": "m³"}
     return {"area": inclusion.area, "area_unit": "m²"}
 
 
 def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
-    """Bodies with their outlines, and what was taken for a ghost; None where none were fitted."""
+    """Report of fitted bodies with their outlines, and of bodies left out as artefacts; None if none were fitted."""
     if result.shapes is None:
         return None
     kept, left = (
@@ -274,7 +283,7 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
 
 
 def _form(body: Star | Ellipsoid) -> dict[str, Any]:
-    """Values of a body's form: the outline of a star, the half axes of an ellipsoid or a column."""
+    """Form of a body: area and outline of a star, or volume, centre and half axes of an ellipsoid or a column."""
     if isinstance(body, Star):
         return {"area": body.area, "outline": body.outline}
     form = "column" if body.column else "ellipsoid"
@@ -282,7 +291,7 @@ def _form(body: Star | Ellipsoid) -> dict[str, Any]:
 
 
 def _evidence_text(body: Star | Ellipsoid) -> str:
-    """Source of the conductivity of a body, in words."""
+    """Describe in words whether the conductivity of a body was estimated or assumed."""
     if not body.contrast_is_determined:
         return "assumed, as of what is strong"
     if isinstance(body, Ellipsoid) and body.alike:
@@ -291,7 +300,7 @@ def _evidence_text(body: Star | Ellipsoid) -> str:
 
 
 def _prior(settings: ImagingSettings, dimension: int) -> str | None:
-    """The prior's name, or that of the method's own; None where there is none."""
+    """Name of the prior of the settings or of the method; None for methods without a prior."""
     method = METHODS[settings.method]
     if settings.method == "shapes" and dimension == 3:
         return "ellipsoids and columns"
@@ -301,7 +310,7 @@ def _prior(settings: ImagingSettings, dimension: int) -> str | None:
 
 
 def _iteration(result: ImagedDifference) -> dict[str, Any]:
-    """How the iteration went; nothing for linear images."""
+    """Report of the iteration; empty for images without one."""
     found = result.reconstruction
     if not isinstance(found, Reconstruction):
         return {}

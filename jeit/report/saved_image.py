@@ -1,4 +1,4 @@
-"""Saved images: read back, and drawn again in other views."""
+"""Reading of saved images, and drawing them from other views."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jeit.plot import Camera, ColourScale
 
 _GIVE = "give the image.npz that jeit reconstruct writes"
-# Kinds of files that are no images, by the end of their names.
+# Descriptions of files that are not images, with the suffixes of their names.
 _OTHERS = {
     "a table of data, which is to be imaged first": (".csv", ".txt", ".mat", ".eit", ".get", ".npy"),
     "a picture, which any viewer shows": (".png", ".gif", ".mp4", ".jpg", ".jpeg", ".svg", ".pdf"),
@@ -36,7 +36,7 @@ _OTHERS = {
     "a report": (".json", ".html"),
 }
 _NEEDED = ("conductivity", "points", "cells")
-_KEPT = (
+_READ_ARRAYS = (
     *_NEEDED,
     "background",
     "departure",
@@ -56,10 +56,12 @@ _KEPT = (
 class SavedImage:
     """Content of an `image.npz`: a body and its image.
 
-    **Fields**: `mesh`; `change` (m,) of conductivity in every cell, S/m (of a sheet S), complex of admittivity;
-    `background`, what it is a change of, None where the file does not say; `departure` (m,), the logarithm to the base
-    of ten of conductivity over background, of iterative images, else None; `electrodes`, as polygons, None where the
-    file has none; `inclusions` that were found.
+    - `mesh`: the mesh of the body.
+    - `change`: change of conductivity in every cell (m,), S/m (2-D: S); complex for admittivity.
+    - `background`: conductivity of the reference; None if the file lacks it.
+    - `departure`: (m,), for iterative images, logarithm to base 10 of conductivity divided by background; else None.
+    - `electrodes`: electrodes as polygons; None if the file has none.
+    - `inclusions`: the inclusions found in the image.
     """
 
     mesh: Mesh
@@ -78,10 +80,15 @@ class SavedImage:
 def saved_extras(
     mesh: Mesh, electrodes: AbstractElectrodes, inclusions: tuple[Inclusion, ...]
 ) -> dict[str, np.ndarray]:
-    """Arrays of an `image.npz` beside the image itself: electrodes as polygons, `electrode_corners` (q, d) of all of
-    them, `electrode_sizes` (p,) how many are each one's, `electrode_numbers` (p,) whose, from 0; and of inclusions
-    `inclusion_centroids` (i, d), `inclusion_sizes` (i,) m² (of solids m³), `inclusion_peaks` (i,); of bodies that were
-    fitted to a solid `inclusion_centres` (i, 3), `inclusion_axes` (i, 3, 3) and `inclusion_columns` (i,)."""
+    """Arrays of an `image.npz` for electrodes and inclusions.
+
+    - `electrode_corners`: (q, d), corners of the polygons of all electrodes; `electrode_sizes`: (p,), number of corners
+      of each polygon; `electrode_numbers`: (p,), electrode of each polygon, from 0.
+    - `inclusion_centroids`: (i, d) in metres; `inclusion_sizes`: (i,), area in m² (3-D: volume in m³);
+      `inclusion_peaks`: (i,), change of conductivity.
+    - For bodies fitted in a solid, `inclusion_centres`: (i, 3); `inclusion_axes`: (i, 3, 3), half axes;
+      `inclusion_columns`: (i,), whether the body is a column.
+    """
     shapes, dimension = shapes_of(mesh, electrodes), np.shape(mesh.points)[1]
     extras = {
         "electrode_corners": shapes.corners,
@@ -102,10 +109,10 @@ def saved_extras(
 
 
 def read_image(path: str | Path) -> SavedImage:
-    """The image in an `image.npz` that `jeit reconstruct` or `write_image` wrote.
+    """Read an `image.npz` written by `jeit reconstruct` or `write_image`.
 
-    Files of earlier versions have no electrodes and no inclusions. Raises `ValueError` for files of another kind, or of
-    arrays that do not belong together, `OSError` where there is none.
+    Files of earlier versions lack electrodes and inclusions. Raises `ValueError` for files of another kind and for
+    arrays that do not fit together, and `OSError` if the file does not exist.
     """
     path = Path(path)
     name = path.name[:80]
@@ -115,12 +122,12 @@ def read_image(path: str | Path) -> SavedImage:
         with path.open("rb") as file:
             if file.read(2) != b"PK":
                 raise ValueError(f"not an image that jeit wrote{_instead(path)}; {_GIVE}.")
-        arrays = npz_arrays(path, *_KEPT)
+        arrays = npz_arrays(path, *_READ_ARRAYS)
         _check_kind(arrays)
         need(arrays, *_NEEDED)
         if arrays["points"].dtype.kind not in "fiu":
             raise ValueError(f"'points' is {describe(arrays['points'])}; real numbers are wanted, metres.")
-        with size_checked():  # by the command that wrote it
+        with size_checked():  # the size of the mesh was checked by the command that wrote it
             mesh = Mesh.create(arrays["points"], arrays["cells"])
         return _image(mesh, arrays)
     except ValueError as error:
@@ -128,7 +135,7 @@ def read_image(path: str | Path) -> SavedImage:
 
 
 def _check_kind(arrays: dict[str, np.ndarray]) -> None:
-    """Other files of jeit's that hold arrays: which command is for them."""
+    """Raise `ValueError` for NPZ files that are not an image: series of frames, and files without an image."""
     held = set(arrays[""].tolist())
     if held & {"images", "depth", "functional"}:
         raise ValueError("it holds many frames; give the image.npz of one, of jeit reconstruct.")
@@ -180,7 +187,7 @@ def _electrodes(mesh: Mesh, arrays: dict[str, np.ndarray]) -> ElectrodeShapes | 
     whole = all(one.dtype.kind in "iu" and one.ndim == 1 for one in (sizes, numbers))
     if not (whole and len(sizes) == len(numbers) > 0 and sizes.min() > 0 and sizes.sum() == len(corners)):
         raise ValueError("'electrode_sizes' does not say whose corners 'electrode_corners' are; write it again.")
-    # Every electrode has a polygon, or there would be one without a place.
+    # Every electrode needs a polygon, as otherwise its place is unknown.
     if not np.array_equal(np.unique(numbers), np.arange(numbers.max() + 1)):
         raise ValueError("'electrode_numbers' leave electrodes out; write it again.")
     return ElectrodeShapes(corners.astype(float), sizes, numbers)
@@ -219,8 +226,8 @@ def _forms(arrays: dict[str, np.ndarray], number: int) -> list[SolidForm | None]
 
 
 VIEW_FILES = ("overview.png", "isosurfaces.png", "slices.png", "planes.png", "surface.png", "image.png")
-"""What `write_views` may write: the first three of a solid, planes if any are asked for, the last two of a surface in
-space and of a sheet."""
+"""Names of the files written by `write_views`: the first three for a solid, `planes.png` if planes are given,
+`surface.png` for a surface in space, and `image.png` for a sheet."""
 _HALF, _DPI = (0.5,), 150
 
 
@@ -234,12 +241,16 @@ def write_views(
     axis: str = "z",
     slices: int = 9,
 ) -> tuple[str, ...]:
-    """Write pictures of an image into `folder`, made if need be, and return their names.
+    """Write pictures of an image to `folder`, which is created if needed, and return their names.
 
-    Of a solid: `overview.png`, `isosurfaces.png` at `levels` from the `camera`, from its other side, from the front
-    and from above, `slices.png`, so many across `axis`, and `planes.png` if `planes` are given. Of a surface in space:
-    `surface.png`, from the same sides. Of a sheet: `image.png`. Complex images are drawn by their real part. Raises
-    `ValueError` for planes through what is no solid, for what cannot be a folder, and as `jeit.plot.plot_solid`.
+    - For a solid: `overview.png`; `isosurfaces.png`, isosurfaces at `levels`, seen from the `camera`, from the opposite
+      side, from the front and from above; `slices.png`, the given number of `slices` perpendicular to `axis`; and
+      `planes.png`, sections by `planes`, if any are given.
+    - For a surface in space: `surface.png`, seen from the same sides.
+    - For a sheet: `image.png`.
+
+    For complex images, the real part is drawn. Raises `ValueError` for planes if the body is not a solid, for a path
+    that cannot be a folder, and as `jeit.plot.plot_solid`.
     """
     if image.mesh.dimension != 3 and planes:
         raise ValueError("planes cut solids; this image is of a sheet. Leave them out.")
@@ -251,8 +262,8 @@ def write_views(
 
 
 def drawn_values(image: SavedImage) -> tuple[np.ndarray, "ColourScale"]:
-    """Values per cell that are drawn of an image, and their scale: the departure of iterative images, the real part of
-    complex ones."""
+    """Values per cell to draw, and their colour scale: `departure` for iterative images, the real part of the change
+    for complex images, otherwise the change of conductivity."""
     from jeit.plot.axes import CHANGE, LOGARITHM, ColourScale
 
     if image.departure is not None:

@@ -1,4 +1,4 @@
-"""Reports of series of frames, and films of them."""
+"""Files of series of frames: pictures, arrays, tables, reports and films."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from jeit.report.folder import describe_measurement, plain, results, write_json,
 
 FILMS = (".gif", ".mp4")
 FILM_FRAMES = 120
-"""Frames of a film at most."""
-# Frames per second: the greatest number, and the one used where the stream's rate is not known.
+"""Maximum number of frames of a film."""
+# Frames per second of a film: the maximum, and the default if the rate of the stream is not known.
 _FASTEST, _PACE = 25.0, 10.0
 
 
 def check_film(name: str) -> str:
-    """The name of a film's file. Raises `ValueError` for another ending, a folder in it, and where ffmpeg lacks."""
+    """Check the name of a film's file, and return it. Raises `ValueError` for an unknown suffix, a path with a folder,
+    and for .mp4 if ffmpeg is not installed."""
     if Path(name).suffix.lower() not in FILMS or Path(name).name != name:
         raise ValueError(f"film must be a name that ends in {' or '.join(FILMS)}; it is '{name}'.")
     if name.lower().endswith(".mp4"):
@@ -45,13 +46,17 @@ def write_film(
     limit: float | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> None:
-    """Write the frames of a stream as a film, `path` ending in .gif or .mp4, all on one colour scale.
+    """Write the frames of a stream as a film with one colour scale.
 
-    `changes` and `titles` as in `jeit.plot.plot_frames`: frames that were refused are shown as such. `limit`: the end
-    of the scale, S (3-D: S/m), that of all frames unless given. `rate`: frames of the stream in a second; the film then
-    takes as long as the stream, unless it had more than 25 frames a second; 10 a second unless given. Of long streams
-    120 frames are taken, evenly chosen. `progress` is called with how far it is.
-    Raises `ValueError` for another ending, where ffmpeg lacks, and where every frame was refused.
+    - `path`: ends in .gif or .mp4.
+    - `changes`, `titles`: as in `jeit.plot.plot_frames`; refused frames are shown as refused.
+    - `limit`: end of the colour scale, S (3-D: S/m); default: the maximum over all frames.
+    - `rate`: frames per second of the stream. The film then lasts as long as the stream, but has at most 25 frames per
+      second. Default: a film of 10 frames per second.
+    - `progress`: called with the number of frames drawn.
+
+    For longer streams, 120 evenly spaced frames are drawn. Raises `ValueError` for an unknown suffix, for .mp4 if
+    ffmpeg is not installed, and if every frame was refused.
     """
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
@@ -71,7 +76,7 @@ def write_film(
     if text := slice_text(mesh):
         figure.supxlabel(text, fontsize=9, color=SOFT)
     figure.canvas.draw()
-    figure.set_layout_engine("none")  # or the picture would move from frame to frame
+    figure.set_layout_engine("none")  # prevents a different layout in each frame
     pace = min(_PACE if rate is None else rate * len(chosen) / len(values), _FASTEST)
     writer = (PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter)(fps=max(pace, 0.1))  # pyright: ignore
     with writer.saving(figure, str(path), 80):
@@ -93,13 +98,16 @@ def write_series(
     oscillations: Sequence[Oscillation] = (),
     film: str | None = None,
 ) -> dict[str, Any]:
-    """Write `series.png`, `series.npz`, `regions.csv` and `report.json` into `folder`, and a film if its name is given;
+    """Write `series.png`, `series.npz`, `regions.csv`, `report.json` and, if its name is given, a film to `folder`;
     return the report.
 
-    `regions`: cells (m,) by name; the whole body unless given. `oscillations`: of `found.series.changes`. The table has
-    `time_s` and the mean change of each region, S/m (2-D: S), empty for refused frames. The NPZ holds `changes` (F, m),
-    `times` (F,), `background`, `points`, `cells`, `functional` (m,), and for every oscillation `frequency` (k,),
-    `amplitude` (k, m) and `phase` (k, m) radians. Raises `ValueError` for what cannot be a folder or a film.
+    - `regions`: cells (m,) of each region, by name; default: the whole body.
+    - `oscillations`: oscillations of `found.series.changes`.
+
+    The table has the time in seconds and the mean change of each region, S/m (2-D: S), empty for refused frames. The
+    NPZ has `changes` (F, m), `times` (F,), `background`, `points`, `cells`, `functional` (m,), and, for k oscillations,
+    `frequency` (k,), `amplitude` (k, m) and `phase` (k, m) in radians. Raises `ValueError` for names that cannot be a
+    folder or a film.
     """
     series, model = found.series, found.prepared.model
     chosen = {"whole body": np.ones(series.mesh.num_cells, bool)} if not regions else dict(regions)

@@ -1,4 +1,4 @@
-"""Files of a stream: a line and an image for every frame as it arrives, and pictures at the end."""
+"""Files of a stream: a table and images, written frame by frame, and pictures at the end."""
 
 from __future__ import annotations
 
@@ -19,21 +19,25 @@ from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_i
 from jeit.report.series import FILM_FRAMES, check_film, write_film
 
 PICTURES = ("contact sheet", "film")
-"""Pictures of a stream, by the names that are passed to `drawing`."""
+"""Names of the pictures of a stream, as passed to `drawing`."""
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
 _NOTHING = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
-# Least end of a colour scale, as a share of the background, so that noise alone stays invisible.
+# End of the colour scale of streams without changes, as a share of the background, so that noise is not visible.
 _FAINT = 0.01
-# Refused frames that are named beneath the sheet, at most.
+# Maximum number of refused frames named below the contact sheet.
 _NAMED = 8
 
 
 @dataclass(frozen=True)
 class WrittenStream:
-    """Result of `write_stream`: the `number` of frames, `counts` of them by status, the `latency` in seconds of those
-    that were imaged, (K,), of long streams some of them, evenly chosen, and of the others the `first_reason`, empty if
-    there is none."""
+    """Result of `write_stream`.
+
+    - `number`: number of frames.
+    - `counts`: number of frames by status.
+    - `latency`: (K,) seconds, latencies of the imaged frames, or an evenly spaced sample for long streams.
+    - `first_reason`: reason why the first refused frame was refused; empty if none was.
+    """
 
     number: int
     counts: dict[str, int]
@@ -52,20 +56,24 @@ def write_stream(
     progress: Callable[[FrameImage], None] | None = None,
     drawing: Callable[[str], None] | None = None,
 ) -> WrittenStream:
-    """Write `frames.csv`, a line for every image as it comes, and at the end `images.npz`, `frames.png`, a contact
-    sheet, and a film, into `folder`. A stream may be of any length: its images grow on the disk, not in memory.
+    """Write a stream of any length to `folder`: `frames.csv`, with a line for every frame as it arrives, and at the end
+    `images.npz`, the contact sheet `frames.png`, and a film. Images are stored on the disk, not in memory.
 
-    `images`: those of `jeit.inverse.stream`, of an imager made with `calibration`, see `jeit.imaging.prepare_imager`.
-    The table has the place in metres and the height, S (3-D: S/m), of each image's strongest change, of frames that are
-    unchanged none. The NPZ holds
-    `conductivity` (frames, cells), NaN for frames that were refused, `background`, `points` and `cells`. `film`: the
-    name of its file, ending in .gif or, where ffmpeg is installed, .mp4; None for none. `rate`: frames in a second, for
-    times in place of numbers, and the pace of the film. Pictures are of some frames, evenly chosen, and show refused
-    ones as such; where all are, there is none. `progress` is called with every image, and `drawing` then with what is
-    written ("images") and drawn (one of `PICTURES`), a colon, and how far it is; what it raises leaves what is written
-    by then. An earlier stream's images and pictures are taken away first; each file is whole, or not there. Raises
-    `ValueError`, with the `name` of the stream, if no frame came, and for what cannot be a folder, a film or a rate;
-    `OSError` on a full disk.
+    - `images`: images of `jeit.inverse.stream`, computed by an imager with this `calibration` (see
+      `jeit.imaging.prepare_imager`).
+    - `name`: name of the stream, for error messages.
+    - `film`: name of the film's file, ending in .gif or, if ffmpeg is installed, .mp4; None for no film.
+    - `rate`: frames per second, for titles with times instead of frame numbers, and for the pace of the film.
+    - `progress`: called with every image.
+    - `drawing`: called at the end with the step, "images" or one of `PICTURES`, sometimes followed by a colon and the
+      progress. If it raises, the files written so far remain.
+
+    The table has the place in metres and the value, S (3-D: S/m), of the maximum change of each image; both are empty
+    for unchanged frames. The NPZ has `conductivity` (frames, cells), NaN for refused frames, `background`, `points` and
+    `cells`. Pictures show evenly spaced frames and mark refused ones; no pictures are drawn if all were refused. Images
+    and pictures of an earlier stream are deleted first; each file is written completely or not at all. Raises
+    `ValueError` for a stream without frames and for values that cannot be a folder, a film or a rate, and `OSError` if
+    the disk is full.
     """
     if film is not None:
         check_film(film)
@@ -74,7 +82,7 @@ def write_stream(
     made = ("frames.csv", "images.npz", "frames.png", *([] if film is None else [film]))
     folder = results_folder(folder, made)
     for earlier in made[1:]:
-        (folder / earlier).unlink(missing_ok=True)  # would not go with these frames
+        (folder / earlier).unlink(missing_ok=True)  # it belongs to an earlier stream
     clear_unfinished(folder)
     report = drawing or (lambda said: None)
     mesh, seen = calibration.model.mesh, _Seen(calibration)
@@ -100,7 +108,7 @@ def write_stream(
 
 
 class _Seen:
-    """Values kept of the frames of a stream, of which there may be any number."""
+    """Statistics of the frames of a stream, of constant size for any number of frames."""
 
     def __init__(self, calibration: Calibration):
         self.calibration = calibration
@@ -111,7 +119,7 @@ class _Seen:
         self.refused, self.first_imaged, self.largest = [], -1, 0.0
 
     def take(self, one: FrameImage) -> tuple[list[object], Float[np.ndarray, " m"]]:
-        """The line of a frame in the table, and its image."""
+        """Add a frame to the statistics; return its line of the table, and its image."""
         self.counts[str(one.status)] = self.counts.get(str(one.status), 0) + 1
         if one.conductivity is None:
             self.first_reason = self.first_reason or one.reason
@@ -125,14 +133,16 @@ class _Seen:
 
     @property
     def limit(self) -> float:
-        """The end of the colour scale: where all is noise, it is not to fill the colours."""
+        """End of the colour scale: the maximum change, or, for streams without changes, `_FAINT` times the background,
+        so that noise does not fill the scale."""
         changed = sum(self.counts.values()) > sum(self.counts.get(status, 0) for status in _NOTHING)
         return self.largest if changed else _FAINT * self.background
 
 
 @dataclass(frozen=True)
 class _Pictures:
-    """Pictures to draw into a folder, and the function that progress is reported to."""
+    """Settings of the pictures of a stream: folder, film, frame rate, and the function to which progress is
+    reported."""
 
     folder: Path
     film: str | None
@@ -140,7 +150,7 @@ class _Pictures:
     report: Callable[[str], None]
 
     def draw(self, rows: GrowingRows, seen: _Seen) -> None:
-        """The contact sheet, and the film, of some of the rows."""
+        """Draw the contact sheet and the film from evenly spaced rows."""
         from jeit.plot import ColourScale, plot_frames
         from jeit.plot.imaging.series import SHEET_FRAMES, FrameCount
 
@@ -173,7 +183,7 @@ class _Pictures:
 
         chosen = chosen_frames(rows.number, most)
         images = rows.read(chosen)
-        if not np.isfinite(images).any():  # one that is to be seen
+        if not np.isfinite(images).any():  # include a frame that was imaged
             chosen = sorted({seen.first_imaged, *chosen[1:]})
             images = rows.read(chosen)
         return images - np.float32(seen.background), self._titles(chosen)
@@ -183,7 +193,7 @@ class _Pictures:
 
 
 def _row(one: FrameImage, centre, background: float) -> list[object]:
-    """The columns of a frame."""
+    """Values of a frame for the table."""
     spent = f"{1e3 * one.latency:.3f}"
     if one.conductivity is None:
         return [one.number, one.status, int(one.usable.sum()), "", one.iterations, spent, "", "", "", one.reason]

@@ -1,4 +1,4 @@
-"""Files of images for other programs: VTU, a series of them in time (PVD), and XDMF."""
+"""Files of images for other programs: VTU, time series of VTU files (PVD), and XDMF."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jeit.mesh import Mesh, write
 from jeit.mesh.geometry import facet_measures
 from jeit.report.folder import results_folder
 
-# Share of the surface round a node that an electrode covers if the node is said to be under it.
+# Minimum share of the surface around a node that an electrode must cover for the node to count as under it.
 _UNDER = 0.1
 
 
@@ -30,10 +30,11 @@ def write_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     electrodes: AbstractElectrodes | None = None,
 ) -> None:
-    """Write one VTU file: a mesh with values per cell (m,) and per node (n,), complex ones by their parts.
+    """Write a mesh with values per cell (m,) and per node (n,) as VTU file; complex values are written as two arrays.
 
-    With `electrodes`, values per node say under which each lies, "electrode": its number from 1, 0 elsewhere. Lengths
-    are in metres. Raises `ValueError` for another ending, values of another length and a folder that cannot be.
+    With `electrodes`, the array "electrode" has the number of the electrode at each node, from 1, and 0 for other
+    nodes. Lengths are in metres. Raises `ValueError` for another suffix, values of another length, and a path that
+    cannot be written to.
     """
     path = Path(path)
     if path.suffix.lower() != ".vtu":
@@ -50,7 +51,7 @@ def draft_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     electrodes: AbstractElectrodes | None = None,
 ) -> None:
-    """As `write_vtu`, in a folder whose files take their places later."""
+    """Write a VTU file as `write_vtu`, but directly to `path`, such as in the temporary folder of `results`."""
     at_nodes = dict(point_data or {})
     if electrodes is not None:
         at_nodes["electrode"] = electrode_of_nodes(mesh, electrodes)
@@ -58,10 +59,11 @@ def draft_vtu(
 
 
 def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
-    """Write a series in time: `path`, a .pvd file that ParaView opens, beside one VTU for each frame.
+    """Write a time series as a .pvd file, which ParaView opens, and one VTU file for each frame.
 
-    `times` (F,) seconds; `cell_data`: names and values (F, m). The VTU files are named after the series,
-    `breath_0000.vtu`. All are written or none. Raises `ValueError` for another ending and arrays that do not fit.
+    `times`: (F,) seconds; `cell_data`: values (F, m) by name. The VTU files are named after the series, such as
+    `breath_0000.vtu`. Either all files are written or none. Raises `ValueError` for another suffix, and for arrays that
+    do not fit together.
     """
     path = Path(path)
     if path.suffix.lower() != ".pvd":
@@ -87,8 +89,8 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
 
 
 def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
-    """Write a series in time as one XDMF file of text, with no other beside it; arguments as of `write_vtk_series`.
-    Raises `ValueError` as that does, for an ending other than .xdmf."""
+    """Write a time series as a single XDMF file in text format; arguments as for `write_vtk_series`. Raises
+    `ValueError` for a suffix other than .xdmf, and for arrays that do not fit together."""
     from meshio.xdmf import TimeSeriesWriter
 
     path = Path(path)
@@ -107,7 +109,7 @@ def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mappin
 
 
 def electrode_of_nodes(mesh: Mesh, electrodes: AbstractElectrodes) -> Int[np.ndarray, " n"]:
-    """The number, from 1, of the electrode that each node of a mesh lies under; 0 for none."""
+    """Number, from 1, of the electrode at each node of a mesh (n,); 0 for nodes without an electrode."""
     contact = electrodes.contact(mesh)
     load = np.asarray(contact.load)
     if not electrodes.is_point:
@@ -123,7 +125,7 @@ def electrode_of_nodes(mesh: Mesh, electrodes: AbstractElectrodes) -> Int[np.nda
 
 
 def _real(data: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
-    """Values with complex ones by their parts."""
+    """Replace complex arrays by two arrays, their real and imaginary part."""
     found = {}
     for name, values in data.items():
         array: Any = np.asarray(values)
@@ -135,7 +137,7 @@ def _real(data: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:
 
 
 def _frames(mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> tuple[np.ndarray, dict[str, Any]]:
-    """Times and values of the frames of a series, checked."""
+    """Check the times and values of a series, and return them as arrays. Raises `ValueError` if they do not fit."""
     check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
     seconds: Sequence | np.ndarray = np.atleast_1d(np.asarray(times, dtype=object))
     if len(seconds) == 0 or not all(is_number(one) for one in seconds):

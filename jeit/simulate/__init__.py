@@ -1,4 +1,4 @@
-"""What was simulated here is simulated in `jeit.touch.simulate`, `jeit.acoustic.simulate` and `jeit.data` now."""
+"""Deprecated: the simulations are now in `jeit.touch.simulate`, `jeit.acoustic.simulate` and `jeit.data`."""
 
 from __future__ import annotations
 

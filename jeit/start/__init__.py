@@ -1,5 +1,5 @@
-"""Set-up of JAX on importing jeit: double precision, a place where compiled code is kept between runs, flags of its
-compiler, and what happens in forked processes."""
+"""Set-up of JAX on importing jeit: double precision, a cache of compiled code, compiler flags, and errors in forked
+processes."""
 
 from __future__ import annotations
 

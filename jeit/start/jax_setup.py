@@ -1,4 +1,4 @@
-"""Set-up of JAX."""
+"""Functions that configure JAX: precision, compiler, cache of compiled code, and forked processes."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ import jax
 
 
 def take_double_precision() -> None:
-    """Set JAX to double precision: a light touch changes voltages by 1e-4, for which single precision is not enough.
-    JAX_ENABLE_X64 set by the user takes precedence, with a warning of the cost of single precision
-    (docs/numerics.md)."""
+    """Set JAX to double precision: a light touch changes voltages by 1e-4, for which single precision is not accurate
+    enough. If the user has set JAX_ENABLE_X64, it takes precedence; single precision then raises a warning about its
+    cost (docs/numerics.md)."""
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", True)
     elif not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
@@ -35,10 +35,10 @@ def take_double_precision() -> None:
 
 
 def quick_compilation() -> str:
-    """A value for the environment variable XLA_FLAGS, to be set before JAX computes anything.
+    """A value of the environment variable XLA_FLAGS for fast compilation, to be set before JAX computes anything.
 
-    Code without optimisation takes a quarter of the time to compile. XLA ends the process at flags that it does not
-    know, and they come and go.
+    Code without optimisation compiles in a quarter of the time. The flags depend on the version of jaxlib, because XLA
+    aborts the process at unknown flags.
     """
     fusion = " --xla_cpu_use_fusion_emitters=false" if version("jaxlib").startswith("0.10.") else ""
     return f"--xla_backend_optimization_level=0{fusion}"
@@ -48,19 +48,19 @@ _refusing = False
 
 
 def refuse_compiled_code_in_forks() -> None:
-    """Make compiled code raise `RuntimeError` in processes that `os.fork` makes once JAX has started: its threads are
-    not in them, so that a program would wait for ever. Methods that run in NumPy still work; and where a process forks
-    before JAX has started, everything works."""
+    """Make compiled code raise `RuntimeError` in processes forked after JAX has started. Such a process lacks JAX's
+    threads, so a compiled program would wait forever. Methods that run in NumPy still work, and a process forked before
+    JAX has started is not restricted."""
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=_forked)
+        os.register_at_fork(after_in_child=_refuse_in_child)
 
 
-def _forked() -> None:
+def _refuse_in_child() -> None:
     global _refusing
     if _refusing or not _has_started():
         return
     _refusing = True
-    jax.clear_caches()  # nothing compiled before the fork is found again, and what is traced anew is refused
+    jax.clear_caches()  # programs compiled before the fork are dropped, and new ones are refused
     jax.monitoring.register_event_duration_secs_listener(_refuse)
 
 
@@ -71,7 +71,7 @@ def _has_started() -> bool:
 
 
 def _refuse(event: str, duration_secs: float, **_: str | int) -> None:
-    """A listener to JAX's monitoring events: raises before a program is compiled, after tracing."""
+    """Listener to JAX's monitoring events that raises after tracing, before a program is compiled."""
     del duration_secs
     if event.startswith("/jax/core/compile"):
         raise RuntimeError(
@@ -85,13 +85,13 @@ _MOST_BYTES, _MOST_FILES = 256 * 2**20, 5000
 
 
 def keep_compiled_code() -> None:
-    """Keep compiled programs in the user's cache folder, so that a program is compiled once on a machine, not in every
-    process.
+    """Keep compiled programs in the user's cache folder, so that a program is compiled once per machine instead of once
+    per process.
 
-    Does nothing if the user has set where JAX keeps them (`JAX_COMPILATION_CACHE_DIR`, or `jax_compilation_cache_dir`),
-    if `JEIT_COMPILATION_CACHE` is "off", or where no folder can be written to. JAX looks programs up by their text and
-    by its own and the compiler's versions. Those used longest ago go when there are thousands, or a quarter of a
-    gigabyte.
+    Does nothing if the user has set a cache folder for JAX (`JAX_COMPILATION_CACHE_DIR`, or
+    `jax_compilation_cache_dir`), if `JEIT_COMPILATION_CACHE` is "off", or if the folder cannot be written to. JAX
+    identifies programs by their text and by the versions of JAX and of the compiler. The least recently used programs
+    are deleted when there are more than 5,000 files or 256 MiB.
     """
     given = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
     asked = os.environ.get("JEIT_COMPILATION_CACHE", "").strip().lower()
@@ -111,9 +111,11 @@ def keep_compiled_code() -> None:
 
 
 def discarded_damaged(warning: str) -> bool:
-    """Whether a warning is JAX's that it could not read a program it kept; all kept under its name are gone then.
+    """Whether a warning is JAX's message that it could not read a cached program; if so, all cached files of that name
+    are deleted.
 
-    It would compile it anew in every process to come, and say so again: it does not write over what is there.
+    Otherwise JAX, which does not overwrite cached files, would compile the program again and repeat the warning in
+    every later process.
     """
     given = re.match(r"Error reading persistent compilation cache entry for '([\w<>.-]+)'", warning)
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
@@ -126,7 +128,8 @@ def discarded_damaged(warning: str) -> bool:
 
 
 def _processor() -> str:
-    """A name for this kind of processor: where homes are shared, its code must not run on another."""
+    """Identifier of the type of processor, because code compiled for one type must not run on another where home
+    folders are shared."""
     described = platform.machine() + platform.processor()
     with contextlib.suppress(OSError), open("/proc/cpuinfo") as lines:
         described += next((line for line in lines if line.startswith(("flags", "Features"))), "")
@@ -134,9 +137,9 @@ def _processor() -> str:
 
 
 def _discard_oldest(folder: Path) -> None:
-    """Remove the oldest files where there are too many, and empty ones, as are left by a full disk, which JAX would
-    fail to read."""
-    kept = sorted(_used(folder), reverse=True)
+    """Delete the least recently used files beyond the limits, and empty files, which a full disk leaves and JAX cannot
+    read."""
+    kept = sorted(_file_usage(folder), reverse=True)
     size = 0
     for number, (_, bytes_taken, path) in enumerate(kept):
         size += bytes_taken
@@ -144,10 +147,10 @@ def _discard_oldest(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _used(folder: Path) -> Iterator[tuple[float, int, Path]]:
-    """When each file was last used, its bytes, and its path."""
+def _file_usage(folder: Path) -> Iterator[tuple[float, int, Path]]:
+    """Time of last use, size in bytes, and path of each file."""
     for path in folder.glob("*/*"):
-        with contextlib.suppress(FileNotFoundError):  # another process discards too
+        with contextlib.suppress(FileNotFoundError):  # another process may delete the file
             given = path.stat()
             yield max(given.st_atime, given.st_mtime), given.st_size, path
 

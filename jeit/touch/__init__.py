@@ -1,11 +1,11 @@
 """Estimate from frames where, how hard and how a skin is touched.
 
-Packages: `contacts` (contacts in images, from frame to frame, in newtons), `learnt` (skins that learn from recorded
-presses, without a model), `kohonen` (self-organising maps of frames), `gestures` (touches of a stream, and their
-gestures), `health` (cuts, failing electrodes, repair), `attributes` (the resolution of a skin), `training` (of
-networks, and their files), `networks` (that image).
+Packages: `contacts` (detection of contacts in images, tracking, and their loads in newtons), `learnt` (skins that learn
+from recorded presses, without a model), `kohonen` (self-organising maps of frames), `gestures` (touches of a stream,
+and their gestures), `health` (cuts, failing electrodes, repair), `attributes` (resolution of a skin), `training`
+(training of networks, and files of trained networks), `networks` (networks that estimate maps of indentation depth).
 
-`LogitBoostClassifier` is imported when it is first used, and scikit-learn with it.
+`LogitBoostClassifier`, and scikit-learn with it, is imported when it is first used.
 """
 
 from __future__ import annotations

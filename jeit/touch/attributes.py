@@ -1,7 +1,7 @@
-"""The five attributes of touch of Silvera Tawil et al. 2011, section IV-A: measures of a skin's resolution.
+"""Five measures of a skin's resolution: the attributes of touch of Silvera Tawil et al. 2011, section IV-A.
 
-Each is computed from recordings of a skin; `touch_attributes` requests all the touches that it needs, from a robot or a
-simulated skin, and measures them all.
+Each is computed from recordings of a skin. `touch_attributes` requests all the touches that are needed, from a robot or
+a simulated skin, and computes all five.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.touch.contacts import Contact, ImageNoise, find_contacts
 from jeit.touch.contacts.finder import AbstractFinder
 
-# The least number of loads, and of touches with each.
+# Minimum number of different loads; minimum number of touches with each.
 _LEVELS, _REPEATS = 3, 3
-# Shares of the response's rise or fall at which its time begins and ends.
+# Fractions of the maximum response between which rise and fall times are measured.
 _BEGUN, _DONE = 0.1, 0.9
 
 
 class Localisation(NamedTuple):
     """Error of the estimated places of touches.
 
-    `mean`, standard `deviation` and `most`, the greatest, metres; `missed`: the share of touches that were not found.
+    `mean`, `deviation` and `most`: mean, standard deviation and maximum of the error, metres; `missed`: share of
+    touches that were not found.
     """
 
     mean: float
@@ -39,10 +40,10 @@ class Localisation(NamedTuple):
 
 
 class ContactArea(NamedTuple):
-    """Linear relation of estimated to true contact areas: `least` + `gain` × the true area, m², with this
-    `correlation`.
+    """Linear relation between contact areas: the estimated area is `least` + `gain` × the true area, m².
 
-    `least` is the estimated area of a point, a measure of the skin's blur.
+    `least`: estimated area of a contact at a point, a measure of the skin's blur, m²; `correlation`: correlation of the
+    estimated with the true areas.
     """
 
     gain: float
@@ -51,13 +52,13 @@ class ContactArea(NamedTuple):
 
 
 def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Weber's ratio: at each of the k loads, newtons, the least relative change of load that can be detected.
+    """Weber's ratio at each of k loads: the smallest relative change of load that can be detected.
 
-    It is the standard deviation of the response to the load over its slope, and over the load; infinite where the
-    response does not rise. Returns the loads and the ratios. `load` (n,), newtons, three or more different loads, each
-    applied three times or more; `response` (n,), in any unit, such as the peak of an image. Such a change moves the
-    response by one deviation (d′ = 1). Raises `ValueError` for fewer, loads that are not positive, other lengths, and
-    NaN.
+    A change of load is detected if it changes the response by one standard deviation (d′ = 1). So the ratio is the
+    standard deviation of the response, divided by the slope of the response against the load, and by the load. It is
+    infinite where the response does not rise. `load` (n,), newtons: three or more different loads, each applied three
+    times or more; `response` (n,), in any unit, such as the peak of an image. Returns the loads (k,), newtons, and the
+    ratios (k,). Raises `ValueError` for fewer loads, loads that are not positive, arrays of different lengths, and NaN.
     """
     load, response = _pair("load", load, "response", response)
     if (load <= 0).any():
@@ -76,10 +77,9 @@ def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray,
 
 
 def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
-    """Error of touches at a `place` (n, 2 or 3) that are `found` (n, 2 or 3) elsewhere, metres; NaN where none was
-    found.
+    """Compute the error of places `found` (n, 2) or (n, 3) for touches at the true places `place`, metres.
 
-    Raises `ValueError` for other shapes, and where nothing was found at all.
+    `found` is NaN for touches that were not found. Raises `ValueError` for other shapes, and if no touch was found.
     """
     place = real_array("place", place, "metres (n, 2) or (n, 3)")
     found = real_array("found", found, "metres, as many as places, NaN where nothing was found")
@@ -94,11 +94,12 @@ def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
 
 
 def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
-    """The least amount that is detected in half of the trials, in its unit; infinite if there is none.
+    """Compute the smallest amount that is detected in half of the trials, in its unit; infinite if there is none.
 
-    An amount may be the separation of two points that are distinguished, or the gap between two touches. `amount` (n,)
-    of each trial; `detected` (n,), true or false. The detected share is assumed to rise with the amount (isotonic
-    regression), linearly between amounts. Raises `ValueError` for other lengths, and NaN.
+    An amount may be the separation of two points that are distinguished, or the gap between two touches. `amount` (n,):
+    the amount in each trial; `detected` (n,): whether it was detected, true or false. The share of detections is
+    assumed to rise with the amount (isotonic regression), and is interpolated linearly between amounts.
+    Raises `ValueError` for arrays of different lengths, and NaN.
     """
     from scipy.optimize import isotonic_regression
 
@@ -118,9 +119,9 @@ def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
 
 
 def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
-    """Fit areas `found` (n,) to the true areas `area` (n,), m², by least squares.
+    """Fit a linear relation between true areas `area` (n,) and estimated areas `found` (n,), m², by least squares.
 
-    Raises `ValueError` for other lengths, NaN, and areas that are all the same.
+    Raises `ValueError` for arrays of different lengths, NaN, and true areas that are all the same.
     """
     area, found = _pair("area", area, "found", found)
     if len(area) < 2 or (area == area[0]).all():
@@ -131,11 +132,12 @@ def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
 
 
 def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, float]:
-    """Rise and fall time, seconds, of the response (T,) to a touch that begins and ends abruptly.
+    """Compute the rise time and the fall time, seconds, of the response to a touch that begins and ends abruptly.
 
-    The rise is from 10 to 90 % of the greatest value, the fall from 90 to 10 % after its last occurrence; the fall is
-    infinite where the `seconds` (T,) end before it. Before the first frame nothing touches. Raises `ValueError` for
-    other lengths, times that do not rise, NaN, and a response that is nowhere positive.
+    `seconds` (T,): times of the frames; `response` (T,): the response at these times. Nothing touches the skin before
+    the first frame. The rise time is from 10 to 90 % of the maximum; the fall time is from the last value above 90 % to
+    10 %, and infinite if the recording ends before. Raises `ValueError` for arrays of different lengths, times that do
+    not increase, NaN, and a response that is nowhere positive.
     """
     seconds, response = _pair("seconds", seconds, "response", response)
     if (np.diff(seconds) <= 0).any():
@@ -151,7 +153,7 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
 
 
 def _pair(first: str, one: ArrayLike, second: str, other: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Check that both are (n,) and finite."""
+    """Convert two arrays to numbers, and check that both are (n,) and finite."""
     left, right = real_array(first, one, "numbers (n,)"), real_array(second, other, "numbers (n,)")
     if left.ndim != 1 or left.shape != right.shape or not left.size:
         raise ValueError(f"{first} and {second} must be (n,), as many; they have shapes {left.shape}, {right.shape}.")
@@ -161,17 +163,21 @@ def _pair(first: str, one: ArrayLike, second: str, other: ArrayLike) -> tuple[np
     return left, right
 
 
-# Numbers of untouched frames, repeats of a load, places, and trials of each separation.
+# Number of untouched frames; number of repetitions of each load and of each area; number of places; number of trials of
+# each separation.
 _UNTOUCHED, _PRESSED_TIMES, _PLACES, _TRIALS = 50, 8, 40, 8
-# As multiples of the load: those at which Weber's ratio is measured. As multiples of the disc's diameter: separations,
-# from centre to centre, and diameters of other discs under the same pressure.
+# Loads at which Weber's ratio is measured, relative to the given load; distances between the centres of two discs,
+# relative to the given diameter; diameters of discs under the same pressure, relative to the given diameter.
 _LOADS = np.geomspace(0.25, 4.0, 7)
 _SEPARATIONS = np.array([1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0])
 _DIAMETERS = np.array([1.0, 1.5, 2.0, 3.0, 4.0])
 
 
 class DiscTouch(NamedTuple):
-    """A flat disc of a `diameter`, metres, that presses with a `load`, newtons, at a `place` (x, y), metres."""
+    """A flat disc that presses on a skin.
+
+    `place`: (x, y), metres; `load`: its force, newtons; `diameter`, metres.
+    """
 
     place: Float[np.ndarray, "2"]
     load: float
@@ -181,10 +187,11 @@ class DiscTouch(NamedTuple):
 class TouchAttributes(NamedTuple):
     """The attributes of touch of a skin.
 
-    **Fields**: `load` (k,), newtons, and `weber` (k,), the least relative change of each that is detected;
-    `localisation`, metres; `two_points`, metres, the distance between the centres of two discs that are distinguished
-    in half of the trials; `area`; `rise` and `fall`, seconds, of the image's response to a touch that begins and ends
-    abruptly, None where none was recorded.
+    **Fields**: `load` (k,): loads, newtons; `weber` (k,): smallest relative change of each load that is detected;
+    `localisation`: error of places, metres; `two_points`: distance between the centres of two discs that are
+    distinguished in half of the trials, metres; `area`: relation of estimated to true contact areas; `rise` and `fall`:
+    rise and fall time of the response to a touch that begins and ends abruptly, seconds, None if no such touch was
+    recorded.
     """
 
     load: Float[np.ndarray, " k"]
@@ -209,15 +216,15 @@ def touch_attributes(
     recording: tuple[ArrayLike, ArrayLike] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> TouchAttributes:
-    """Measure a real or simulated skin, through `linear` images of its changes and the contacts that `finder` finds.
+    """Measure a real or simulated skin, by `linear` images of its changes and the contacts that `finder` finds.
 
-    `press` is given n touches, each a list of simultaneous discs, none for an untouched skin, and returns a frame (n,
-    M), volts, of each: a robot with discs, or a simulated skin. Discs of a `diameter`, metres, press with a `load`,
-    newtons, or from a quarter to four times that, near the `middle` (x, y); for localisation, anywhere in a disk of
-    radius `within`, metres, about it. `recording`: seconds (T,), and frames (T, M) of one touch that begins and ends
-    abruptly. `key` draws places and directions; `progress` is called with what is measured. Raises `ValueError` for
-    what is no key, image or finder, sizes and loads that are not positive, frames of another shape, and a skin on which
-    nothing is found.
+    `press`: a function of n touches, each a list of simultaneous discs, empty for an untouched skin, that returns their
+    frames (n, M), volts; it commands a robot with discs, or simulates a skin. Discs have a `diameter`, metres, and
+    press with a `load`, newtons; some touches have other diameters, or a quarter to four times the load. Touches are
+    near the `middle` (x, y), for localisation anywhere within the radius `within` of it, metres. `recording`: times
+    (T,), seconds, and frames (T, M), volts, of a touch that begins and ends abruptly. `key`: draws places and
+    directions; `progress`: is called with what is being measured. Raises `ValueError` for an invalid key, images or
+    finder, sizes and loads that are not positive, frames of another shape, and a skin on which no touch is found.
     """
     check_key(key)
     if not callable(press):
@@ -245,12 +252,12 @@ def touch_attributes(
     report("Weber ratio")
     loads = np.repeat(load * _LOADS, _PRESSED_TIMES)
     levels, weber = weber_ratio(
-        loads, [_size(one) for one in contacts([[DiscTouch(centre, n, diameter)] for n in loads])]
+        loads, [_peak(one) for one in contacts([[DiscTouch(centre, n, diameter)] for n in loads])]
     )
     report("localisation")
     places = centre + (within * np.sqrt(random.uniform(size=_PLACES)))[:, None] * _directions(random, _PLACES)
     found = contacts([[DiscTouch(place, load, diameter)] for place in places])
-    localisation = point_localisation(places, np.array([_where(one) for one in found]))
+    localisation = point_localisation(places, np.array([_centroid(one) for one in found]))
     report("two points")
     apart = np.repeat(_SEPARATIONS * diameter, _TRIALS)
     half = apart[:, None] / 2 * _directions(random, len(apart))
@@ -265,7 +272,7 @@ def touch_attributes(
         report("times")
         seconds = real_array("recording", recording[0], "seconds (T,), and frames (T, M)")
         frames = _frames(recording[1], len(np.atleast_1d(seconds)), linear)
-        rise, fall = response_times(seconds, [_size(one) for one in contacts_in(frames)])
+        rise, fall = response_times(seconds, [_peak(one) for one in contacts_in(frames)])
     return TouchAttributes(levels, weber, localisation, two_points, area, rise, fall)
 
 
@@ -281,12 +288,12 @@ def _directions(random: np.random.Generator, number: int) -> Float[np.ndarray, "
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _size(found: list[Contact]) -> float:
+def _peak(found: list[Contact]) -> float:
     """Peak of the strongest contact; 0 if there is none."""
     return abs(found[0].peak) if found else 0.0
 
 
-def _where(found: list[Contact]) -> np.ndarray:
+def _centroid(found: list[Contact]) -> np.ndarray:
     """Centroid of the strongest contact; NaN if there is none."""
     return found[0].centroid if found else np.full(2, np.nan)
 

@@ -1,12 +1,12 @@
-"""Numerics with no physics in it, in pure JAX.
+"""Numerical methods that do not depend on the physics, in JAX and NumPy.
 
-- `sparse`: symmetric systems by a direct solver (nested dissection, multifrontal Cholesky in batches of dense fronts)
-  or conjugate gradients, for `SparseSymmetric` operators and behind `lineax.linear_solve`; and the functions beneath,
-  for when every microsecond counts: `analyse`, `factorise`, `solve`;
-- `dense`: small systems that batch;
-- `optimise`: descent along quadratic models, many small problems at once, problems between bounds, derivatives of a
+- `sparse`: symmetric sparse systems, solved directly (nested dissection, multifrontal Cholesky factorisation in batches
+  of dense fronts) or by conjugate gradients, for `SparseSymmetric` operators and through `lineax.linear_solve`; and the
+  underlying functions `analyse`, `factorise`, `solve`, for calls with the least overhead;
+- `dense`: small dense systems in batches;
+- `optimise`: descent along quadratic models, many small problems at once, problems with bounds, derivatives of a
   minimum, and `Status`;
-- `kmeans`; `over_cores`, `on_cores` and `in_turn`, which share work out.
+- `kmeans`: clustering; `over_cores`, `on_cores` and `in_turn`: distribution of work.
 """
 
 from __future__ import annotations

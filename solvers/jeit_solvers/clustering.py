@@ -1,8 +1,8 @@
-"""k-means: points parted into clusters about their means, by matrix products.
+"""k-means clustering by matrix products.
 
-Lloyd's steps from greedy k-means++ starts, several times over. A step costs one product of (k, d) with (d, n), less as
-clusters come to rest; everything else is small beside it. Points are centred first, so that the distances
-‖x‖² - 2 x·c + ‖c‖² keep their digits however far the points lie from the origin.
+Lloyd's algorithm is run from several greedy k-means++ starts. An iteration costs a product of (k, d) with (d, n), less
+once clusters no longer move; everything else is small in comparison. Points are centred first, so that the distances
+‖x‖² - 2 x·c + ‖c‖² stay accurate however far the points lie from the origin.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from jeit_solvers.engines import has_values, in_turn
 class KMeans(eqx.Module):
     """Result of k-means.
 
-    `centres` (k, d), the means of the clusters; `labels` (n,), which cluster each point belongs to; `inertia`, the sum
-    of the squared distances of points to their centres; of the restart that is kept, the `steps` it took and whether
-    it `converged`.
+    **Fields**: `centres`: (k, d) means of the clusters; `labels`: (n,) cluster of each point; `inertia`: sum of the
+    squared distances of points to their centres; `steps`: number of iterations of the best restart; `converged`:
+    whether the best restart converged.
     """
 
     centres: Float[Array, "k d"]
@@ -43,22 +43,22 @@ def kmeans(
     max_steps: int = 300,
     tolerance: float = 0.0,
 ) -> KMeans:
-    """Part `points` (n, d) into `num_clusters` k clusters of least inertia: the best of several local minima.
+    """Partition `points` (n, d) into `num_clusters` k clusters of minimum inertia: the best of several local minima.
 
     Lloyd's algorithm (IEEE Trans. Inf. Theory 28, 1982) from greedy k-means++ starts (Arthur and Vassilvitskii 2007).
-    Clusters that lose all points are given those farthest from their centres; one can end up empty only where fewer
-    than k points differ. A batch of point sets goes through `jax.vmap`. Centres and inertia have derivatives, the
-    labels being held.
+    Clusters that lose all points receive the points farthest from their centres; a cluster can remain empty only if
+    fewer than k points differ. Batches of point sets are supported through `jax.vmap`. Centres and inertia are
+    differentiable, with the labels held constant.
 
     **Arguments:**
 
     - `key`: from `jax.random.key`; the same key gives the same clusters.
-    - `restarts`: how many starts to try.
-    - `max_steps`: of Lloyd's algorithm, for each start.
-    - `tolerance`: stop when a step lowers the inertia by no more than this share of it; 0 goes on until no point
-      changes its cluster.
+    - `restarts`: number of starts.
+    - `max_steps`: maximum number of iterations of Lloyd's algorithm for each start.
+    - `tolerance`: stop when an iteration lowers the inertia by no more than this fraction of it; with 0, iterate until
+      no point changes its cluster.
 
-    Raises `ValueError` for shapes, counts and points that make no sense.
+    Raises `ValueError` for invalid shapes, counts, tolerances, keys and points.
     """
     if np.ndim(points) != 2 or 0 in np.shape(points):
         raise ValueError(f"points has shape {np.shape(points)}; give (n, d), one row for each point.")
@@ -86,7 +86,7 @@ def _check_count(name: str, count: int) -> None:
 
 @partial(jax.jit, static_argnums=(3, 4))
 def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int) -> KMeans:
-    # Labels have no derivative; means with labels held have one, without a loop in it.
+    # Labels have no derivative. Means for constant labels have one, which needs no loop.
     find = in_turn(partial(_best_of_all, num_clusters, restarts))
     best = find(jax.lax.stop_gradient(points), key, stop)
     centres = _means(points, best.labels, best.centres)
@@ -100,7 +100,7 @@ def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int
 
 
 class _State(eqx.Module):
-    """State of Lloyd's algorithm: the labels are of the nearest centres, at squared `distance` (n,)."""
+    """State of Lloyd's algorithm: `labels` of the nearest centres, at the squared `distance` (n,)."""
 
     centres: Float[Array, "k d"]
     labels: Int[Array, " n"]
@@ -114,8 +114,9 @@ def _best_of_all(num_clusters: int, restarts: int, points, key, stop) -> _State:
     middle = jnp.mean(points, axis=0)
     centred = points - middle
     squares = jnp.sum(centred**2, axis=1)
-    # Starts all take the same number of steps: side by side, the points go through memory once for all of them. How
-    # many steps follow differs: one after the other, none waits for the slowest.
+    # All starts take the same number of steps, so they run side by side, and the points pass through memory once for
+    # all of them. The number of later iterations differs, so these run one after the other, and none waits for the
+    # slowest.
     draws = jax.random.uniform(key, (restarts, num_clusters, _trials(num_clusters)), points.dtype)
     starts = jax.vmap(lambda draws: _start(centred, squares, draws))(draws)
     descend = in_turn(_lloyd)
@@ -125,13 +126,14 @@ def _best_of_all(num_clusters: int, restarts: int, points, key, stop) -> _State:
 
 
 def _trials(num_clusters: int) -> int:
-    """Points to draw for every centre of a start, as many as in scikit-learn."""
+    """Number of points to draw for every centre of a start, as in scikit-learn."""
     return 2 + int(np.log(num_clusters))
 
 
 def _start(points, squares, draws: Float[Array, "k trials"]) -> Float[Array, "k d"]:
-    """Greedy k-means++: of a few points drawn with the square of their distance to the nearest centre as weight, the
-    next centre is the one that lowers the sum of these squares most. `draws`: numbers from 0 to 1."""
+    """Greedy k-means++: a few points are drawn with weights equal to their squared distance to the nearest centre, and
+    the next centre is the drawn point that lowers the sum of these squares most. `draws`: random numbers from 0 to
+    1."""
     last = len(points) - 1
 
     def distance(index):
@@ -151,17 +153,18 @@ def _start(points, squares, draws: Float[Array, "k trials"]) -> Float[Array, "k 
 
 
 def _lloyd(start, points, squares, stop) -> _State:
-    """Means of the clusters, clusters about the means, until nothing changes; `stop`: most steps, and tolerance."""
+    """Alternate means of the clusters and assignment to the nearest means until nothing changes. `stop`: maximum number
+    of steps, and tolerance."""
     num_clusters = len(start)
     max_steps, tolerance = stop
     part = -(-num_clusters // 3)
 
     def score(centres):
-        """Squared distances to the points, less the points' own squares."""
+        """Squared distances to the points, minus the squared norms of the points."""
         return jnp.sum(centres**2, axis=1)[:, None] - 2 * centres @ points.T
 
     def score_moved(scores, centres, moved):
-        """Centres at rest keep their scores; after a few steps most are."""
+        """Scores of the centres that moved; the others keep their scores, as most do after a few steps."""
 
         def some():
             index = jnp.nonzero(moved, size=part, fill_value=num_clusters)[0]
@@ -170,7 +173,8 @@ def _lloyd(start, points, squares, stop) -> _State:
         return jax.lax.cond(jnp.sum(moved) <= part, some, lambda: score(centres))
 
     def assign(scores):
-        """The first of the nearest centres; a minimum runs many times as fast as jnp.argmin does on a CPU."""
+        """Labels, distances and inertia for the first of the nearest centres. A minimum is many times faster than
+        jnp.argmin on a CPU."""
         least = jnp.min(scores, axis=0)
         row = jnp.arange(num_clusters)[:, None]
         labels = jnp.min(jnp.where(scores == least, row, num_clusters - 1), axis=0)
@@ -198,7 +202,7 @@ def _lloyd(start, points, squares, stop) -> _State:
 
 
 def _fill(labels, distance, counts) -> Int[Array, " n"]:
-    """Labels with the points farthest from their centres, farthest first, handed to the empty clusters in order."""
+    """Labels after moving the points farthest from their centres, farthest first, to the empty clusters in order."""
     empty = counts == 0
     spare = jnp.where(counts[labels] > 1, distance, -1)
     farthest = jax.lax.top_k(spare, len(counts))[1]
@@ -211,7 +215,7 @@ def _count(labels, num_clusters: int) -> Int[Array, " k"]:
 
 
 def _means(points, labels, otherwise) -> Float[Array, "k d"]:
-    """Mean of the points of each cluster, and `otherwise` (k, d) of those that have none."""
+    """Mean of the points of each cluster; for empty clusters the rows of `otherwise` (k, d)."""
     num_clusters = len(otherwise)
 
     def scattered(points, labels):
@@ -220,7 +224,7 @@ def _means(points, labels, otherwise) -> Float[Array, "k d"]:
     def multiplied(points, labels):
         return jax.nn.one_hot(labels, num_clusters, dtype=points.dtype, axis=0) @ points
 
-    # On a CPU a sum by index costs a fifth of the product; on accelerators its order, and rounding, is left to chance.
+    # On a CPU a sum by index costs a fifth of the product; on accelerators its order, and so its rounding, is random.
     totals = jax.lax.platform_dependent(points, labels, cpu=scattered, default=multiplied)
     counts = _count(labels, num_clusters)[:, None]
     return jnp.where(counts > 0, totals / jnp.maximum(counts, 1), otherwise)

@@ -1,8 +1,9 @@
-"""Parallel work of many equal parts, shared between the cores of a machine.
+"""Distribution of many equal parts of work over the cores of a machine.
 
-XLA spreads one product of large matrices over all cores, but runs gathers, sums and small products of a compiled loop
-on one; two loops side by side, each on a thread of its own, keep two cores busy. So does NumPy, whose products alone
-are spread by its BLAS: threads of ours and of the BLAS's own would wait for each other, and it is kept to one.
+XLA spreads a product of large matrices over all cores, but runs gathers, sums and small products of a compiled loop on
+one core; two loops, each on its own thread, keep two cores busy. NumPy likewise runs on one core, except for products,
+which its BLAS spreads over all cores. While several threads work in NumPy, the BLAS is limited to one thread, because
+its threads would compete with them.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 import threadpoolctl
 from jaxtyping import Array, Int
 
-# Threads at most, that work in NumPy side by side: each takes memory of its own, and they share the memory's bandwidth.
+# Maximum number of threads that work in NumPy at once: each needs its own memory, and all share the memory bandwidth.
 _MOST_THREADS = 4
 # Prefix of the names of our threads.
 _NAME = "jeit-core"
@@ -34,10 +35,11 @@ def number_of_cores() -> int:
 
 
 def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], number: int, size: int) -> Array:
-    """Rows of `function` for the parts 0 … `number` - 1, `size` of them at a time, joined; the last may be repeated.
+    """Rows of `function` for the parts 0 … `number` - 1, computed in groups of `size` parts and concatenated; if the
+    groups do not divide evenly, the rows of the last part are repeated at the end.
 
-    `function`: from numbers of parts (c, s), s at a time, to an array (c s, …); compiled for one c. What it does with
-    a group of s parts must not depend on the others, then the result does not depend on the number of cores.
+    `function`: maps indices of parts (c, s), s at a time, to an array (c s, …); compiled for a single c. The results of
+    a group of s parts must not depend on other groups, so that they do not depend on the number of cores.
     """
     groups = -(-number // size)
     cores = min(number_of_cores(), groups)
@@ -49,13 +51,14 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], number: int,
 
 
 def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
-    """`function` of each of some parts, in NumPy, side by side on every core; it puts what it makes in place.
+    """Apply `function` to each part, in NumPy, in parallel on several cores; the function stores its results itself.
 
-    One part, and what is asked for by a part of other work, is done at once. NaN is reported elsewhere: nothing warns.
+    A single part, or a call from inside another part, is processed in the calling thread. Floating-point warnings are
+    suppressed, because NaN is reported elsewhere.
     """
 
     def quietly(part: Any) -> None:
-        with np.errstate(all="ignore"):  # threads have error states of their own
+        with np.errstate(all="ignore"):  # every thread has its own error state
             function(part)
 
     if len(parts) <= 1 or threading.current_thread().name.startswith(_NAME):
@@ -67,37 +70,38 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
 
 
 def parts_for_cores(number: int) -> list[slice]:
-    """0 … `number` - 1 in parts of about equal size, one for each core."""
+    """The indices 0 … `number` - 1 split into slices of about equal size, one for each core."""
     ends = np.linspace(0, number, min(number_of_cores(), _MOST_THREADS, number) + 1).astype(int).tolist()
     return [slice(*both) for both in itertools.pairwise(ends)]
 
 
 @functools.cache
 def _workers(process: int) -> ThreadPoolExecutor:
-    """Threads of a process, which a fork of it has not. They are kept: what new ones allocate and free stays with the
-    process, a hundred megabytes every time."""
+    """Thread pool of a process (a forked process needs a new one). The pool is kept, because memory allocated and freed
+    by new threads, about a hundred megabytes, is not returned each time."""
     return ThreadPoolExecutor(min(number_of_cores(), _MOST_THREADS), _NAME)
 
 
 @functools.cache
 def blas() -> threadpoolctl.ThreadpoolController:
-    """NumPy's BLAS, and others that were loaded when it was first asked for; what comes later is not NumPy's."""
+    """Controller of the BLAS libraries that are loaded at the first call, which include NumPy's."""
     return threadpoolctl.ThreadpoolController().select(user_api="blas")
 
 
-_kept: list[Any] = []
-_keeping = threading.Lock()
+_active_limits: list[Any] = []
+_limits_lock = threading.Lock()
 
 
 @contextlib.contextmanager
 def _one_thread_of_blas() -> Iterator[None]:
-    """Within it, and for as long as anyone else is, the BLAS keeps to one thread; a few microseconds."""
-    with _keeping:
-        _kept.append(None if _kept else blas().limit(limits=1))
+    """Limit the BLAS to one thread while this context, or another one of this kind, is active. Takes a few
+    microseconds."""
+    with _limits_lock:
+        _active_limits.append(None if _active_limits else blas().limit(limits=1))
     try:
         yield
     finally:
-        with _keeping:
-            limit = _kept.pop()
-            if limit is not None:  # the first, who knows how many threads there were, is the last in the list to go
+        with _limits_lock:
+            limit = _active_limits.pop()
+            if limit is not None:  # the first context holds the original limits, and is the last to be removed
                 limit.restore_original_limits()

@@ -1,4 +1,4 @@
-"""Small dense systems in elementwise operations and matrix products, which batch."""
+"""Small dense systems, solved by elementwise operations and matrix products, which support batches."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _LARGE_BATCH = 16
 def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
     """W = L^-1 for the lower triangular L with A = L L^T, so that W A W^T = 1.
 
-    Real matrices must be positive definite. Complex ones must be symmetric (not Hermitian) with a positive definite
-    real part, which makes the elimination stable without pivoting (Higham, Math. Comp. 67, 1998). What cannot be
-    factorised comes back as NaN.
+    Real matrices must be positive definite. Complex matrices must be symmetric (not Hermitian) with a positive definite
+    real part, which makes elimination without pivoting stable (Higham, Math. Comp. 67, 1998). The result is NaN for
+    matrices that cannot be factorised.
     """
     if isinstance(matrices, np.ndarray):
         return _by_halves(matrices)
@@ -33,7 +33,7 @@ def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "b
 
 
 def lower_cholesky(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
-    """L with A = L Lᵀ; NaN where there is none."""
+    """Lower triangular L with A = L Lᵀ; NaN if there is no such matrix."""
     if not isinstance(matrix, np.ndarray):
         return jnp.linalg.cholesky(matrix)
     try:
@@ -43,7 +43,7 @@ def lower_cholesky(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
 
 
 def symmetric_eigen(matrix: Inexact[Array, "s s"]) -> tuple[Inexact[Array, " s"], Inexact[Array, "s s"]]:
-    """Eigenvalues, ascending, and eigenvectors in columns; NaN where the matrix is not finite."""
+    """Eigenvalues in ascending order, and eigenvectors in columns; NaN if the matrix is not finite."""
     if not isinstance(matrix, np.ndarray):
         return jnp.linalg.eigh(matrix)
     if not np.isfinite(matrix).all():
@@ -52,7 +52,7 @@ def symmetric_eigen(matrix: Inexact[Array, "s s"]) -> tuple[Inexact[Array, " s"]
 
 
 def symmetric_inverse(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
-    """A^-1 of one matrix that `inverse_cholesky` takes; NaN where it is singular or not finite."""
+    """A^-1 of a single matrix of the kind that `inverse_cholesky` accepts; NaN if it is singular or not finite."""
     if not isinstance(matrix, np.ndarray):
         return _symmetric_inverse(matrix)
     if not np.isfinite(matrix).all():
@@ -77,8 +77,9 @@ def _symmetric_inverse_jvp(primals, tangents):
 
 
 def _by_lapack(matrices: Any) -> Any:
-    """`inverse_cholesky` by LAPACK, of NumPy's arrays."""
-    # Scaled to a diagonal of order one, by powers of two: LAPACK's inverse loses accuracy for rows of other orders.
+    """`inverse_cholesky` for NumPy arrays, by LAPACK."""
+    # Scale the diagonal to order one by powers of two: LAPACK's inverse is less accurate for rows of different orders
+    # of magnitude.
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
     scale = np.ldexp(1.0, -(np.frexp(diagonal)[1] // 2)).astype(matrices.dtype)
     try:
@@ -97,14 +98,15 @@ def _inverse_square_root(pivot: Inexact[Array, "batch 1"]) -> Inexact[Array, "ba
     root = 1 / xp.sqrt(pivot) if xp is np else jax.lax.rsqrt(pivot)
     if not jnp.issubdtype(pivot.dtype, jnp.complexfloating):
         return root
-    # A positive definite real part keeps the real part of every pivot positive; others are refused.
+    # With a positive definite real part of the matrix, the real part of every pivot is positive; other matrices yield
+    # NaN.
     return xp.where(pivot.real > 0, root, xp.nan)
 
 
 def _by_halves(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """Two by two blocks, each half in the same way: nearly all is matrix products, which LAPACK's inverse of a triangle
-    is three to four times slower than. Large batches of the smallest blocks are worth unrolled code; few are better off
-    with a loop of short vectors, which may be longer the fewer there are."""
+    """`inverse_cholesky` by recursion on two by two blocks. Nearly all work is in matrix products, which are three to
+    four times faster than LAPACK's inverse of a triangle. The smallest blocks use unrolled code in large batches, and
+    in small batches a loop over short vectors, with larger blocks the fewer matrices there are."""
     batch, size, _ = matrices.shape
     on_host = isinstance(matrices, np.ndarray)
     by_lapack = on_host and not np.iscomplexobj(matrices)
@@ -124,7 +126,7 @@ def _by_halves(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s
 
 
 def _unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """[A | 1] becomes [L^T | W] row by row."""
+    """Elimination of [A | 1] to [L^T | W], row by row, in unrolled code."""
     size, xp = matrices.shape[-1], namespace(matrices)
     identity = xp.broadcast_to(xp.eye(size, dtype=matrices.dtype), matrices.shape)
     augmented = xp.concatenate([matrices, identity], axis=-1)
@@ -138,7 +140,7 @@ def _unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s 
 
 
 def _row_by_row(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """The same in a loop, each row less its products with all rows done."""
+    """The elimination of `_unrolled` in a loop, where each row is reduced by all previous rows in one product."""
     size = matrices.shape[-1]
     identity = jnp.broadcast_to(jnp.eye(size, dtype=matrices.dtype), matrices.shape)
     augmented = jnp.concatenate([matrices, identity], axis=-1)
@@ -154,8 +156,9 @@ def _row_by_row(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch 
 
 
 def _by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """A loop over blocks of rows, W one block at a time: with G = A_k W^T, the new diagonal block is
-    A_kk - G G^T = (W_kk^T W_kk)^-1 and the new rows are W_kk (E_k - G W). One compiled body, whatever the size."""
+    """`inverse_cholesky` by a loop over blocks of rows of W. With G = A_k W^T, the new diagonal block satisfies A_kk -
+    G G^T = (W_kk^T W_kk)^-1, and the new rows are W_kk (E_k - G W). The compiled loop body does not depend on the
+    size."""
     size, dtype = matrices.shape[-1], matrices.dtype
     block = 32 if size <= 256 else 64
     padding = -size % block
@@ -177,7 +180,8 @@ def _by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "bat
     return inverse[:, :size, :size]
 
 
-# The cost at a point, and a function of the damping that gives a step from there with its slope and curvature.
+# The cost at a point, and a function that returns, for a given damping, a step from that point with its slope and
+# curvature.
 QuadraticModel = tuple[Float[Array, ""], Callable[[Any], tuple[Float[Array, " n"], Float[Array, ""], Float[Array, ""]]]]
 
 
@@ -188,7 +192,8 @@ def ridge_model(
     covariance: Float[Array, "M M"],
     precision: Float[Array, "M M"],
 ) -> QuadraticModel:
-    """The cost ½ rᵀ C⁻¹ r + ½ ‖c‖² and its `step`, for `Descent`; `covariance` C of the data, and its inverse."""
+    """The cost ½ rᵀ C⁻¹ r + ½ ‖c‖² at a point c, and its `step` function for `Descent`. `covariance`: C of the data;
+    `precision`: its inverse."""
     if not isinstance(jacobian, np.ndarray):
         jacobian = jax.lax.optimization_barrier(jacobian)
     weighted = precision @ residual
@@ -211,10 +216,10 @@ def ridge_step(
     precision: Float[Array, "M M"],
     ridge: Float[Array, ""] | float = 1.0,
 ) -> Float[Array, " n"]:
-    """The δ of (JᵀC⁻¹J + ridge · 1) δ = -(JᵀC⁻¹r + c), by a system of min(M, n) unknowns.
+    """The solution δ of (JᵀC⁻¹J + ridge · 1) δ = -(JᵀC⁻¹r + c), from a system of min(M, n) unknowns.
 
-    With fewer data than unknowns, δ = -c / ridge - Jᵀ (JJᵀ + ridge · C)⁻¹ (r - J c / ridge), by Woodbury's identity,
-    arranged so that no large terms cancel however small the ridge is beside J.
+    With fewer data than unknowns, δ = -c / ridge - Jᵀ (JJᵀ + ridge · C)⁻¹ (r - J c / ridge) by Woodbury's identity, in
+    a form without cancellation of large terms, however small the ridge is relative to J.
     """
     rows, columns = jacobian.shape
     if columns <= rows:
@@ -226,7 +231,7 @@ def ridge_step(
 
 
 def solve_definite(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
-    """A⁻¹ b for a dense symmetric positive definite A; NaN for one that is not."""
+    """Solution A⁻¹ b for a dense symmetric positive definite A; NaN if A is not positive definite."""
     if isinstance(matrix, np.ndarray):
         try:
             return scipy.linalg.cho_solve(

@@ -1,17 +1,13 @@
-"""Two engines for one formula: NumPy for values, JAX for traced arrays; and batches over them.
+"""Two engines for the same formula, NumPy and JAX, and batching rules for `jax.vmap`.
 
-Batching rules of the direct solver under `jax.vmap`: matrices one after the other on a CPU, right-hand sides all at
-once.
+JAX traces and compiles a program before it runs, which takes seconds; NumPy runs at once, and is as fast on large
+arrays. Therefore functions run in NumPy if all values are known, and in a compiled program if arrays are traced,
+batched or differentiated. A formula that uses only the functions below and those common to `numpy` and `jax.numpy`
+works in both.
 
-A batch of factorisations side by side streams all of the batch through memory at every stage, and takes more than
-twice as long per matrix as one that stays in the cache. Accelerators do get the whole batch at once.
-
-One formula for two engines: NumPy where values are known, JAX where they are traced, batched or differentiated.
-
-JAX traces and compiles a program before it runs, which takes seconds; NumPy runs at once, and is as quick on large
-arrays. So what is asked for once runs in NumPy, and what is asked for a thousand times, or differentiated, in a
-compiled program; a formula written with the functions below, and with what `numpy` and `jax.numpy` have in common, goes
-through both.
+Under `jax.vmap` on a CPU, matrices are factorised one after the other, and right-hand sides are solved all at once. A
+batch of factorisations side by side moves the whole batch through memory at every stage, and takes more than twice as
+long per matrix as a single one that stays in the cache. Accelerators process the whole batch at once.
 """
 
 from __future__ import annotations
@@ -32,19 +28,19 @@ from jaxtyping import Array, Inexact, Int, Shaped
 
 
 def in_turn(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of arrays that `jax.vmap` calls for one element of the batch after the other on a CPU.
+    """Make `jax.vmap` on a CPU call a function of arrays for one element of the batch after the other.
 
-    On accelerators, and in every other respect, it is the function itself. Worth it for functions that need more
-    memory than fits the cache when a whole batch of them runs side by side, like anything with a factorisation in it.
+    On accelerators, and without `vmap`, the function is not changed. This is useful for functions, such as those with a
+    factorisation, whose whole batch would not fit in the cache.
     """
     return differentiable_batches(function, one_by_one)
 
 
 def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..., Any]) -> Callable[..., Any]:
-    """`function` with `batch_rule` for its behaviour under vmap, and the derivatives it has by itself.
+    """`function` with `batch_rule` as its behaviour under vmap, and with its usual derivatives.
 
     `batch_rule(batchable, plain, axis_size, batched, *arguments)` returns outputs that all have the batch as leading
-    axis. `batchable` is the function as it may be batched once more, `plain` the function without the rule.
+    axis. `batchable` is the function with the rule, for nested batches; `plain` is the function without the rule.
     """
 
     @custom_vmap
@@ -56,7 +52,7 @@ def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..
         outputs = batch_rule(batchable, function, axis_size, batched, *arguments)
         return outputs, jax.tree.map(lambda _: True, outputs)
 
-    # Functions with a batching rule have no transpose: derivatives are taken of the plain function.
+    # Functions with a custom batching rule have no transpose, so derivatives are taken of the plain function.
     @jax.custom_jvp
     def differentiable(*arguments):
         return batchable(*arguments)
@@ -85,7 +81,7 @@ def _is_zero(tangent: Any) -> bool:
 def one_by_one(
     batchable: Callable[..., Any], plain: Callable[..., Any], axis_size: int, batched: Any, *arguments: Any
 ) -> Any:
-    """Call a function for each element of a batch: in turn on a CPU, side by side on accelerators."""
+    """Call a function for each element of a batch: one after the other on a CPU, side by side on accelerators."""
     del axis_size
     leaves, structure = jax.tree.flatten(arguments)
     flags = jax.tree.leaves(batched)
@@ -108,32 +104,31 @@ def one_by_one(
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _PROCESS = os.getpid()
-# Complex step, so small that its square vanishes beside any number.
+# Size of a complex step; its square is negligible in double precision.
 _COMPLEX_STEP = 1e-100
 
 
 host: Any = np
-"""NumPy, for arrays that are to go where JAX's are declared."""
+"""NumPy, typed as Any, for arrays that are used where JAX's are declared."""
 
 
 def namespace(*trees: Any) -> Any:
-    """`numpy` if every array of these pytrees is NumPy's, else `jax.numpy`."""
+    """`numpy` if no array of these pytrees is one of JAX's, else `jax.numpy`."""
     return jnp if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(trees)) else np
 
 
 def has_values(*trees: Any) -> bool:
-    """Whether all arrays of these pytrees have values that can be looked at, i.e. none is being traced."""
+    """Whether the values of all arrays in these pytrees are known, i.e. no array is being traced."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def is_forked() -> bool:
-    """Whether this process was forked from the one that imported this: nothing compiled need run here."""
+    """Whether this process was forked from the one that imported this module; compiled code may hang in it."""
     return os.getpid() != _PROCESS
 
 
 def on_host(tree: Any) -> Any:
-    """The pytree with NumPy's arrays in place of JAX's, but for those that are traced; on a CPU they share their
-    memory."""
+    """The pytree with JAX's arrays converted to NumPy's, except traced ones; on a CPU both share their memory."""
     return jax.tree.map(_on_host, tree)
 
 
@@ -142,7 +137,7 @@ def _on_host(leaf: Any) -> Any:
 
 
 def on_device(tree: Any) -> Any:
-    """The pytree with JAX's arrays in place of NumPy's; they keep their values where something else is traced."""
+    """The pytree with NumPy's arrays converted to JAX's, which keep their values even inside a traced program."""
     with jax.ensure_compile_time_eval():
         return jax.tree.map(_on_device, tree)
 
@@ -152,27 +147,27 @@ def _on_device(leaf: Any) -> Any:
 
 
 def as_array(values: Any, dtype: Any = None) -> Array:
-    """JAX's array of values that are at hand or traced, a copy: who gave them may write into theirs.
+    """Copy values, known or traced, to an array of JAX's, so that later changes of the caller's array have no effect.
 
-    `jax.numpy.asarray` may share the memory, and compiles a program for every shape.
+    `jax.numpy.asarray`, in contrast, may share the memory, and compiles a program for every shape.
     """
     if has_values(values):
-        with jax.ensure_compile_time_eval():  # what has values keeps them where something else is traced
+        with jax.ensure_compile_time_eval():  # known values stay known inside a traced program
             return jax.device_put(np.array(values, dtype and jax.dtypes.canonicalize_dtype(dtype)))
     return jnp.asarray(values, dtype)
 
 
 def at_once(function: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
-    """Result of `function` for arrays that have values, computed in NumPy."""
+    """Result of `function` for arrays with known values, computed in NumPy."""
     arguments, named = on_host((arguments, named))
-    with np.errstate(all="ignore"):  # JAX says nothing of them either
+    with np.errstate(all="ignore"):  # JAX does not warn of these errors either
         return function(*arguments, **named)
 
 
 def either_engine(function: _Function) -> _Function:
-    """`function` of arrays: in NumPy, at once, where all have values; compiled as a whole where any is traced.
+    """Make `function` of arrays run in NumPy if all values are known, and in a compiled program if any array is traced.
 
-    What it returns are JAX's arrays, unless all it was given are NumPy's.
+    The results are JAX's arrays, unless all arguments are NumPy's.
     """
     compiled = jax.jit(function)
 
@@ -188,10 +183,11 @@ def either_engine(function: _Function) -> _Function:
 
 
 def values_at_once(function: _Function) -> _Function:
-    """`function` of arrays: in NumPy, at once, where all have values; as it is where any is traced.
+    """Make `function` of arrays run in NumPy if all values are known, and unchanged, not compiled, if any array is
+    traced.
 
-    For what must see some values even where others are traced, which `either_engine` does not let it. What it returns
-    are JAX's arrays, unless all it was given are NumPy's.
+    For functions that must read some values even if other arrays are traced, which `either_engine` does not allow. The
+    results are JAX's arrays, unless all arguments are NumPy's.
     """
 
     @functools.wraps(function)
@@ -205,14 +201,15 @@ def values_at_once(function: _Function) -> _Function:
 
 
 class Recent:
-    """Keeps the last few results of a function of pytrees, known again by the identity of the arrays they came of."""
+    """Cache of the last few results of a function of pytrees, looked up by the identity of the arrays in its
+    arguments."""
 
     def __init__(self, make: Callable[..., Any], size: int = 4):
         self._make, self._size = make, size
         self._kept: list[tuple[list[Any], Any, Any]] = []
 
     def __call__(self, *trees: Any) -> Any:
-        """The result of `make` for these arguments, computed or remembered."""
+        """The result of `make` for these arguments, computed or taken from the cache."""
         leaves, structure = jax.tree.flatten(trees)
         for known, kind, result in reversed(self._kept):
             if kind == structure and all(one is other for one, other in zip(known, leaves, strict=True)):
@@ -223,22 +220,22 @@ class Recent:
 
 
 def undifferentiated(values: Any) -> Any:
-    """The same pytree of arrays, which no derivative goes through."""
+    """The same pytree of arrays, treated as constant in differentiation."""
     return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf, values)
 
 
 def kept(values: Any) -> Any:
-    """The same pytree of arrays, computed once: otherwise XLA may compute them again wherever they are used."""
+    """The same pytree of arrays, computed only once: otherwise XLA may compute them again wherever they are used."""
     return values if namespace(values) is np else jax.lax.optimization_barrier(values)
 
 
 def adjoint(matrix: Any) -> Any:
-    """The conjugate transpose of a matrix (m, n); of a real one the transpose, a view."""
+    """The conjugate transpose of a matrix (m, n); for a real matrix the transpose, as a view."""
     return matrix.conj().T if np.iscomplexobj(matrix) else matrix.T
 
 
 def while_loop(condition: Callable[[Any], Any], body: Callable[[Any], Any], state: Any) -> Any:
-    """The state after so many turns of `body` as `condition` asks for; `jax.lax.while_loop` of JAX's arrays."""
+    """The state after repeating `body` while `condition` holds; `jax.lax.while_loop` for JAX's arrays."""
     if namespace(state) is jnp:
         return jax.lax.while_loop(condition, body, state)
     while condition(state):
@@ -247,8 +244,8 @@ def while_loop(condition: Callable[[Any], Any], body: Callable[[Any], Any], stat
 
 
 def scan(body: Callable[[Any, Any], tuple[Any, Any]], state: Any, each: Any, *, reverse: bool = False) -> Any:
-    """The last state of `body(state, one)`, turn by turn along the first axis of `each`, and what it gave besides,
-    stacked; at least one turn in NumPy, `jax.lax.scan` of JAX's arrays."""
+    """The last state, and the stacked outputs, of `body(state, one)` applied along the first axis of `each`.
+    `jax.lax.scan` for JAX's arrays; in NumPy at least one element is needed."""
     if namespace(state, each) is jnp:
         return jax.lax.scan(body, state, each, reverse=reverse)
     given: Any = [None] * len(jax.tree.leaves(each)[0])
@@ -258,7 +255,8 @@ def scan(body: Callable[[Any, Any], tuple[Any, Any]], state: Any, each: Any, *, 
 
 
 def complex_slope(function: Callable[[Any], Any], x: Any, row: int) -> Any:
-    """The derivative of `function` of NumPy's x (n, F) along a row; columns are independent. See `slopes`."""
+    """Derivative of `function` with respect to one row of a NumPy array x (n, F), whose columns are independent. See
+    `slopes`."""
     return _complex_step(function, x, row)[1]
 
 
@@ -270,10 +268,11 @@ def _complex_step(function, x, row: int) -> tuple[Any, Any]:
 
 
 def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
-    """Values of `function` at x (n, F), and its derivatives along each of the n rows; columns are independent.
+    """Values of `function` at x (n, F), and its derivatives with respect to each of the n rows; columns are
+    independent.
 
-    In NumPy by complex steps (Squire and Trapp, SIAM Rev. 40, 1998, 110-112), exact to rounding: the function must be
-    analytic. In JAX by forward differentiation.
+    NumPy uses complex steps (Squire and Trapp, SIAM Rev. 40, 1998, 110-112), which are exact to rounding if the
+    function is analytic. JAX uses forward differentiation.
     """
     if isinstance(x, np.ndarray):
         ahead = [_complex_step(function, x, row) for row in range(len(x))]
@@ -283,37 +282,37 @@ def slopes(function: Callable[[Any], Any], x: Any) -> tuple[Any, list[Any]]:
 
 
 def gather(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Shaped[Array, "..."]:
-    """Rows of `values`; the indices are known to be there."""
+    """Rows of `values` at valid indices; the indices are not checked."""
     if isinstance(values, np.ndarray):
         return values[np.asarray(index)]  # pyright: ignore[reportReturnType]
     return values.at[index].get(mode="promise_in_bounds")
 
 
 def gather_or_zero(values: Shaped[Array, "n *k"], index: Int[Array, "*i"]) -> Shaped[Array, "..."]:
-    """Rows of `values`, zeros for the index n."""
+    """Rows of `values`, with zeros for the index n."""
     if isinstance(values, np.ndarray):
         if not len(values):
             return host.zeros((*np.shape(index), *values.shape[1:]), values.dtype)
-        found = np.take(values, index, axis=0, mode="clip")  # no copy of all of them, with a row of zeros at the end
+        found = np.take(values, index, axis=0, mode="clip")  # avoids a copy of all rows with a row of zeros appended
         found[np.asarray(index) == len(values)] = 0
         return host.asarray(found)
     return values.at[index].get(mode="fill", fill_value=0)
 
 
 def replace_at(values: Shaped[Array, " n"], index: Any, value: Any) -> Shaped[Array, " n"]:
-    """`values` with another one at an index; the same where it lies beyond the end."""
+    """`values` with `value` at an index; unchanged if the index lies beyond the end."""
     if isinstance(values, np.ndarray):
         return np.where(np.arange(values.size) == index, value, values)  # pyright: ignore[reportReturnType]
     return values.at[index].set(value, mode="drop")
 
 
 def sum_into(shape: tuple[int, ...], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
-    """Zeros of this shape, to which `values` are added at `index`, repeated indices again and again."""
+    """An array of zeros of the given shape, to which `values` are added at `index`; repeated indices accumulate."""
     return add_at(namespace(values).zeros(shape, values.dtype), index, values)
 
 
 def set_at(total: Shaped[Array, "*n"], index: Any, values: Any) -> Shaped[Array, "*n"]:
-    """`total` with `values` in place of those at `index`; indices beyond the end, of JAX's arrays, are passed over."""
+    """`total` with the entries at `index` replaced by `values`; in JAX's arrays, indices beyond the end are ignored."""
     if isinstance(total, np.ndarray):
         changed: Any = np.array(total)
         changed[index] = values
@@ -322,12 +321,12 @@ def set_at(total: Shaped[Array, "*n"], index: Any, values: Any) -> Shaped[Array,
 
 
 def add_at(total: Inexact[Array, "*n"], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
-    """`total` with `values` added at `index`, repeated indices again and again."""
+    """`total` with `values` added at `index`; repeated indices accumulate."""
     return add_into(host.array(total) if isinstance(total, np.ndarray) else total, index, values)
 
 
 def add_into(total: Inexact[Array, "*n"], index: Any, values: Inexact[Array, "*i"]) -> Inexact[Array, "*n"]:
-    """The same in place of a `total` of NumPy's that nothing else needs."""
+    """Like `add_at`, but a NumPy array `total` is changed in place."""
     if isinstance(total, np.ndarray):
         np.add.at(total, index, values)
         return host.asarray(total)

@@ -1,1 +1,1 @@
-"""Calibration: the decay model and noise of every microphone, estimated from taps at known positions."""
+"""Calibration: estimation of the decay model and noise of each microphone from taps at known positions."""

@@ -1,7 +1,7 @@
-"""Calibration: fit the decay model and noise of every microphone to taps at known positions, of unknown strength.
+"""Calibration: fit the decay model and noise of each microphone to taps at known positions with unknown strengths.
 
-The models are fitted by robust least squares. Of the available decay models, the one that best locates taps outside its
-own fit is selected. Outlying taps are excluded from the fit and reported.
+The models are fitted by robust least squares. The decay model that best locates taps left out of the fit is selected.
+Outlying taps are excluded from the fit and reported.
 """
 
 from __future__ import annotations
@@ -26,28 +26,34 @@ from jeit.acoustic.surface import AbstractSurface, make_surface
 from jeit.arguments import check_kind
 from jeit_solvers.engines import as_array, host, on_device
 
-# The decay model that predicts best.
+# Value of `decay` that selects the decay model by cross-validation.
 AUTO = "auto"
-# Relative improvement in the error of left-out taps below which the model with fewer parameters is preferred.
-_NO_BETTER = 0.05
-# Relative error above the 18 to 21 % found on simulated skins with uneven coupling and exact positions.
+# Minimum relative improvement of the localisation error of left-out taps for which a model with more parameters is
+# preferred.
+_LEAST_IMPROVEMENT = 0.05
+# Relative error of the intensities above which a note is given. On simulated skins with uneven coupling and exact
+# positions, the relative error is 18 to 21 %.
 _MUCH = 0.23
-# The given positions are rejected where less than this share of the microphones with enough taps follow the model and
-# left-out taps are located no better than by a guess.
+# Minimum fraction of the microphones with enough taps that must agree with the model, unless left-out taps are located
+# well. Otherwise the given positions are rejected.
 _LEAST_SHARE = 0.5
 
 
 class CalibrationFit(eqx.Module):
-    """A `calibration` and the T taps that it was fitted to.
+    """A calibration, with the T taps to which it was fitted.
 
-    - `distance`: (T, M) metres; `power`: (T, M) intensities above the floor; `usable`: (T, M), True where fitted.
-    - `strength`: (T,) of the taps; NaN where no microphone received the tap, or the tap was excluded.
-    - `outlier`: (T,), taps excluded because no single source at the given position explains them.
-    - `explained`: (M,) share of the variance of a microphone's levels that its model explains.
-    - `shared`: (M,) microphones whose own taps do not determine the decay of their response, which is then taken from
-      the other microphones.
-    - `left_out`: names of the fitted decay models, the chosen one first, each with its median localisation error, m,
-      for taps left out of the fit; infinite where it located none.
+    - `calibration`: the fitted calibration.
+    - `distance`: (T, M) distance of each tap from each microphone in metres.
+    - `power`: (T, M) intensities minus the noise floor.
+    - `usable`: (T, M) mask of the intensities to which the models were fitted before unusable microphones were
+      excluded.
+    - `strength`: (T,) strengths of the taps; NaN if no microphone received the tap or the tap was excluded.
+    - `outlier`: (T,) mask of taps that were excluded because no single source at the given position explains them.
+    - `explained`: (M,) fraction of the variance of a microphone's levels that its model explains.
+    - `shared`: (M,) mask of microphones whose own taps do not determine the decay of the response with distance, which
+      is then taken from the other microphones.
+    - `left_out`: name of each decay model with its median localisation error in metres for taps left out of the fit;
+      infinite if it located none. The selected model is first.
     """
 
     calibration: Calibration
@@ -62,13 +68,13 @@ class CalibrationFit(eqx.Module):
 
     @property
     def error(self) -> float:
-        """Relative error of the predicted intensities: the median over the usable microphones."""
+        """Median over the usable microphones of the relative error of the predicted intensities."""
         calibration = self.calibration
         return float(np.median(np.asarray(calibration.microphone_array.noise.relative)[calibration.usable]))
 
     @property
     def evidence(self) -> str:
-        """A sentence that compares the decay models by how well they locate left-out taps."""
+        """Text that compares the localisation errors of the decay models for left-out taps; empty if unknown."""
         if not self.left_out:
             return ""
         mine, *others = (_millimetres(off) for _, off in self.left_out)
@@ -78,7 +84,7 @@ class CalibrationFit(eqx.Module):
 
     @property
     def note(self) -> str:
-        """A sentence that explains a large error; empty where the error is not large."""
+        """Text that suggests reasons for a large `error`; empty if the error is not large."""
         if self.error <= _MUCH:
             return ""
         return (
@@ -100,16 +106,16 @@ def calibrate_microphones(
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationFit:
-    """Fit the decay model of every microphone to `taps`.
+    """Fit the decay model of each microphone to `taps`.
 
-    `decay`: "inverse-square", a / (r² + b), the paper's; "exponential", a exp(−r / l); "attenuated", a exp(−r / l) /
-    (r² + b); or "auto", the one of these that best locates left-out taps (median distance in four-fold cross-validation
-    over the positions). `intensity`: band and window, for taps given as samples. `progress` is called with the name of
-    each step as it begins.
+    `decay`: "inverse-square", a / (r² + b) as in Park 2022; "exponential", a exp(−r / l); "attenuated", a exp(−r / l) /
+    (r² + b); a subclass of `AbstractDecay`; or "auto", which selects among the three the model with the smallest median
+    localisation error of left-out taps (four-fold cross-validation over the positions). `intensity`: band and windows,
+    for taps given as samples. `progress` is called with the name of each step when it begins.
 
     The command `jeit calibrate-microphones` calls this function; `jeit.acoustic.reports.write_calibration` writes its
-    output files. Raises `ValueError` where fewer than three microphones can be calibrated, where most microphones do
-    not agree with the given positions, for another `decay`, for `intensity` where the taps are intensities, and for
+    output files. Raises `ValueError` if fewer than three microphones can be calibrated, if most microphones disagree
+    with the given positions, for an unknown `decay`, for `intensity` given with taps that are intensities, and for
     arguments of the wrong type.
     """
     every = isinstance(decay, str) and decay == AUTO
@@ -119,16 +125,16 @@ def calibrate_microphones(
 
 
 def choose(fits: dict[str, CalibrationFit], refused: dict[str, str]) -> CalibrationFit:
-    """Select the fit that locates left-out taps best; of two that are equally good, the simpler one. Raises
-    `ValueError` with the reasons where there is no fit."""
+    """Select the fit that locates left-out taps best. Among fits with nearly equal errors, the one with the fewest
+    parameters is selected. Raises `ValueError` if `fits` is empty; its message is the first reason in `refused`."""
     if not fits:
         raise ValueError(next(iter(refused.values())))
-    # Models are listed by their number of parameters, the simplest first.
+    # The fits are in order of their number of parameters.
     least = min(fit.left_out[0][1] for fit in fits.values())
-    return next(fit for fit in fits.values() if not fit.left_out[0][1] > (1 + _NO_BETTER) * least)
+    return next(fit for fit in fits.values() if not fit.left_out[0][1] > (1 + _LEAST_IMPROVEMENT) * least)
 
 
-@np.errstate(all="ignore")  # of what fits nothing, reasons are given
+@np.errstate(all="ignore")  # models that do not fit are reported with a reason
 def calibrate_each(
     taps: Taps,
     decays: Sequence[type[AbstractDecay]] = (),
@@ -136,11 +142,11 @@ def calibrate_each(
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, CalibrationFit], dict[str, str]]:
-    """Fit each of the given decay models (default: all). Returns the fits by name, and the reasons for models without a
-    fit.
+    """Fit each of the given decay models; by default all. Returns a dictionary of the fits by name, and a dictionary of
+    the reasons why the other models could not be fitted.
 
-    `progress` is called with the name of each step as it begins. Raises `ValueError` as `calibrate_microphones` does,
-    except where no model fits.
+    `progress` is called with the name of each step when it begins. Raises `ValueError` as `calibrate_microphones` does,
+    but not if no model can be fitted.
     """
     check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
     check_settings("intensity", intensity)
@@ -166,7 +172,13 @@ def calibrate_each(
 
 
 class _Readings(NamedTuple):
-    """Positions and powers of the taps of a calibration, and the noise model."""
+    """Input of a fit: positions and intensities of the taps, and the noise of the microphones.
+
+    **Fields**: `microphones`, `places`: positions of microphones and taps in metres; `surface`: the surface;
+    `distance`: distances in metres; `power`: intensities minus the floor, NaN where unusable; `noise`: noise of the
+    microphones; `known_noise`: whether its floor was measured; `faults`: fault of each microphone; `settings`: band and
+    windows, for taps given as samples.
+    """
 
     microphones: Float[np.ndarray, "M d"]
     surface: AbstractSurface
@@ -180,8 +192,12 @@ class _Readings(NamedTuple):
 
 
 class _Fitted(NamedTuple):
-    """A fit, the readings `tried`, the `good` microphones, the reasons why others are not, the share of variance that
-    each model explains, and the localisation of left-out taps."""
+    """Result of the fit of one decay model.
+
+    **Fields**: `fit`: the fit; `tried`: mask of the readings used in the first fit, of all microphones; `good`: mask of
+    the usable microphones; `reasons`: reasons why microphones are unusable; `explained`: fraction of variance that each
+    model explains; `left`: localisation errors of left-out taps.
+    """
 
     fit: TapFit
     tried: Bool[np.ndarray, "T M"]
@@ -192,7 +208,7 @@ class _Fitted(NamedTuple):
 
 
 class _NoFitError(Exception):
-    """Raised where a decay model cannot be fitted to the taps; the message gives the reason."""
+    """Raised if a decay model cannot be fitted to the taps. The message gives the reason."""
 
 
 def _read(taps: Taps, intensity: IntensitySettings | None) -> _Readings:
@@ -213,7 +229,8 @@ def _read(taps: Taps, intensity: IntensitySettings | None) -> _Readings:
 
 
 def _fit(kind: type[AbstractDecay], readings: _Readings) -> _Fitted:
-    """Fit one decay model. Raises `_NoFitError` where the fit does not determine positions."""
+    """Fit one decay model to all microphones. Raises `_NoFitError` if too few microphones received the taps or agree
+    with the model."""
     enough, why = check_received(kind, readings.distance.T, readings.power, readings.faults)
     if why:
         raise _NoFitError(why)
@@ -233,7 +250,7 @@ def _fit(kind: type[AbstractDecay], readings: _Readings) -> _Fitted:
 
 def _calibration_fit(taps: Taps, readings: _Readings, fitted: _Fitted, notes) -> CalibrationFit:
     fit, good = fitted.fit, fitted.good
-    # The factor between parameters and strengths, as `Calibration` has it.
+    # Logarithm of the common factor of gains and strengths, according to the convention of `Calibration`.
     gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.values)).gain))[good].mean()
     strength = np.where(fit.received, np.exp(fit.strength + gain), np.nan)
     shared, errors = fit.shared & good, standard_errors(fit)
@@ -255,6 +272,6 @@ def _calibration_fit(taps: Taps, readings: _Readings, fitted: _Fitted, notes) ->
 
 
 def _range(strength: np.ndarray) -> tuple[float, float] | None:
-    """Strengths of the weakest and the strongest tap."""
+    """Strengths of the weakest and the strongest tap; None if no strength is known."""
     known = strength[strength > 0]
     return (float(known.min()), float(known.max())) if known.size else None

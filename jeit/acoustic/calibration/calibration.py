@@ -1,4 +1,4 @@
-"""`Calibration`: decay models and noise of an array of microphones, and its JSON file."""
+"""`Calibration`: decay models and noise of an array of microphones, stored in a JSON file."""
 
 from __future__ import annotations
 
@@ -28,26 +28,29 @@ if TYPE_CHECKING:
 FORMAT, VERSION = "jeit microphone calibration", 1
 _UNITS = {"length": "m", "intensity": "square of the samples' unit"}
 _SCALE = "strength 1 is the source whose intensity upon a microphone has geometric mean 1 over the usable ones"
-# The arrays of a curved surface.
+# Fields of `CurvedSurface` that are stored in the file.
 _CURVE = ("origin", "axes", "normal", "knots", "weights", "affine")
-# Largest file in bytes; a microphone takes some hundred.
+# Maximum size of a calibration file in bytes. A microphone takes several hundred bytes.
 _LARGEST = 2**24
 
 
 class Calibration(eqx.Module):
-    """A calibrated array: microphones, surface, decay models, noise, and which microphones are usable.
+    """A calibrated array of microphones.
 
-    - `microphone_array`: microphones (M, d) in metres, surface, decay, noise.
-    - `usable`: (M,); `reasons`: why a microphone is not usable ("" for the others).
-    - `standard_errors`: (K, M) relative standard errors of the decay model's K parameters.
-    - `intensity`: band and window used for the taps' samples; None where intensities were given.
-    - `name`: of the taps.
-    - `strengths`: of the weakest and the strongest tap; None where not known.
-    - `widening`: factor by which `locate` multiplies covariances, so that the ellipses contain taps left out of the
-      fit.
+    - `microphone_array`: positions of the microphones, surface, decay models and noise.
+    - `usable`: (M,) mask of the usable microphones.
+    - `reasons`: M reasons why a microphone is not usable; "" for usable microphones.
+    - `standard_errors`: (K, M) relative standard errors of the K parameters of the decay model.
+    - `intensity`: band and windows with which the samples of the taps were analysed; None if the taps were given as
+      intensities.
+    - `name`: name of the taps.
+    - `strengths`: strengths of the weakest and the strongest tap; None if unknown.
+    - `widening`: factor by which `locate` multiplies covariances, chosen so that the error ellipses contain taps that
+      were left out of the fit.
 
-    The data determine parameters and strengths up to a common factor. It is chosen so that the geometric mean of f_i(0)
-    over the usable microphones is 1: a source's strength is the intensity at a typical microphone directly under it.
+    The taps determine the gains of the decay models and the strengths of the taps only up to a common factor. The
+    factor is chosen so that the geometric mean of f_i(0) over the usable microphones is 1. The strength of a source is
+    therefore the intensity at a typical microphone directly below it.
     """
 
     microphone_array: MicrophoneArray
@@ -65,16 +68,16 @@ class Calibration(eqx.Module):
         return len(self.microphone_array.microphones)
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration to a JSON file, with format version and units."""
+        """Write the calibration to a JSON file, which includes the format version and the units."""
         text = json.dumps(self._content(), indent=1, ensure_ascii=False, allow_nan=False)
         with written_whole(path) as file:
             file.write(f"{text}\n".encode())
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
-        """Read a file written by `save`. Raises `ValueError` for another format, version or unit, and for invalid
-        values; `OSError` where there is no such file."""
-        # pydantic takes longer to import than most of what jeit does with a calibration.
+        """Read a calibration from a file written by `save`. Raises `ValueError` for another format, version or unit and
+        for invalid values, and `OSError` if the file cannot be opened."""
+        # Imported here, since the import of pydantic takes longer than most uses of a calibration.
         from jeit.acoustic.calibration.calibration_tables import CalibrationTable
         from jeit.files.limits import faults_message
         from jeit.files.schema import validated

@@ -1,4 +1,4 @@
-"""Tables of a calibration file: type, range and unit of every key."""
+"""Schema of a calibration file: type, range and unit of the value of each key."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class UnitsTable(Table):
 
 
 class CurveTable(Table):
-    """Height of a curved surface above its plane; see `CurvedSurface`."""
+    """Parameters of a curved surface; see `CurvedSurface`."""
 
     what = "a curve"
     origin: Vector
@@ -40,7 +40,7 @@ class CurveTable(Table):
 
 
 class SurfaceTable(Table):
-    """The surface, in metres."""
+    """Surface of the skin: its outline, holes and curvature, in metres."""
 
     what = "a surface"
     outline: Loop
@@ -49,7 +49,7 @@ class SurfaceTable(Table):
 
 
 class IntensityTable(Table):
-    """Band and window used for the samples; see `IntensitySettings`."""
+    """Band and windows with which samples are analysed; see `IntensitySettings`."""
 
     what = "intensity"
     low: Annotated[float, Number(0, 1e9, "Hz")] = 50.0
@@ -68,7 +68,7 @@ class ErrorsTable(Table):
 
 
 class MicrophoneTable(Table):
-    """One microphone: position, parameters of the decay model, noise."""
+    """Position, decay model and noise of one microphone."""
 
     what = "a microphone"
     position: Annotated[np.ndarray, Numbers(((2, 3),), -1e6, 1e6, "m")]
@@ -85,7 +85,7 @@ class MicrophoneTable(Table):
 
 
 class CalibrationTable(Table):
-    """A complete calibration file."""
+    """Content of a calibration file."""
 
     what = "a calibration"
     format: Literal["jeit microphone calibration"]

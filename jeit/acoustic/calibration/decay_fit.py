@@ -1,10 +1,10 @@
-"""Least-squares problems of a calibration: decay models fitted to taps of unknown strength.
+"""Weighted least-squares fit of decay models to taps of unknown strength.
 
-Microphones are the first axis, taps the last. With the taps' strengths given, each microphone is a problem of K
-unknowns. All microphones together with the strengths have K M + T unknowns; the strengths are eliminated by a Schur
-complement, which leaves a system of K M unknowns. Microphones of an array are mostly of one kind: all parameters but
-the first are penalised for deviating from the array's common value, relative to a `spread`. The common value is
-eliminated too, as the mean that minimises the penalty. The code uses NumPy, since a calibration is made once.
+Microphones are the first axis of arrays, and taps the last. For M microphones with K parameters each, and T taps, there
+are K M + T unknowns. The strengths of the taps are eliminated by a Schur complement, which leaves a system with K M
+unknowns. Since the microphones of an array are usually of the same kind, a penalty acts on the deviation of each
+parameter except the first from its common value over the array, relative to a `spread`. The common value is eliminated
+too: it is the mean, which minimises the penalty. The code uses NumPy, since an array is calibrated only once.
 """
 
 from __future__ import annotations
@@ -18,20 +18,22 @@ from jeit.acoustic.decay import AbstractDecay
 from jeit_solvers import Descent, minimise_small, solve_definite
 from jeit_solvers.engines import host, slopes
 
+# Maximum number of steps of a minimisation.
 _MOST_STEPS = 100
-# Largest change of the logarithm of a strength in a step.
+# Maximum change of the logarithm of a strength in a step.
 _LONGEST_STEP = 3.0
-# Rounds in which parameters are fixed at their bounds and released again.
+# Maximum number of iterations in which parameters are fixed at their bounds or released.
 _MOST_HELD = 6
-# Smallest residual, in units of the weights (inverse variances), once the data are fitted to rounding error.
+# The tolerance `atol`, in the unit of the cost, ends the fit once the data are fitted to rounding error.
 _SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 
 
 class DecayProblem(NamedTuple):
-    """Levels y (M, T) at squared distances r² (m²), with weights (0: not used), and the floors N (M,).
+    """Least-squares problem of a calibration.
 
-    `spread` (K,): standard deviation of the logarithm of each parameter over the microphones; infinite for no
-    constraint.
+    **Fields**: `level`: levels y (M, T); `squared_distance`: squared distances r² (M, T) in m²; `weight`: weights (M,
+    T) of the levels, 0 for unused ones; `floor`: noise floors N (M,); `decay`: class of the decay model; `spread`:
+    standard deviation (K,) of the logarithm of each parameter over the microphones, infinite for no penalty.
     """
 
     level: Float[np.ndarray, "M T"]
@@ -42,19 +44,20 @@ class DecayProblem(NamedTuple):
     spread: Float[np.ndarray, " K"]
 
     def log_response(self, logarithms: Any) -> Float[np.ndarray, "M T"]:
-        """log f of the models whose parameters have these logarithms, (K, M)."""
+        """Logarithm of the responses f (M, T) of the models whose parameters have the given `logarithms` (K, M)."""
         return np.asarray(self.decay.from_logarithms(logarithms).log_response(host.asarray(self.squared_distance)))
 
     def expected(
         self, logarithms: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
-        """log(e^s f + N), and its derivative with respect to s or log f."""
+        """Expected levels m = log(e^s f + N) (M, T), and their derivatives with respect to s, which equal those with
+        respect to log f. `strength` (T,): logarithms s of the strengths."""
         return self.levels(strength + self.log_response(logarithms))
 
     def levels(
         self, log_received: Float[np.ndarray, "M T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
-        """log(S + N) from log S, and its derivative."""
+        """Levels log(S + N) from the logarithm of the received power S, and their derivatives with respect to log S."""
         received = np.exp(log_received)
         total = received + self.floor[:, None]
         return np.log(total), received / total
@@ -62,20 +65,21 @@ class DecayProblem(NamedTuple):
     def expand(
         self, logarithms: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"], Float[np.ndarray, "K M T"]]:
-        """Residual y − m, 0 where the weight is 0, and the derivatives of m with respect to s and the parameters."""
+        """Residuals y − m, the derivatives of m with respect to s, and those with respect to the logarithms of the
+        parameters. Residuals with weight 0 are 0."""
         log_response, along = slopes(self.log_response, logarithms)
         mean, share = self.levels(strength + log_response)
         return self.residual(mean), share, share * np.stack(along)
 
     def residual(self, mean: Float[np.ndarray, "M T"]) -> Float[np.ndarray, "M T"]:
-        """Residual y − m; 0 where the weight is 0."""
+        """Residuals y − m for the expected levels `mean`; 0 where the weight is 0."""
         return np.where(self.weight > 0, self.level - mean, 0.0)
 
 
 def fit_strengths(
     problem: DecayProblem, logarithms: Float[np.ndarray, "K M"], start: Float[np.ndarray, " T"]
 ) -> Float[np.ndarray, " T"]:
-    """Fit the strengths of all taps for given models of the microphones."""
+    """Fit the logarithms of the strengths of all taps for given decay models."""
 
     def expand(unknown, taps):
         level, log_response, weight = taps
@@ -104,7 +108,7 @@ def fit_together(
     strength: Float[np.ndarray, " T"],
     free: Bool[np.ndarray, "K M"],
 ) -> tuple[Float[np.ndarray, "K M"], Float[np.ndarray, " T"]]:
-    """Fit the `free` parameters and the strengths of all taps jointly."""
+    """Fit the parameters in the mask `free` and the strengths of all taps jointly. Returns their logarithms."""
 
     def unpack(unknowns):
         return unknowns[: start.size].reshape(start.shape), unknowns[start.size :]
@@ -136,8 +140,11 @@ def fit_within(
     received: Bool[np.ndarray, " M"],
     bounds: tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]],
 ) -> tuple[Float[np.ndarray, "K M"], Float[np.ndarray, " T"], Bool[np.ndarray, "K M"]]:
-    """As `fit_together`, with `bounds` on the logarithms, for the microphones in the mask `received` (those with usable
-    readings). Also returns which parameters are held at a bound; one is released where the cost decreases inwards."""
+    """Fit parameters and strengths as `fit_together` does, with `bounds` on the logarithms of the parameters.
+
+    `received`: mask of the microphones with usable readings, whose parameters are fitted. Also returns the mask of the
+    parameters that are held at a bound. A held parameter is released if the cost decreases towards the interior.
+    """
     lower, upper = (bound[:, None] for bound in bounds)
     held = ((start <= lower) | (start >= upper)) & received
     values = start
@@ -157,16 +164,20 @@ def fit_within(
 def log_covariance(
     problem: DecayProblem, logarithms: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"], free, scale
 ) -> np.ndarray:
-    """Covariance (K M, K M) of the logarithms of the parameters, parameter by parameter. Weights are inverse variances;
-    the overall scale is fixed by `scale` · logarithms = constant, (K M,). NaN where not `free` (K, M)."""
+    """Covariance (K M, K M) of the logarithms of the parameters, ordered by parameter and then by microphone.
+
+    The weights of the problem must be inverse variances. The undetermined common factor of gains and strengths is fixed
+    by the condition `scale` · logarithms = constant, with `scale` (K M,). Entries of parameters that are not `free` (K,
+    M) are NaN.
+    """
     schur = _schur(_normal_equations(problem, logarithms, strength, free)[1], 0.0)
     number, count = logarithms.shape
     kept = np.asarray(free).ravel()
     shift = np.concatenate([np.ones(count), np.zeros((number - 1) * count)])[kept]
     normal = np.asarray(scale)[kept]
     result = np.full((number * count, number * count), np.nan)
-    # The direction that the data do not determine (all responses up, all strengths down) is projected out by the
-    # convention.
+    # The data do not determine the direction in which all gains increase and all strengths decrease. It is projected
+    # out according to the condition.
     inverse = np.linalg.pinv(schur[np.ix_(kept, kept)], rcond=1e-12, hermitian=True)
     project = np.eye(len(shift)) - np.outer(shift, normal) / (normal @ shift)
     result[np.ix_(kept, kept)] = project @ inverse @ project.T
@@ -174,8 +185,13 @@ def log_covariance(
 
 
 class _System(NamedTuple):
-    """Normal equations: blocks (M, K, K) of the microphones, coupling (K, M, T) to the strengths, diagonal (T,) of the
-    strengths, and ties (K, M, M) between microphones."""
+    """Normal equations of the least-squares problem.
+
+    **Fields**: `matrix`: block (M, K, K) of each microphone; `ties`: matrices (K, M, M) of the penalty, which couple
+    the microphones; `coupling`: block (K, M, T) between parameters and strengths; `tap_matrix`: diagonal (T,) of the
+    strengths; `gradient`, `tap_gradient`: gradients with respect to parameters (K, M) and strengths (T,); `free`: mask
+    (K, M) of the fitted parameters.
+    """
 
     matrix: np.ndarray
     ties: np.ndarray
@@ -206,8 +222,8 @@ def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[n
 
 
 def _ties(problem: DecayProblem) -> Float[np.ndarray, "K M M"]:
-    """Matrices of the quadratic forms Σ_m (v_m − v̄)² / spread², v̄ the mean over microphones with any weighted
-    reading."""
+    """Matrices (K, M, M) of the penalties Σ_m (v_m − v̄)² / spread², where v̄ is the mean over the microphones with at
+    least one reading of nonzero weight."""
     received = (problem.weight > 0).any(axis=1).astype(float)
     return (np.diag(received) - np.outer(received, received) / max(received.sum(), 1.0)) / problem.spread[
         :, None, None
@@ -218,8 +234,8 @@ def _step(system: _System, damping):
     number, count = system.gradient.shape
     diagonal = _tap_diagonal(system, damping)
     schur = _schur(system, damping)
-    # The undetermined direction (all responses up, all strengths down) is held fixed; so are parameters that are not
-    # free.
+    # Two things are held fixed: the undetermined direction, in which all gains increase and all strengths decrease; and
+    # parameters that are not free.
     shift = np.concatenate([np.where(system.free[0], 1.0, 0.0), np.zeros((number - 1) * count)])
     typical = np.trace(schur) / schur.shape[0] + 1e-300
     held = ~system.free.ravel()

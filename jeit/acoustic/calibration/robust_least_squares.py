@@ -1,14 +1,13 @@
-"""Robust least squares of decay models: the noise of tap levels, and fits that reweight outliers.
+"""Robust fit of the decay models of all microphones, the strengths of all taps, and the noise of each microphone.
 
-Noise of each microphone, estimated from the residuals of a calibration: relative error and additive deviation.
+Arrays are (M, T) for M microphones and T taps. The fitted data are levels, log(power + floor).
 
-Arrays are (M, T): M microphones, T taps. Residuals are of levels, log(power + floor).
+The fit is an iteratively reweighted least-squares fit. First, all microphones share the shape of the response, that is,
+all parameters of the decay model except the gain; almost any set of taps determines it. Then each microphone has its
+own shape, with the variation of the shapes over the array as the prior. Between fits, the noise and the weights are
+re-estimated from the residuals, until convergence. Each step takes a `TapFit` and returns a new one.
 
-Iteratively reweighted least squares: fit decay models of all microphones, strengths of all taps, and the noise.
-
-First all microphones share one shape of the response, which nearly any taps determine. Then each has its own shape, as
-far as its taps determine it, with the scatter of the shapes over the array as the prior. Noise and weights are
-re-estimated from the residuals in between, until convergence. Every step takes a `TapFit` and returns another.
+The noise of a microphone consists of a relative error and an additive deviation; see `jeit.acoustic.noise`.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, below_nothing
 from jeit_solvers.engines import host, on_host, slopes
 
-# Residuals beyond so many standard deviations are excluded from the noise estimate.
+# Residuals larger than this number of standard deviations are excluded from the noise estimate.
 _BEYOND = 4.0
-# Number of taps that the median of all microphones counts as, in the noise of each.
+# Weight of the median over all microphones in the noise estimate of one microphone, as a number of taps.
 _DRAWN = 20.0
-# Least number of taps to estimate additive noise from.
+# Minimum number of taps for an estimate of the additive noise.
 _FEW = 8
 
 
@@ -40,12 +39,12 @@ def relative_errors(
     use: Bool[np.ndarray, "M T"],
     inflation: float,
 ) -> Float[np.ndarray, " M"]:
-    """Relative error τ of each microphone, from the moments of its residuals beyond the floor's noise, without
-    outliers.
+    """Estimate the relative error τ of each microphone from the mean square of its residuals in excess of the variance
+    of additive noise. Outliers are excluded.
 
-    `received`: expected power; `inflation`: correction of the squared residuals for the fitted parameters. Each
-    estimate is shrunk towards the median of all microphones, which counts as a few more taps: with few taps the moments
-    may be zero or negative.
+    `received`: expected power. `use`: mask of the residuals to use. `inflation`: factor on squared residuals that
+    corrects for the number of fitted parameters. Each estimate is shrunk towards the median over all microphones, which
+    has the weight of 20 taps, since the excess may be zero or negative if there are few taps.
     """
     floor, rest, cross = (np.asarray(x) for x in (noise.floor, noise.deviation, noise.cross))
     seen, excess = np.zeros(len(received)), np.zeros(len(received))
@@ -71,11 +70,13 @@ def relative_errors(
 def additive_deviations(
     power: Float[np.ndarray, "M T"], received: Float[np.ndarray, "M T"], use: Bool[np.ndarray, "M T"], inflation: float
 ) -> Float[np.ndarray, " M"]:
-    """Additive deviation s of each microphone, where only intensities are known: its reading without a source.
+    """Estimate the additive deviation s of each microphone, the standard deviation of its intensity without a source,
+    if only intensities are known.
 
-    The maximum-likelihood pair of relative and additive deviation, on a grid and a finer one about the best; 0 unless
-    that is clearly better than none. The estimate is at least half the median of all microphones: few taps determine
-    the noise poorly, and a microphone whose noise is underestimated causes false detections.
+    The relative error and the additive deviation are estimated together by maximum likelihood, on a grid and then on a
+    finer grid near the maximum. The deviation is 0 unless the likelihood is clearly higher than without it. The
+    estimate is at least half the median over all microphones, since few taps determine the noise poorly, and
+    underestimated noise causes false detections.
     """
     deviation = np.zeros(len(received))
     coarse = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
@@ -103,26 +104,33 @@ def additive_deviations(
     return np.where(judged, np.maximum(deviation, 0.5 * typical), deviation)
 
 
+# Maximum number of iterations of the fit with a shared shape, and of the fit with individual shapes.
 _ALTERNATIONS, _REWEIGHTINGS = 6, 12
-# Degrees of freedom of Student's t, which weights the residuals.
+# Degrees of freedom of Student's t distribution, from which the weights of the residuals are derived.
 _TAIL = 5.0
-# Ratio of a tap's mean square residual to the median tap's above which the tap is excluded.
+# Ratio of the mean square residual of a tap to the median over all taps above which the tap is excluded.
 _OUTLIER = 12.0
-# Scatter of the logarithms of shapes over an array: for identical microphones; initially; least and greatest.
+# Standard deviation of the logarithms of the shape parameters over the array: in the fit with a shared shape; initially
+# in the fit with individual shapes; its minimum; its maximum.
 _ALIKE, _FIRST, _LEAST, _MOST = 0.03, 0.5, 0.1, 1.0
-# A microphone whose own taps determine the shape only to this relative error or worse takes that of the others.
+# Relative standard error of the shape at or above which a microphone's own taps are considered not to determine it.
 _LOOSE = 0.5
 
 
 class TapFit(eqx.Module):
     """State of the fit of M microphones to T taps.
 
-    - `squared`: squared distances (M, T), m²; `power`: (M, T) above the floor, NaN where there is none to use.
-    - `noise`; `known_noise`: whether its floor was measured.
-    - `values`: logarithms of the decay model's parameters, (K, M), those `held` (K, M) at their `bounds`, two of (K,);
-      `spread`: (K,) by how much each scatters over the array. `strength`: (T,) logarithms.
-    - `weight`: (M, T) inverse variances of levels, reduced for large residuals.
-    - `outlier`: (T,) excluded taps; `dropped`: (M,) excluded microphones.
+    - `kind`: class of the decay model.
+    - `squared`: (M, T) squared distances in m².
+    - `power`: (M, T) intensities minus the floor; NaN where not usable.
+    - `noise`: noise of the microphones. `known_noise`: whether its floor was measured.
+    - `values`: (K, M) logarithms of the parameters of the decay models.
+    - `held`: (K, M) mask of the parameters that are held at a bound.
+    - `spread`: (K,) standard deviation of each logarithm over the array, used as the prior.
+    - `strength`: (T,) logarithms of the strengths of the taps.
+    - `weight`: (M, T) inverse variances of the levels, reduced for large residuals.
+    - `outlier`: (T,) mask of the excluded taps. `dropped`: (M,) mask of the excluded microphones.
+    - `bounds`: lower and upper bounds (K,) of the logarithms.
     """
 
     kind: type[AbstractDecay] = eqx.field(static=True)
@@ -141,31 +149,33 @@ class TapFit(eqx.Module):
 
     @property
     def usable(self) -> Bool[np.ndarray, "M T"]:
-        """Readings with a finite level, of microphones that are not excluded."""
+        """Mask of the readings with a finite level, of microphones that are not excluded."""
         above = np.nan_to_num(self.power, nan=-np.inf) + self.noise.floor[:, None] > 0
         return above & ~self.dropped[:, None]
 
     @property
     def use(self) -> Bool[np.ndarray, "M T"]:
-        """Readings used in the fit."""
+        """Mask of the readings used in the fit: usable readings of taps that are not excluded."""
         return self.usable & ~self.outlier
 
     @property
     def received(self) -> Bool[np.ndarray, " T"]:
-        """Taps with a reading used in the fit, at any microphone."""
+        """Mask of the taps with at least one reading used in the fit."""
         return np.asarray(self.use.any(axis=0))
 
     @property
     def free(self) -> Bool[np.ndarray, "K M"]:
-        """Parameters determined by the data: those not held at a bound."""
+        """Mask of the parameters that are fitted to data: not held at a bound, and of microphones with usable
+        readings."""
         return ~self.held & self.usable.any(axis=1)
 
     @property
     def shared(self) -> Bool[np.ndarray, " M"]:
-        """Microphones whose own taps do not determine the decay of their response, which is taken from the others.
+        """Mask of the microphones whose own taps do not determine the decay of the response with distance. The prior
+        from the other microphones then determines it.
 
-        Where no tap was near a microphone, b is only bounded from above by the data; the least value would pull all
-        positions towards that microphone.
+        If no tap was near a microphone, the data give only an upper bound of b. Without the prior, b could be very
+        small, and estimated positions would be drawn to that microphone.
         """
         alone = np.where(np.arange(len(self.spread)) == 1, np.inf, self.spread)
         own = standard_errors(replace(self, spread=alone))[1]
@@ -173,17 +183,17 @@ class TapFit(eqx.Module):
 
     @property
     def level(self) -> Float[np.ndarray, "M T"]:
-        """Level y = log(power + floor); arbitrary where not usable."""
+        """Levels y = log(power + floor), with an arbitrary value where not usable."""
         return np.asarray(self.noise.level(host.where(self.usable, self.power, 1.0)))
 
     def problem(self, *, with_outliers: bool = False) -> DecayProblem:
-        """The least-squares problem with the present weights."""
+        """Create the least-squares problem with the current weights, optionally including the excluded taps."""
         weight = np.where(self.usable if with_outliers else self.use, self.weight, 0.0)
         floor = np.asarray(self.noise.floor)
         return DecayProblem(self.level, self.squared, weight, floor, self.kind, self.spread)
 
     def expected(self) -> Float[np.ndarray, "M T"]:
-        """Levels predicted by the models."""
+        """Levels predicted by the fitted models."""
         return self.problem().expected(self.values, self.strength)[0]
 
 
@@ -195,7 +205,7 @@ def fit_taps(
     noise: IntensityNoise,
     known_noise: bool,
 ) -> TapFit:
-    """Fit all microphones with a common shape, then each microphone to its own taps."""
+    """Fit the decay model `kind` to all microphones: first with a shared shape, then with individual shapes."""
     extent = float(np.sqrt(squared.max()))
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
     lower, upper = (np.array(bound) for bound in kind.bounds(extent))
@@ -216,7 +226,7 @@ def fit_taps(
         dropped=np.zeros(len(microphones), bool),
         bounds=(lower, upper),
     )
-    # The strength of a tap is estimated from the loudest microphone alone.
+    # The initial strength of a tap is estimated from the loudest microphone only.
     seen = np.where(fit.use, power, -np.inf)
     loudest = seen.argmax(axis=0), np.arange(taps)
     response = fit.problem().log_response(fit.values)
@@ -224,7 +234,7 @@ def fit_taps(
     fit = replace(
         fit,
         strength=np.where(fit.received & np.isfinite(strength), strength, 0.0),
-        # At first the model is good to 20 % at best.
+        # The relative error of the initial model is assumed to be at least 20 %.
         weight=1 / np.maximum(_level_variance(fit, np.nan_to_num(np.maximum(power, 0.0))), 0.04),
     )
     fit = _refine(fit, _ALTERNATIONS)
@@ -232,13 +242,13 @@ def fit_taps(
 
 
 def refit_without(fit: TapFit, bad: Bool[np.ndarray, " M"]) -> TapFit:
-    """Repeat the fit without the microphones in `bad`."""
+    """Repeat the fit without the microphones in the mask `bad`."""
     return _refine(replace(fit, dropped=fit.dropped | bad), _REWEIGHTINGS, scattered=True)
 
 
 def standard_errors(fit: TapFit) -> Float[np.ndarray, "K M"]:
-    """Standard deviations of the logarithms of the parameters, with the scale of a calibration; NaN where they are
-    held."""
+    """Standard deviations (K, M) of the logarithms of the parameters, for gains normalised as in a `Calibration`; NaN
+    for parameters held at a bound."""
     free = fit.free
     if free[0].sum() < 2:
         return np.full(free.shape, np.nan)
@@ -252,14 +262,14 @@ def standard_errors(fit: TapFit) -> Float[np.ndarray, "K M"]:
 
 
 def _refine(fit: TapFit, rounds: int, *, scattered: bool = False) -> TapFit:
-    """Alternate the joint fit of all microphones and the re-estimation of noise and weights until convergence; with
-    `scattered`, estimate the scatter of the parameters too."""
+    """Alternate between the fit of all microphones and the re-estimation of noise and weights, until convergence or for
+    `rounds` iterations. If `scattered`, the `spread` of the parameters is also re-estimated."""
     for _ in range(rounds):
         before, received = fit.values, np.asarray(fit.usable.any(axis=1))
         values, strength, held = fit_within(fit.problem(), before, fit.strength, received, fit.bounds)
         fit = replace(fit, values=values, strength=strength, held=held)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
-        fit = _reweighed(replace(fit, strength=strength))
+        fit = _reweight(replace(fit, strength=strength))
         if scattered:
             fit = replace(fit, spread=_scatter(fit))
         if np.abs(fit.values - before)[fit.free].max(initial=0.0) < 1e-9:
@@ -268,28 +278,29 @@ def _refine(fit: TapFit, rounds: int, *, scattered: bool = False) -> TapFit:
 
 
 def _spread(shapes) -> Float[np.ndarray, " K"]:
-    """The spread of each parameter; infinite for the gain."""
+    """Spread (K,) of all parameters from that of the `shapes`; infinite for the gain, which has no prior."""
     return np.concatenate([[np.inf], shapes])
 
 
 def _scatter(fit: TapFit) -> Float[np.ndarray, " K"]:
-    """Maximum-likelihood spread of the shapes, from the estimates and their errors (expectation maximisation)."""
+    """Update the spread of the shape parameters over the array by one step of expectation maximisation, from the
+    estimates and their standard errors."""
     known = fit.usable.any(axis=1)
     if known.sum() < 2:
         return fit.spread
     shapes, errors = fit.values[1:, known], np.nan_to_num(standard_errors(fit)[1:, known])
-    # An outlying microphone does not contribute.
+    # Deviations are limited, so that an outlying microphone does not dominate.
     off = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
     near = np.minimum(off, 3 * fit.spread[1:, None])
     square = (near**2 + errors**2).sum(axis=1) / (known.sum() - 1)
     return _spread(np.clip(np.sqrt(square), _LEAST, _MOST))
 
 
-def _reweighed(fit: TapFit) -> TapFit:
-    """Re-estimate the noise, the outliers and the weights from the residuals."""
+def _reweight(fit: TapFit) -> TapFit:
+    """Re-estimate the noise, the outlying taps and the weights from the residuals."""
     expected = fit.expected()
     received = np.maximum(np.exp(expected) - fit.noise.floor[:, None], 0.0)
-    # Degrees of freedom used by the unknown strengths and parameters.
+    # The residuals are smaller than the errors, since strengths and parameters were fitted; `inflation` corrects this.
     count = fit.use.sum()
     spent = fit.received.sum() + fit.free.sum()
     inflation = count / max(count - spent, 0.1 * count)
@@ -313,9 +324,10 @@ def _reweighed(fit: TapFit) -> TapFit:
 
 
 def _residual_of_equals(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, "M T"]:
-    """Residuals with equal weights of all microphones in estimating the strength of a tap.
+    """Residuals (M, T) of the levels if the strengths are estimated with the same relative error for all microphones.
 
-    With individual weights one microphone could dominate the estimated strengths and so gain weight without limit.
+    With individual relative errors, a single microphone could dominate the strengths: its residuals would become ever
+    smaller, and its weight ever larger.
     """
     relative = fit.noise.relative
     alike = replace(fit, noise=replace(fit.noise, relative=np.full(len(relative), np.median(relative))))
@@ -325,7 +337,8 @@ def _residual_of_equals(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, 
 
 
 def _level_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
-    """Variance of levels with the expected power `received`, bounded from below so that all weights are finite."""
+    """Variance (M, T) of the levels for the expected power `received`, which is bounded from below so that all weights
+    are finite."""
     floor = 1e-6 * np.nanmax(np.where(fit.use, fit.power, np.nan), axis=1, initial=1e-300)[:, None]
     return _variance(fit, np.maximum(received, floor))
 

@@ -1,9 +1,10 @@
-"""Which microphones can be calibrated, and which are left out because their levels disagree with the others.
+"""Selection of usable microphones, and cross-validation of decay models.
 
-Cross-validation of decay models: localisation errors of taps left out of the fit, by which models are compared.
+Microphones that received too few taps, or whose levels disagree with their model, are left out of a calibration.
 
-The tapped positions are divided into a few folds; the taps of each fold are located by models fitted to the taps of the
-other folds. Taps at one position stay in one fold, so that the model has not been fitted to that position.
+Decay models are compared by their localisation errors for taps left out of the fit. The tapped positions are divided
+into four folds, and the taps of each fold are located with models fitted to the other folds. All taps at one position
+are in the same fold, so that the models were not fitted to any tap at that position.
 """
 
 from __future__ import annotations
@@ -28,18 +29,19 @@ from jeit.acoustic.surface import AbstractSurface, bounding_box, in_space, longe
 from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import as_array, at_once, host, namespace, on_device
 
-# A microphone is unusable if its model explains less than this share of the variance of its levels.
+# Minimum fraction of the variance of a microphone's levels that its model must explain.
 _LEAST_EXPLAINED = 0.3
-# Also if its relative error is so many times the median of all, where the median counts as this much at least.
+# Maximum ratio of a microphone's relative error to the median over all microphones, and lower bound of that median.
 _UNLIKE, _WELL = 2.5, 0.1
-# Least decrease of the logarithm of a response over the tapped distances.
+# Minimum decrease of the logarithm of a response from the nearest to the farthest tap.
 _FLAT = 0.1
 
 
 def check_received(
     kind: type[AbstractDecay], distance: Float[np.ndarray, "M T"], power: Float[np.ndarray, "M T"], faults
 ) -> tuple[Bool[np.ndarray, " M"], str]:
-    """Which microphones received taps from enough distances, and the reason if too few did to fit a model, else ""."""
+    """Return the mask of the microphones that received taps from enough different distances, and the reason why no
+    model can be fitted if fewer than three did, otherwise ""."""
     needed = len(kind.parameters) + 2
     step = 1e-4 * distance.max()
     received = np.isfinite(power)
@@ -55,11 +57,14 @@ def check_received(
 
 
 def leave_out(fit: TapFit, faults) -> tuple[TapFit, Bool[np.ndarray, " M"], tuple[str, ...], Float[np.ndarray, " M"]]:
-    """Refit without the unusable microphones. Returns the fit, the mask of usable microphones, the reasons for the
-    others, and the share of variance that each model explains."""
+    """Repeat the fit without the unusable microphones.
+
+    Returns the new fit, the mask of the usable microphones, the reasons why microphones are unusable ("" for usable
+    ones), and the fraction of variance that each model explains.
+    """
     reasons, explained = _judge(fit, faults)
     bad = np.array([bool(reason) for reason in reasons])
-    # Faults of some microphones may show only once others are excluded.
+    # The disagreement of some microphones may become apparent only after others are excluded.
     while bad.any() and (~fit.dropped & ~bad).sum() >= 3:
         fit = refit_without(fit, bad)
         again, explained = _judge(fit, ("",) * len(bad), explained)
@@ -69,8 +74,8 @@ def leave_out(fit: TapFit, faults) -> tuple[TapFit, Bool[np.ndarray, " M"], tupl
 
 
 def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
-    """The reason why each microphone is unusable, "" where it is usable; and the share of the variance of its levels
-    that its model explains, taken from `explained` for excluded microphones."""
+    """Return the reason why each microphone is unusable ("" if usable), and the fraction of the variance of its levels
+    that its model explains. For excluded microphones this fraction is taken from `explained`."""
     expected, level, use = fit.expected(), fit.level, fit.use
     falls = _falls(fit)
     needed = len(fit.kind.parameters) + 2
@@ -111,19 +116,22 @@ def _falls(fit: TapFit) -> Float[np.ndarray, " M"]:
     return np.where(use.any(axis=1), most - least, np.inf)
 
 
+# Number of folds in the cross-validation.
 _PARTS = 4
-# Least relative error assumed in screening rasters; steps of a descent.
+# Minimum relative error assumed when a raster is screened; maximum number of steps of a minimisation.
 _SCREENED_AT, _MOST_STEPS = 0.2, 30
-# Located taps required before their errors widen covariances; 90 % quantile of χ² with two degrees of freedom.
+# Minimum number of located taps for an estimate of `widening`; fraction of the taps that the error ellipses must
+# contain; quantile of χ² with two degrees of freedom for that fraction.
 _FEWEST, _MOST_OF_THEM = 10, 0.9
 _CHI_SQUARE = -2 * math.log(1 - _MOST_OF_THEM)
 
 
 class LeftOutTaps(NamedTuple):
-    """Localisation errors of T left-out taps; NaN for taps that were not detected or are outliers.
+    """Localisation errors of T left-out taps.
 
-    `off` (T,): distance from the given position, metres; `square` (T,): squared error in units of the covariance;
-    `guess`: median distance of the positions from their mean.
+    **Fields**: `off`: distance (T,) of each estimate from the given position in metres; `square`: squared Mahalanobis
+    distance (T,), the squared error in units of the covariance; `guess`: median distance in metres of the given
+    positions from their mean. `off` and `square` are NaN for outliers and for taps that could not be located.
     """
 
     off: Float[np.ndarray, " T"]
@@ -132,14 +140,14 @@ class LeftOutTaps(NamedTuple):
 
     @property
     def median(self) -> float:
-        """Median localisation error, metres; infinite where no tap is located."""
+        """Median localisation error in metres; infinite if no tap was located."""
         known = self.off[np.isfinite(self.off)]
         return float(np.median(known)) if known.size else np.inf
 
     @property
     def widening(self) -> float:
-        """Factor on the covariances for which the ellipses contain 90 % of the taps; at least 1, since errors of the
-        models may be larger elsewhere."""
+        """Factor on covariances for which the 90 % error ellipses contain 90 % of the taps. It is at least 1, since the
+        errors of the models may be larger at other positions."""
         known = self.square[np.isfinite(self.square)]
         if known.size < _FEWEST:
             return 1.0
@@ -147,14 +155,14 @@ class LeftOutTaps(NamedTuple):
 
     @property
     def located(self) -> bool:
-        """Whether the median error is at most half that of guessing the mean of all positions."""
+        """Whether the median error is less than half of `guess`, the error of always guessing the mean position."""
         return self.median < 0.5 * self.guess
 
 
 def locate_left_out(
     fit: TapFit, microphones: Float[np.ndarray, "M d"], surface: AbstractSurface, places: Float[np.ndarray, "T d"]
 ) -> LeftOutTaps:
-    """Locate every tap with models fitted to taps at other positions, and the noise of the whole fit."""
+    """Locate each tap with decay models fitted to taps in other folds, and with the noise of the fit to all taps."""
     part = _deal(places)
     off, square = np.full((2, len(places)), np.nan)
     coarse = Localiser.create(_array(fit, fit.values, microphones, surface)).coarse
@@ -169,7 +177,7 @@ def locate_left_out(
         array = _array(fit, values, microphones, surface)
         found, covariance = at_once(_most_likely, array, coarse, np.nan_to_num(fit.power[:, out]), use)
         offset = found - places[out]
-        # On a curved surface the covariance is singular.
+        # The pseudoinverse is used, since the covariance on a curved surface is singular.
         known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(offset).all(axis=1) & (use.sum(axis=0) >= 3)
         inverse = np.linalg.pinv(np.where(known[:, None, None], covariance, 0.0), hermitian=True, rcond=1e-9)
         off[out] = np.where(known, np.linalg.norm(offset, axis=1), np.nan)
@@ -185,7 +193,7 @@ def _array(fit: TapFit, values, microphones, surface: AbstractSurface) -> Microp
 
 def _most_likely(array: MicrophoneArray, coarse: Pixels, power, use):
     """Positions (F, d) and covariances (F, d, d) by Fisher scoring from the best two valleys of a raster, within the
-    outline's bounding box: the result of a `Localiser`, except for the last digits and for non-rectangular outlines."""
+    bounding box of the outline. For a rectangular outline, the result is that of a `Localiser` up to rounding."""
     xp = namespace(array, power)
     rough = eqx.tree_at(lambda one: one.noise.relative, array, xp.maximum(array.noise.relative, _SCREENED_AT))
     maps = Likelihood.create(power, use, rough).screen(Likelihood.features(rough, coarse.chart))
@@ -211,7 +219,7 @@ def _most_likely(array: MicrophoneArray, coarse: Pixels, power, use):
 
 
 def _deal(places: Float[np.ndarray, "T d"]) -> Int[np.ndarray, " T"]:
-    """Fold of each tap: positions are assigned to the folds in turn, in a fixed random order."""
+    """Index of the fold of each tap. Distinct positions are assigned to the folds in turn, in a fixed random order."""
     step = 1e-4 * max(float(np.ptp(places, axis=0).max()), 1e-300)
     _, which = np.unique(np.round(places / step), axis=0, return_inverse=True)
     order = np.random.default_rng(0).permutation(which.max() + 1)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jeit.acoustic import LocatedTouches, Recording
 
 _OPTIONS = {"intensity": "--low, --high, --window and --hop"}
-# For a touch that has moved farther, start and end are printed instead of the middle.
+# Length of the path of a touch above which its start and end are printed instead of its mean position.
 _STROKE = 0.015  # m
 
 
@@ -134,7 +134,7 @@ def _rows(found: "LocatedTouches") -> Iterator[tuple[str, ...]]:
         yield str(number), *when, *where, f"{off:.1f}", f"{1e3 * touch.length:.0f}", counts
         both = touch.first + np.flatnonzero(locations.status[frames] == LocationStatus.TWO_TOUCHES)
         if both.size:
-            # Which of the two is the stronger may change: the other is the one farther from the track.
+            # The stronger touch may change from frame to frame. The other touch is the one farther from the track.
             pair = np.stack([locations.position[both], locations.second[both]])
             apart = np.linalg.norm(pair - track.position[both], axis=-1)
             other = 1e3 * pair[apart.argmax(axis=0), np.arange(both.size), :2].mean(axis=0)

@@ -1,1 +1,1 @@
-"""Localisation from intensities: objectives, their minimisation, maps, bounds, and localisation frame by frame."""
+"""Localisation of sources from intensities: objectives, their minimisation, maps, and the Cramér-Rao bound."""

@@ -1,4 +1,4 @@
-"""Intensities of a recording, with the calibration's settings, above the recording's noise floor or that of silence."""
+"""Intensities of a recording, computed with the band and windows of the calibration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, in
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.arguments import check_kind
 
-# Ratio of noise floors above which they are considered different.
+# Ratio of two noise floors above which they are considered different.
 _SAME_FLOOR = 4.0
 
 
@@ -23,12 +23,12 @@ def calibrated_intensities(
     *,
     silence: Recording | None = None,
 ) -> Intensities:
-    """Intensities of a recording, measured with the settings of the calibration.
+    """Compute the intensities of a recording. A recording of intensities is returned unchanged.
 
-    `silence`: samples of the same array at the same gain, untouched, from which the noise floor is then taken. A
-    recording without pauses needs it; otherwise the floor comes from the quietest windows of the recording itself.
-    Raises `ValueError` for another number of microphones, for a silence that is louder than the recording's quietest
-    windows, and for arguments of the wrong type.
+    `intensity`: band and windows; by default those of the calibration. `silence`: recording of the untouched array at
+    the same gain, from which the noise floor is estimated. It is required if touches never pause; by default the floor
+    is estimated from the quietest windows of the recording. Raises `ValueError` for another number of microphones, for
+    a `silence` that is louder than the quietest windows of the recording, and for arguments of the wrong type.
     """
     given = {"recording": recording} if silence is None else {"recording": recording, "silence": silence}
     for name, one in given.items():
@@ -50,7 +50,7 @@ def calibrated_intensities(
     recorded = intensities(recording, settings)
     if silence is not None:
         return _above_silence(recorded, intensities(silence, settings))
-    # Noise floors are comparable only if measured with the same settings.
+    # Noise floors can be compared only if band and windows are those of the calibration.
     if settings != calibration.intensity:
         if calibration.intensity is None:
             return recorded
@@ -68,7 +68,8 @@ def calibrated_intensities(
 
 
 def _above_silence(recorded: Intensities, quiet: Intensities) -> Intensities:
-    """Intensities above the noise floor of silence; microphones without a floor there are unusable."""
+    """Replace the noise floor of a recording by that of `quiet`, a recording of silence. Microphones that are unusable
+    in the silence become unusable."""
     known = np.asarray(quiet.usable.any(axis=0))
     both = (quiet.floor > 0) & (recorded.floor > 0)
     ratio = float(np.median(quiet.floor[both] / recorded.floor[both])) if both.any() else 1.0

@@ -1,18 +1,17 @@
-"""The intensity-consistency loss, and the search for its minima.
+"""Intensity-consistency loss, and minimisation of objectives on a skin.
 
-Intensity consistency: at the source, the strengths estimated from all microphones by their distances are equal.
+Each microphone gives an estimate of the strength of a source at u: its intensity I_i multiplied by g_i(u) = 1 / f_i(u).
+At the true position, the estimates of all microphones are equal. The loss of Park 2022, text S2, is
 
-The loss of Park 2022, text S2, with g_i = 1 / f_i and k the loudest microphone:
+    L(u) = Σ_{i≠k} (I_k g_k(u) − I_i g_i(u))²,
 
-    L(u) = Σ_{i≠k} (I_k g_k(u) − I_i g_i(u))².
+where k is the microphone with the highest intensity. The loss does not take noise into account: since g_i increases
+with distance, it amplifies the noise of distant microphones. Microphones are the first axis of all arrays, and frames
+the last. Intensities are divided by the highest intensity of the frame.
 
-The loss ignores noise: far microphones count as much as near ones, multiplied by the distance. Frames are the last axis
-of all arrays here, microphones the first; intensities are relative to the loudest.
-
-Minimisation of an objective on the skin from given starting positions, with derivatives of the minimum.
-
-An objective, `Likelihood` or `Consistency`, has `microphone_array`, `frames` (the arrays that differ between frames),
-`cost`, `expand`, `start`, and `features` and `screen` for candidate positions.
+The functions for minimisation find the minimum of an objective from given starting positions, and the derivatives of
+the minimum. An objective, `Likelihood` or `Consistency`, has the attributes `microphone_array`, `frames` (the arrays
+that differ between frames), `cost`, `expand`, `start`, and, for candidate positions, `features` and `screen`.
 """
 
 from __future__ import annotations
@@ -39,7 +38,12 @@ from jeit_solvers.engines import kept, namespace, set_at, slopes, undifferentiat
 
 
 class Consistency(eqx.Module):
-    """Consistency loss of F frames: `power` relative to the `loudest` (F,) of the microphones in `use` (M, F)."""
+    """Consistency loss of F frames.
+
+    **Fields**: `power`: intensities (M, F) divided by the highest intensity of the frame; `loudest`: index (F,) of the
+    microphone with the highest intensity; `scale`: that intensity (F,); `use`: mask (M, F) of the intensities used;
+    `microphone_array`: model of the array.
+    """
 
     power: Float[Array, "M F"]
     loudest: Int[Array, " F"]
@@ -51,7 +55,7 @@ class Consistency(eqx.Module):
     def create(
         cls, power: Float[Array, "M F"], use: Bool[Array, "M F"], microphone_array: MicrophoneArray
     ) -> "Consistency":
-        """Create the loss from intensities; unused values are ignored and may be NaN."""
+        """Create the loss from intensities `power`. Values outside the mask `use` are ignored and may be NaN."""
         xp = namespace(power, use)
         known = xp.where(use, power, 0.0)
         scale = xp.max(known, axis=0)
@@ -60,35 +64,39 @@ class Consistency(eqx.Module):
 
     @property
     def frames(self) -> tuple[Array, ...]:
-        """The arrays that differ between frames."""
+        """Fields whose last axis is the frame."""
         return self.power, self.loudest, self.scale, self.use
 
     def differences(self, chart: Float[Array, "2 F"]) -> Float[Array, "M F"]:
-        """Differences I_k g_k − I_i g_i; 0 where not used."""
+        """Differences I_k g_k − I_i g_i of the estimated strengths; 0 where not used."""
         estimates = self.power / self.microphone_array.response(chart)
         xp = namespace(self, estimates)
         most = xp.take_along_axis(estimates, self.loudest[None], axis=0)
         return xp.where(self.use, most - estimates, 0.0)
 
     def cost(self, chart: Float[Array, "2 F"]) -> Float[Array, " F"]:
-        """The loss L, relative to the square of the loudest intensity."""
+        """Loss L divided by the square of the highest intensity."""
         return (self.differences(chart) ** 2).sum(axis=0)
 
     def expand(self, chart: Float[Array, "2 F"]) -> tuple[Array, Array, Array]:
-        """Loss, gradient, and Gauss-Newton matrix."""
+        """Loss, its gradient (2, F), and its Gauss-Newton matrix (2, 2, F)."""
         off, along = kept(slopes(self.differences, chart))
         gradient = 2 * namespace(off).stack([(off * slope).sum(axis=0) for slope in along])
         rows = [[2 * (one * other).sum(axis=0) for other in along[: k + 1]] for k, one in enumerate(along)]
         return (off**2).sum(axis=0), gradient, symmetric_small(rows)
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "2 F"]:
-        """Initial unknowns: the chart coordinates."""
+        """Initial unknowns of a minimisation: the chart coordinates."""
         return chart
 
     @staticmethod
     def features(microphone_array: MicrophoneArray, chart: Float[Array, "2 P"]) -> Float[Array, "N P"]:
-        """Features of candidate positions for `screen`: the ten products of pairs of (|x|², x, y, 1) where 1 / f is (|x
-        − x_i|² + b) / a, on a surface in space fifteen; responses f (M, P) for other models."""
+        """Features of candidate positions for `screen`.
+
+        For the inverse-square model, 1 / f = (|x − x_i|² + b) / a, they are the ten products of pairs of (|x|², x, y,
+        1), or the fifteen products of pairs of (|x|², x, y, z, 1) in space. For other models they are the responses f
+        (M, P).
+        """
         if not isinstance(microphone_array.decay, InverseSquare):
             return microphone_array.response(chart)
         place = microphone_array.surface.place(chart)
@@ -97,10 +105,12 @@ class Consistency(eqx.Module):
         return xp.stack([terms[i] * terms[j] for i in range(len(terms)) for j in range(i + 1)])
 
     def screen(self, features: Float[Array, "N P"]) -> Float[Array, "F P"]:
-        """The loss at candidate positions, by matrix products for all frames and positions.
+        """Loss (F, P) of all frames at candidate positions, computed by matrix products.
 
-        With A = I_k g_k and n microphones in use it is n A² − 2 A Σ I_i g_i + Σ I_i² g_i². Where g is quadratic in the
-        position, the loss is a polynomial of the fourth degree: ten coefficients per frame and one product."""
+        With A = I_k g_k and n microphones in use, the loss is n A² − 2 A Σ I_i g_i + Σ I_i² g_i². For the
+        inverse-square model, g is quadratic in the position, so the loss is a polynomial of degree four; it is computed
+        as the product of its coefficients and the features.
+        """
         xp = namespace(self, features)
         number = xp.sum(self.use, axis=0)
         if not isinstance(self.microphone_array.decay, InverseSquare):
@@ -122,15 +132,19 @@ class Consistency(eqx.Module):
         return xp.stack(coefficients, axis=1) @ features
 
     def covariance(self, chart: Float[Array, "2 F"], strength: Float[Array, " F"]) -> Float[Array, "2 2 F"]:
-        """Covariance of the minimum, from the variances of the intensities: Σ_i (∂u/∂I_i)(∂u/∂I_i)ᵀ var I_i, with the
-        derivative of the minimum by the implicit function theorem, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I at small differences."""
+        """Covariance of the minimum u, from the variances of the intensities: Σ_i (∂u/∂I_i)(∂u/∂I_i)ᵀ var I_i.
+
+        The implicit function theorem gives the derivative of the minimum, ∂u/∂I = −H⁻¹ ∂²L/∂u∂I. Second derivatives are
+        approximated for small differences I_k g_k − I_i g_i.
+        """
         estimates, along = slopes(lambda u: 1 / self.microphone_array.response(u), chart)
         xp = namespace(self, estimates)
         slope = xp.stack(along) * self.power
         most = xp.take_along_axis(slope, self.loudest[None, None], axis=1)
         rise = xp.where(self.use, most - slope, 0.0)
         matrix = xp.einsum("kmf,lmf->klf", rise, rise)
-        # ∂/∂I_i of ½∂L/∂u: −g_i times the gradient of its difference; for the loudest, g_k times the sum over all.
+        # Derivative of ½ ∂L/∂u with respect to I_i: −g_i times the gradient of the difference of microphone i. For the
+        # loudest microphone k it is g_k times the sum of these gradients over all microphones.
         is_loudest = xp.arange(estimates.shape[0])[:, None] == self.loudest
         drive = xp.where(is_loudest, xp.sum(rise, axis=1, keepdims=True) * estimates, -estimates * rise)
         received = strength / estimates
@@ -140,22 +154,25 @@ class Consistency(eqx.Module):
         return xp.einsum("ijf,jkf,klf->ilf", inverse, spread, inverse)
 
 
-# Positions screened along the outline.
+# Number of candidate positions along the outline.
 _EDGE = 240
-# Valleys closer than this fraction of the skin's size are the same.
+# Distance, as a fraction of the skin's size, below which two minima are considered the same.
 _SAME_VALLEY = 0.05
-# Steps into a second valley before it is compared with the first, and the largest cost difference to continue with.
+# Number of steps in the second valley before its cost is compared with that of the first; maximum difference of cost
+# for which the minimisation continues; maximum number of steps of a minimisation.
 _TRIAL_STEPS, _PROMISING, _MOST_STEPS = 8, 8.0, 30
-# Least predicted decrease of a step, relative to the cost; an exact Newton step follows.
+# Tolerance of the minimisation: predicted decrease of the cost in the next step, relative to 1 + |cost|.
 _TOLERANCE = 1e-12
 
 
 def find_minima(objective, first, second, worth):
-    """Minimise from both starts (2, F), the second only where it is promising.
+    """Minimise the objective from the starting positions `first` and `second` (2, F).
 
-    Returns the unknowns (n, F), the excess cost of the outline over the minimum beyond it, the excess cost of the rival
-    valley, whether converged, and the (start, end) of the side of the outline on which frames were held, NaN for those
-    inside."""
+    `worth`: mask of the frames for which the second start is tried, or None for none; it is given up if it is not
+    promising. Returns the unknowns (n, F) at the minimum; the cost on the outline minus the cost of the minimum beyond
+    it; the difference of cost between the two minima; whether the minimisation converged; and the start and end (2, 2,
+    F) of the side of the outline to which the position was moved, NaN for positions inside.
+    """
     surface = objective.microphone_array.surface
     found = _minimise(objective, objective.start(first), None)
     unknowns, converged = found.x, found.converged
@@ -164,7 +181,7 @@ def find_minima(objective, first, second, worth):
     within = surface.outline.contains(unknowns[:2].T)
     rival, least = xp.full(value.shape, xp.inf), value
     if worth is not None:
-        # After a few steps, only promising valleys are minimised further.
+        # After a few steps, the minimisation continues only in promising second valleys.
         tried = _minimise(objective, objective.start(second), ~worth, max_steps=_TRIAL_STEPS)
         worth = worth & (tried.value < value + _PROMISING)
         other = _minimise(objective, tried.x, ~worth)
@@ -173,12 +190,14 @@ def find_minima(objective, first, second, worth):
         apart = xp.linalg.norm(other.x[:2] - unknowns[:2], axis=0) > _SAME_VALLEY * longer_side(surface)
         rival = xp.where(apart & worth & within & other_within, xp.abs(other_value - value), xp.inf)
         least = xp.minimum(value, other_value)
-        # If one of two valleys lies beyond the outline, the other is taken; the outline itself may still be better.
+        # If one of the two minima is outside the outline, the other is selected. A position on the outline may still be
+        # better.
         better = xp.where(other_within == within, other_value < value, other_within & xp.isfinite(other_value))
         unknowns = xp.where(better, other.x, unknowns)
         converged = xp.where(better, other.converged, converged)
         value, within = xp.where(better, other_value, value), xp.where(better, other_within, within)
-    # Positions beyond the outline are replaced by the best on it; so are valleys inside that are worse than one beyond.
+    # Minima outside the outline are replaced by the best position on the outline. A minimum inside is also compared
+    # with it, if the other minimum, outside, has a lower cost.
     beyond = xp.isfinite(value) & (~within | (least < value))
     nowhere = xp.full((2, 2, value.size), xp.nan)
 
@@ -202,10 +221,11 @@ def find_minima(objective, first, second, worth):
 
 
 def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimum:
-    """Minimise within three times the outline's box, in steps of at most a quarter of the skin and a factor of ten in
-    strength.
+    """Minimise the objective within the bounding box of the outline, extended by its longer side in all directions. A
+    step is at most a quarter of that side, and a factor of ten in strength.
 
-    The last steps use exact Hessians, unless `max_steps` is given, which limits the number of steps without them.
+    `max_steps`: maximum number of steps, all with the approximate Hessian. By default, the last steps use the exact
+    Hessian.
     """
     surface = objective.microphone_array.surface
     low, high = bounding_box(surface)
@@ -220,7 +240,7 @@ def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimu
         lambda x, frames: of(frames).expand(x),
         start,
         objective.frames,
-        finish=None if max_steps is not None else lambda x, frames: _exactly(of(frames), x),
+        finish=None if max_steps is not None else lambda x, frames: _expand_exactly(of(frames), x),
         max_steps=max_steps or _MOST_STEPS,
         lower=xp.concatenate([low - reach, -rest])[:, None],
         upper=xp.concatenate([high + reach, rest])[:, None],
@@ -230,23 +250,22 @@ def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimu
     )
 
 
-def _exactly(objective, x) -> tuple[Array, Array, Array]:
-    """The objective's expansion with the exact Hessian, where that is positive definite: few last steps are then needed
-    near a minimum, however large its misfit."""
+def _expand_exactly(objective, x) -> tuple[Array, Array, Array]:
+    """Value, gradient and Hessian of the objective. The Hessian is exact where it is positive definite, so that few
+    steps are needed near a minimum even if its misfit is large; elsewhere it is approximate."""
     value, gradient, model = objective.expand(x)
     hessian = hessian_small(objective.cost, x)
     return value, gradient, namespace(hessian).where(definite_small(hessian), hessian, model)
 
 
 def _on_edge(objective, skip) -> tuple[Minimum, Array]:
-    """The best position on the outline: the best of many, refined along its side. Also returns the side, (2, 2, F).
-
-    Frames in `skip` (F,) are left out.
+    """Find the best position on the outline: the best of many candidates, refined along its side. Frames in the mask
+    `skip` (F,) are left out. Also returns the start and end of the side (2, 2, F).
     """
     start, end = outline_sides(objective.microphone_array.surface)
     xp = namespace(objective, start)
     length = xp.linalg.norm(end - start, axis=0)
-    # Positions at equal steps along the whole outline, as (side, fraction of the side).
+    # Candidate positions are equally spaced along the outline, and given by a side and a fraction of its length.
     stops = xp.concatenate([xp.zeros(1), xp.cumsum(length)])
     walked = stops[-1] * (xp.arange(_EDGE) + 0.5) / _EDGE
     which = xp.clip(xp.searchsorted(stops, walked, side="right") - 1, 0, length.size - 1)
@@ -282,15 +301,18 @@ def _on_edge(objective, skip) -> tuple[Minimum, Array]:
     )
     end_of = origin + along
     corner = (found.x[0] <= 0) | (found.x[0] >= 1)
-    # A frame held in a corner cannot move: its side has length zero.
+    # A position in a corner of the outline cannot move along a side, so its side is given the length zero.
     side = xp.stack([origin, xp.where(corner, origin, end_of)])
     return Minimum(unknowns_of(found.x, origin, along), found.value, found.converged, found.steps), side
 
 
 def differentiable_minima(objective, unknowns, side, reach):
-    """The minimum as a differentiable function of everything in `objective`. One Newton step from it, x − H⁻¹ ∇cost,
-    adds zero to the value and, with H and x constant, −H⁻¹ ∂∇cost to the derivative, by the implicit function
-    theorem."""
+    """Return the minimum `unknowns` as a differentiable function of all arrays in `objective`.
+
+    The result is a Newton step x − H⁻¹ ∇cost from the minimum x, with x and H held constant. The step is zero, and its
+    derivative −H⁻¹ ∂∇cost is that of the minimum by the implicit function theorem. `side`: start and end of the side of
+    the outline on which the minimum lies, or NaN. `reach`: size of the skin in metres.
+    """
     at, xp = undifferentiated(unknowns), namespace(objective, unknowns)
 
     def finite_cost(at):
@@ -299,7 +321,7 @@ def differentiable_minima(objective, unknowns, side, reach):
 
     matrix = hessian_small(undifferentiated(objective).cost, at)
     gradient = gradient_small(finite_cost, at)
-    # Frames held on the outline move along their side only: the rest of the step is projected out.
+    # Positions on the outline can move along their side only, so the step is projected onto the side.
     held = ~xp.isnan(side[0, 0])
     along = xp.where(held, side[1] - side[0], 0.0)
     length = xp.linalg.norm(xp.where(along == 0, 1e-300, along), axis=0)

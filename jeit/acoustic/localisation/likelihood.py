@@ -1,13 +1,13 @@
-"""The likelihood of a place given the levels of the microphones, and its Cramér-Rao bound.
+"""Likelihood of source positions given the levels of the microphones, and the Cramér-Rao bound.
 
-Frames are the last axis of all arrays here, microphones the first. The unknowns of a frame are chart coordinates u and
-the logarithm of strength, s, of one source after the other; powers of several sources add. With expected levels m_i(u,
-s) = log(Σ e^s f_i(u) + N_i) and variances v_i(u, s),
+Microphones are the first axis of all arrays, and frames the last. The unknowns of a frame are, for each source, its
+chart coordinates u and the logarithm s of its strength. The powers of several sources add. With the levels y_i, the
+expected levels m_i = log(Σ e^s f_i(u) + N_i) and their variances v_i, the negative log-likelihood is
 
-    cost = Σ_i ½ (y_i − m_i)² / v_i + ½ log v_i
+    cost = Σ_i [½ (y_i − m_i)² / v_i + ½ log v_i]
 
-over the microphones in use; steps are Fisher scoring, whose matrix Σ ∇m ∇mᵀ / v + ½ ∇log v ∇log vᵀ is the inverse of
-the Cramér-Rao bound.
+over the microphones in use. It is minimised by Fisher scoring. The Fisher matrix is Σ_i [∇m_i ∇m_iᵀ / v_i + ½ ∇log v_i
+∇log v_iᵀ]; its inverse is the Cramér-Rao bound.
 """
 
 from __future__ import annotations
@@ -24,7 +24,11 @@ from jeit_solvers.engines import either_engine, kept, namespace, slopes
 
 
 class Likelihood(eqx.Module):
-    """Negative log-likelihood of F frames: `power` and `level` y (M, F), the mask `use` (M, F), and the microphones."""
+    """Negative log-likelihood of F frames.
+
+    **Fields**: `power`: intensities (M, F) minus the floor; `level`: levels y (M, F); `use`: mask (M, F) of the
+    intensities used; `microphone_array`: model of the array.
+    """
 
     power: Float[Array, "M F"]
     level: Float[Array, "M F"]
@@ -35,13 +39,13 @@ class Likelihood(eqx.Module):
     def create(
         cls, power: Float[Array, "M F"], use: Bool[Array, "M F"], microphone_array: MicrophoneArray
     ) -> "Likelihood":
-        """Create the likelihood from intensities; unused values are ignored and may be NaN."""
+        """Create the likelihood from intensities `power`. Values outside the mask `use` are ignored and may be NaN."""
         known = namespace(power, use).where(use, power, 1.0)
         return cls(known, microphone_array.noise.level(known), use, microphone_array)
 
     @property
     def frames(self) -> tuple[Array, ...]:
-        """The arrays that differ between frames."""
+        """Fields whose last axis is the frame."""
         return self.power, self.level, self.use
 
     def cost(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
@@ -52,20 +56,21 @@ class Likelihood(eqx.Module):
         return xp.sum(xp.where(self.use, terms, 0.0), axis=0)
 
     def misfit(self, unknowns: Float[Array, "n F"]) -> Float[Array, " F"]:
-        """Misfit Σ (y − m)² / v. Where the model holds it is chi-square distributed; its degrees of freedom are the
-        microphones in use minus the unknowns."""
+        """Misfit Σ (y − m)² / v. If the model is correct, it has a chi-square distribution; the number of degrees of
+        freedom is the number of microphones in use minus the number of unknowns."""
         return (self.residual(unknowns) ** 2).sum(axis=0)
 
     def residual(self, unknowns: Float[Array, "n F"]) -> Float[Array, "M F"]:
-        """Residuals (y − m) / √v; 0 where not used."""
+        """Standardised residuals (y − m) / √v; 0 where not used."""
         mean, variance = self.microphone_array.expected(unknowns)
         xp = namespace(self, mean)
         return xp.where(self.use, (self.level - mean) / xp.sqrt(variance), 0.0)
 
     def expand(self, unknowns: Float[Array, "n F"]) -> tuple[Array, Array, Array]:
-        """Cost, gradient, and Fisher matrix."""
+        """Cost, its gradient (n, F), and the Fisher matrix (n, n, F)."""
         (mean, variance), along = slopes(self.microphone_array.expected, unknowns)
-        # Computed once: all sums below use the logarithms.
+        # `kept` makes the compiler compute these arrays once for all sums below. From here on, `dv` is the derivative
+        # of log v.
         mean, variance, along = kept((mean, variance, [(dm, dv / variance) for dm, dv in along]))
         xp = namespace(self, mean)
         used = xp.where(self.use, 1.0, 0.0)
@@ -85,13 +90,14 @@ class Likelihood(eqx.Module):
         return cost, gradient, matrix
 
     def start(self, chart: Float[Array, "2 F"]) -> Float[Array, "3 F"]:
-        """Initial unknowns at given positions, with the best-fitting strength."""
+        """Initial unknowns of a minimisation: the chart coordinates and the logarithm of the best-fitting strength."""
         response = self.microphone_array.response(chart)
         xp = namespace(response)
         return xp.concatenate([chart, xp.log(self.strength(response))[None]])
 
     def strength(self, response: Float[Array, "M F"]) -> Float[Array, " F"]:
-        """Strength of sources at known positions, by least squares weighted with the observed power; positive."""
+        """Strength of sources with given responses f, by least squares with weights from the observed power. The result
+        is positive."""
         weight, xp = self._weight(), namespace(self, response)
         fitted = xp.sum(weight * self.power * response, axis=0) / xp.sum(weight * response**2, axis=0)
         loudest = xp.max(xp.where(self.use, self.power / response, 0.0), axis=0)
@@ -99,12 +105,13 @@ class Likelihood(eqx.Module):
 
     @staticmethod
     def features(microphone_array: MicrophoneArray, chart: Float[Array, "2 P"]) -> Float[Array, "M P"]:
-        """Features of candidate positions for `screen`: their responses f."""
+        """Features of candidate positions for `screen`: the responses f (M, P)."""
         return microphone_array.response(chart)
 
     def screen(self, response: Float[Array, "M P"]) -> Float[Array, "F P"]:
-        """Weighted residual sum of squares at candidate positions with responses f and the best strength, with weights
-        from the observed power: ½ (Σ w p² − (Σ w p f)² / Σ w f²). Two matrix products for all frames and positions."""
+        """Half the weighted residual sum of squares (F, P) at candidate positions with responses f and the best-fitting
+        strength: ½ (Σ w p² − (Σ w p f)² / Σ w f²), with observed powers p and weights w derived from them. It
+        approximates the cost, and takes two matrix products for all frames and positions."""
         weight, xp = self._weight(), namespace(self, response)
         seen = weight * self.power
         fitted = xp.maximum(seen.T @ response, 0.0) ** 2 / (weight.T @ response**2)
@@ -122,11 +129,12 @@ def cramer_rao(
     *,
     use: ArrayLike | None = None,
 ) -> Float[Array, "N d d"]:
-    """Cramér-Rao bound (N, d, d), m², of the positions of sources at `position` (N, d), metres, with `strength` (N,) or
-    one for all, which the localiser does not know.
+    """Cramér-Rao bound (N, d, d) in m²: the minimum covariance of unbiased estimates of the positions of sources.
 
-    The inverse of the Fisher matrix of position and log strength, under the noise model of `microphone_array`. `use`:
-    (M,) mask of the microphones used, all unless given. Raises `ValueError` for what is no `MicrophoneArray`.
+    It is the position block of the inverse Fisher matrix of position and logarithm of strength, for the noise model of
+    `microphone_array`; the strength is treated as unknown. `position` (N, d): true positions in metres. `strength`:
+    true strengths, (N,) or a number. `use` (M,): mask of the microphones used; by default all. Raises `ValueError` if
+    `microphone_array` is not a `MicrophoneArray`.
     """
     check_array(microphone_array)
     present = np.ones(len(microphone_array.microphones), bool) if use is None else use

@@ -1,8 +1,9 @@
 """`Localiser`: source positions from the intensities of many frames, by maximum likelihood or intensity consistency.
 
-Each frame is screened on a coarse grid, and a descent starts from each of the best two valleys. A minimum beyond the
-outline is replaced by the best position on the outline. The computation is one program, optionally compiled, and is
-differentiable in the intensities, the microphones' positions and the decay models by the implicit function theorem.
+The objective of each frame is evaluated on a coarse grid, and minimised from the two deepest valleys of the grid. A
+minimum outside the outline is replaced by the best position on the outline. The computation can be compiled. It is
+differentiable with respect to the intensities, the positions of the microphones and the decay models, by the implicit
+function theorem.
 """
 
 from __future__ import annotations
@@ -33,22 +34,26 @@ from jeit_solvers.engines import (
 )
 
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
-# Positions screened in the bounding box of the outline.
+# Approximate number of positions of the coarse grid over the bounding box of the outline.
 _COARSE = 400
-# Frames processed together, so that their arrays fit into the cache.
+# Number of frames processed together, so that their arrays fit into the processor's cache: with the coarse grid, and
+# with a map.
 _CHUNK, _CHUNK_OF_MAPS = 1024, 32
-# Least relative error of the decay models assumed in screening.
+# Minimum relative error of the decay models assumed when a grid is screened.
 _SCREENED_AT = 0.2
 
 
 class SourceEstimate(eqx.Module):
     """Estimated sources of F frames.
 
-    `position` (F, d) in metres, on the surface and inside its outline; its `covariance` (F, d, d) in m²; `strength`
-    (F,), in units of intensity; `misfit` (F,), chi-square of the residuals of one source at this position, with
-    `freedom` (F,) degrees; `excess` (F,), by how much a position beyond the outline would lower −2 log-likelihood (0
-    for positions inside); `rival` (F,), by how much the second best valley is worse (∞ if there is none); `converged`
-    (F,).
+    - `position`: (F, d) in metres, on the surface and within its outline.
+    - `covariance`: (F, d, d) covariance of the position in m².
+    - `strength`: (F,) in the unit of intensity.
+    - `misfit`: (F,) chi-square of the residuals. `freedom`: (F,) its degrees of freedom.
+    - `excess`: (F,) decrease of twice the objective (for the likelihood, −2 log-likelihood) at the best position beyond
+      the outline; 0 if no position beyond it is better.
+    - `rival`: (F,) difference of twice the objective between the two deepest valleys; ∞ without a second one.
+    - `converged`: (F,) whether the minimisation converged.
     """
 
     position: Float[Array, "F d"]
@@ -62,7 +67,12 @@ class SourceEstimate(eqx.Module):
 
 
 class Localiser(eqx.Module):
-    """Estimator of source positions from intensities; construct it with `Localiser.create` and call it."""
+    """Estimator of source positions from intensities. Create it with `Localiser.create`, and call it with intensities.
+
+    **Fields**: `microphone_array`: model of the array; `coarse`: coarse grid; `pixels`: raster of the maps, if any;
+    `features`: precomputed features of its pixels; `method`: "likelihood" or "consistency"; `compiled`: whether calls
+    are compiled.
+    """
 
     microphone_array: MicrophoneArray
     coarse: Pixels
@@ -82,10 +92,11 @@ class Localiser(eqx.Module):
     ) -> "Localiser":
         """Create a localiser for an array of microphones.
 
-        `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster on
-        which the whole map of every frame is computed and the descent starts, (200, 200) in the paper; unless given, a
-        coarse grid of 400 positions and no maps. `compiled`: False for a single call, which NumPy completes before JAX
-        has compiled it. Raises `ValueError` for another method, or an invalid shape.
+        `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022. `map_shape`: (rows,
+        columns) of the raster on which the objective of each frame is evaluated, (200, 200) in Park 2022; required for
+        `maps`. By default a coarse grid of about 400 positions is used. The best position is refined in either case.
+        `compiled`: whether to compile calls; False is faster for a single call. Raises `ValueError` for an unknown
+        method or an invalid shape.
         """
         check_array(microphone_array)
         check_name("method", method, METHODS)
@@ -103,14 +114,17 @@ class Localiser(eqx.Module):
         return cls(microphone_array, coarse, pixels, features, method, compiled)
 
     def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> SourceEstimate:
-        """Locate the source of each frame. `power` (F, M): intensities above the floor; `use`: mask of those to use,
-        all finite ones unless given. Frames with fewer than three usable microphones give NaN."""
+        """Locate the source of each frame. `power` (F, M): intensities minus the floor. `use` (F, M): mask of the
+        intensities to use; by default all finite ones. Frames with fewer than three usable microphones give NaN."""
         return self._run(_locate, power, use)
 
     def maps(self, power: ArrayLike, use: ArrayLike | None = None) -> Float[Array, "F rows columns"]:
-        """Compute the map of each frame: the paper's loss, relative to the square of the loudest intensity, or the
-        negative log-likelihood at the best strength; bottom row first, NaN outside the outline. Raises `ValueError`
-        where the localiser was created without `map_shape`."""
+        """Compute the map of each frame: the negative log-likelihood with the best strength at each pixel, up to a
+        constant; or the consistency loss divided by the square of the highest intensity.
+
+        The bottom row is first; pixels outside the outline are NaN. `power`, `use`: as in a call. Raises `ValueError`
+        if the localiser was created without `map_shape`.
+        """
         if self.pixels is None:
             raise ValueError("maps were not asked for: make the Localiser with map_shape=(rows, columns).")
         return self._run(_maps, power, use)
@@ -118,11 +132,11 @@ class Localiser(eqx.Module):
     def with_maps(
         self, power: ArrayLike, use: ArrayLike | None = None
     ) -> tuple[SourceEstimate, Float[Array, "F rows columns"]]:
-        """Compute both the estimate and the map of each frame."""
+        """Compute both the estimate and the map of each frame. Raises `ValueError` as `maps` does."""
         return self(power, use), self.maps(power, use)
 
     def _run(self, function, power, use):
-        """Call `function` with the localiser, the intensities as an array, and the mask of those to use."""
+        """Validate the intensities and the mask, and call `function` with the localiser and both arrays."""
         at_hand = not self.compiled and has_values(self, power, use)
         xp = np if at_hand else jnp
         power = xp.asarray(power, float)
@@ -133,7 +147,7 @@ class Localiser(eqx.Module):
                 f"power has shape {power.shape} and use {use.shape}; give (frames, microphones) with "
                 f"{len(self.microphone_array.microphones)} microphones."
             )
-        if not len(power):  # as for a microphone without a reading
+        if not len(power):  # without frames, the result of an unusable frame gives the structure of the output
             found = self._run(function, np.full((1, power.shape[1]), np.nan), None)
             return jax.tree.map(lambda array: array[:0], found)
         return on_device(at_once(function, self, power, use)) if at_hand else _compiled(function, self, power, use)
@@ -145,8 +159,8 @@ def _compiled(function, localiser: Localiser, power, use):
 
 
 def _in_chunks(function, most: int, *arrays):
-    """Call `function` for a few frames at a time: `arrays` (F, M) are split, padded and transposed to (M, F); F is the
-    leading axis of the results."""
+    """Call `function` for at most `most` frames at a time. The `arrays` (F, M) are split into chunks, padded, and
+    transposed to (M, F). In the results, frames are the leading axis."""
     number = arrays[0].shape[0]
     size_of_chunk = min(most, max(number, 1))
     chunks = -(-number // size_of_chunk)
@@ -167,14 +181,14 @@ def _features(objective, microphone_array: MicrophoneArray, chart) -> Array:
 
 
 def _raster(localiser: Localiser, microphone_array: MicrophoneArray) -> tuple[Pixels, Array]:
-    """The raster of `map_shape` if given, otherwise the coarse one, and the features of its pixels."""
+    """Return the raster of the maps, or the coarse grid if there are no maps, and the features of its pixels."""
     if localiser.pixels is not None and localiser.features is not None:
         return localiser.pixels, localiser.features
     return localiser.coarse, METHODS[localiser.method].features(microphone_array, localiser.coarse.chart)
 
 
 def _maps(localiser: Localiser, power, use) -> Array:
-    """Maps of all frames at once, in one product without copies."""
+    """Compute the maps of all frames (F, rows, columns) at once by matrix products."""
     pixels, features = _raster(localiser, localiser.microphone_array)
     use = _usable(localiser, power, use)
     maps = METHODS[localiser.method].create(power.T, use.T, localiser.microphone_array).screen(features)
@@ -182,11 +196,11 @@ def _maps(localiser: Localiser, power, use) -> Array:
 
 
 def _starts(localiser: Localiser, power, use):
-    """Starting positions of the descents of each frame: first (F, 2), second (F, 2), and whether to try the second
-    (F,)."""
+    """Starting positions of the minimisation: those of the first valley (F, 2) and the second valley (F, 2), and the
+    mask (F,) of the frames whose second valley is worth a minimisation."""
     still = undifferentiated(localiser.microphone_array)
     pixels, features = _raster(localiser, still)
-    # Valleys of an exact model are narrower than the pixel spacing: a least relative error is assumed in screening.
+    # The valleys of a very accurate model are narrower than the grid spacing, so a minimum relative error is assumed.
     still = eqx.tree_at(
         lambda one: one.noise.relative, still, namespace(still).maximum(still.noise.relative, _SCREENED_AT)
     )
@@ -201,7 +215,7 @@ def _starts(localiser: Localiser, power, use):
 
 
 def _usable(localiser: Localiser, power, use):
-    """Mask of usable readings. Without a floor, readings that are not positive have no logarithm and are not usable."""
+    """Mask of the usable readings: those in `use` with a positive sum of power and floor, whose logarithm exists."""
     return use & (power + localiser.microphone_array.noise.floor > 0)
 
 
@@ -216,11 +230,12 @@ def _locate(localiser: Localiser, power, use) -> SourceEstimate:
 
 
 def _refine(localiser: Localiser, power, use, first, second, worth) -> SourceEstimate:
-    """Descend from the starts (2, F) of each frame; `power` and `use` (M, F)."""
+    """Minimise the objective of each frame from the starting positions `first` and `second` (2, F). `power`, `use`: (M,
+    F)."""
     microphone_array = localiser.microphone_array
     fixed = undifferentiated(microphone_array)
     still = METHODS[localiser.method].create(undifferentiated(power), use, fixed)
-    # On a fine raster the start is the best pixel, and there is no second valley to try.
+    # If there are maps, the minimisation starts from the best pixel only.
     unknowns, excess, rival, converged, side = find_minima(
         still, first, second, worth if localiser.pixels is None else None
     )

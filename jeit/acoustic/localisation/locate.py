@@ -1,4 +1,4 @@
-"""Localisation of a recording: which frames contain a touch, its position, and the status of the other frames."""
+"""Localisation of the touches in a recording: detection, position and status of each frame."""
 
 from __future__ import annotations
 
@@ -20,21 +20,24 @@ from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.acoustic.surface import longer_side
 from jeit_solvers.engines import as_array, on_host
 
-# Probability that a silent frame is classified as a touch; that a frame of one source is classified as a misfit.
+# Probability that a silent frame is detected as a touch, and that a frame with one source is classified as a misfit.
 _FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
-# Threshold in standard deviations for a detection, where the distribution is unknown.
+# Detection threshold in standard deviations of the noise, if the distribution of the noise is unknown.
 _ALARM_DEVIATIONS = 6.0
-# Differences of −2 log-likelihood: by which a position beyond the outline must be better for "outside" (three standard
-# deviations), and below which a rival valley makes a frame ambiguous (two).
+# Thresholds of differences of −2 log-likelihood: a frame is "outside" if a position beyond the outline is better by
+# more than this (three standard deviations); a frame is "ambiguous" if its second valley is worse by less than this
+# (two standard deviations).
 _OUTSIDE, _RIVAL = 9.0, 4.0
-# Two sources are accepted if their misfit is below this share of that of one source and not too large per degree of
-# freedom, even if significant; but not if one is this much weaker, since model errors look like a weak second source.
+# Thresholds for accepting two sources whose misfit is statistically significant: maximum ratio of their misfit to that
+# of one source, and maximum misfit per degree of freedom. Minimum ratio of the strengths of two sources, since errors
+# of the model look like a weak second source.
 _BOTH, _STILL_FAIR, _WEAKEST = 0.2, 10.0, 0.05
-# Share of touches without a fitting source on the skin above which changes of the setup are searched for.
+# Fraction of the touches that are not explained by one source on the skin, above which changes of the setup are
+# searched for.
 _ODD = 0.25
-# Where no floor is known, intensities this far below the loudest frame's are not a touch (60 dB).
+# Minimum ratio of the intensity of a touch to the highest intensity of the recording, if no floor is known (−60 dB).
 _DYNAMIC_RANGE = 1e-6
-# Largest plausible ratio of a touch's strength to the calibration taps' (40 dB).
+# Maximum plausible ratio of the strength of touches to that of the calibration taps, or its inverse (40 dB).
 _SAME_UNIT = 1e4
 
 
@@ -48,14 +51,15 @@ def locate(
     silence: Recording | None = None,
     compiled: bool | None = None,
 ) -> Locations:
-    """Locate the touch in every frame of a recording.
+    """Locate the touch in each frame of a recording.
 
-    `method`: "likelihood", or "consistency" for the paper's loss. `map_shape`: (rows, columns) of the raster that is
-    searched, (200, 200) in the paper; a coarse grid unless given (both are refined). `intensity`: band and window for
-    samples, those of the calibration unless given; `silence`: the array untouched, as of `calibrated_intensities`.
-    `compiled`: whether to compile a program first, which takes seconds and is several times as fast afterwards; by
-    default for more than 1,024 frames with a touch. Use True for many recordings in a row. Raises `ValueError` for a
-    recording of another number of microphones, and where fewer than three can be used.
+    `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022. `map_shape`: (rows,
+    columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid. The best position is
+    refined in either case. `intensity`: band and windows, for recordings of samples; by default those of the
+    calibration. `silence`: recording of the untouched array; see `calibrated_intensities`. `compiled`: whether to
+    compile the computation, which takes seconds but makes it several times faster; by default True for more than 1,024
+    frames with a touch. Use True for many successive recordings. Raises `ValueError` for a recording with another
+    number of microphones, and if fewer than three microphones can be used.
     """
     intensities = calibrated_intensities(recording, calibration, intensity, silence=silence)
     microphone_array, use, faults = microphones_in_use(intensities, calibration)
@@ -78,9 +82,9 @@ def locate(
     }
     notes = list(intensities.notes)
     if solve.any():
-        power, used = _padded(intensities.power[solve], use[solve], compiled)
+        power, used = _pad_frames(intensities.power[solve], use[solve], compiled)
         found = localiser(power, used)
-        # The status of frames is determined from the likelihood, whichever loss located them.
+        # The status of a frame is always determined from the likelihood, also if another method locates the touch.
         judge = found if method == "likelihood" else Localiser.create(microphone_array, compiled=compiled)(power, used)
         number = int(solve.sum())
         for key in ("position", "covariance", "strength"):
@@ -88,7 +92,7 @@ def locate(
         for key in ("misfit", "freedom"):
             result[key][solve] = getattr(judge, key)[:number]
         status[solve] = _judge(judge, found)[:number]
-        _explain(status, result, intensities.power, use, microphone_array, compiled)
+        _fit_two_sources(status, result, intensities.power, use, microphone_array, compiled)
         excess = np.zeros(frames)
         excess[solve] = np.asarray(judge.excess)[:number]
         status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
@@ -108,24 +112,26 @@ def locate(
 
 
 def _judge(judge: SourceEstimate, found: SourceEstimate) -> np.ndarray:
-    """Status of frames with a touch, before two touches are considered."""
+    """Status of the frames with a touch, before a fit of two sources is tried. `judge`: maximum-likelihood estimates,
+    from which the status follows; `found`: estimates of the selected method."""
     misfit, freedom = np.asarray(judge.misfit), np.asarray(judge.freedom)
     excess = np.asarray(judge.excess)
     rivalled = np.asarray(judge.rival) < _RIVAL
     status = np.where(rivalled, LocationStatus.AMBIGUOUS, LocationStatus.TOUCH).astype(object)
     status[_unexplained(misfit, freedom)] = LocationStatus.MISFIT
-    # Outside: a source beyond the outline fits where none inside it does; two sources are fitted by neither.
+    # A frame is "outside" if a source beyond the outline explains it, and is clearly better than any source inside. Two
+    # sources are not explained by one source beyond the outline.
     status[(excess > _OUTSIDE) & ~_unexplained(misfit - excess, freedom)] = LocationStatus.OUTSIDE
     status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = LocationStatus.UNUSABLE
     return status
 
 
 def _unexplained(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Whether a misfit is too large to be due to chance."""
+    """Mask of the frames whose misfit is too large to be due to noise."""
     return (freedom > 0) & (chdtrc(np.maximum(freedom, 1), misfit) < _FALSE_MISFIT)
 
 
-def _explain(
+def _fit_two_sources(
     status: np.ndarray,
     result: dict[str, np.ndarray],
     power,
@@ -133,10 +139,11 @@ def _explain(
     microphone_array: MicrophoneArray,
     compiled: bool,
 ) -> None:
-    """Fit two sources where one does not explain the frame; widen the covariance where neither does."""
+    """Fit two sources to the frames that one source does not explain, and enlarge the covariances of the frames that
+    two sources do not explain either. Modifies `status` and `result` in place."""
     tried = np.flatnonzero((status == LocationStatus.MISFIT) & (use.sum(axis=1) > 6))
     if tried.size:
-        two = locate_two(microphone_array, *_padded(power[tried], use[tried], compiled), compiled=compiled)
+        two = locate_two(microphone_array, *_pad_frames(power[tried], use[tried], compiled), compiled=compiled)
         misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
         stronger, weaker = np.asarray(two.strength)[: tried.size].T
         much_better = (misfit < _BOTH * result["misfit"][tried]) & (misfit < _STILL_FAIR * freedom)
@@ -154,8 +161,8 @@ def _explain(
 
 
 def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> None:
-    """Mark touches located less precisely than a fourth of the skin's size as ambiguous, and limit covariances to the
-    skin."""
+    """Mark touches as ambiguous if their standard deviation exceeds a fourth of the skin's size, and replace
+    covariances that extend beyond the skin. Modifies `status` and `result` in place."""
     located = np.isfinite(result["position"]).all(axis=1)
     finite = np.isfinite(result["covariance"]).all(axis=(1, 2))
     width = np.zeros(len(status))
@@ -169,7 +176,8 @@ def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> N
 def _notes(
     status: np.ndarray, intensities: Intensities, use: np.ndarray, microphone_array: MicrophoneArray
 ) -> list[str]:
-    """Notes on changes of the setup since the calibration, which the misfit of many frames indicates."""
+    """Notes on changes of the setup since the calibration, which are searched for if one source does not explain many
+    of the frames."""
     notes = []
     placed = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
     odd = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
@@ -191,7 +199,8 @@ def _notes(
 
 
 def _unit(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
-    """A note where the received intensities differ from those of the calibration's taps by orders of magnitude."""
+    """Return a note if the intensities differ by orders of magnitude from those of the calibration, which suggests
+    another gain or unit."""
     asked = "do the recording and the taps have the same gain and unit?"
     if np.isfinite(strength).any():
         typical = float(np.nanmedian(strength))
@@ -199,7 +208,7 @@ def _unit(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calib
         if max(ratio, 1 / ratio) > _SAME_UNIT:
             return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {asked}"]
         return []
-    # Where the floor is unknown, silence is assumed to scatter as in the calibration.
+    # Without a touch and without a known floor, the intensities are compared with the noise of the calibration.
     deviation = np.asarray(calibration.microphone_array.noise.deviation)
     known = use.any(axis=0) & (deviation > 0)
     if intensities.floor.any() or not known.any():
@@ -212,10 +221,10 @@ def _unit(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calib
 def microphones_in_use(
     intensities: Intensities, calibration: Calibration
 ) -> tuple[MicrophoneArray, np.ndarray, tuple[str, ...]]:
-    """The array with the noise of these intensities, the mask of usable readings (F, M), and the faults of the
-    microphones.
+    """Return the calibrated array with the noise of these intensities, the mask (F, M) of the usable readings, and a
+    description of the fault of each microphone.
 
-    Raises `ValueError` if fewer than three microphones are left.
+    Raises `ValueError` if fewer than three microphones can be used.
     """
     use = np.asarray(intensities.usable) & calibration.usable
     faults = tuple(
@@ -233,7 +242,7 @@ def microphones_in_use(
             len(faults), floor=intensities.floor, freedom=intensities.freedom, relative=np.asarray(known.relative)
         )
     else:
-        # Negative intensities indicate noise that may have been absent in the calibration.
+        # Negative intensities are due to noise, which may be larger than in the calibration.
         wider = np.maximum(below_nothing(intensities.power, use), np.asarray(known.deviation))
         noise = eqx.tree_at(
             lambda n: (n.deviation, n.floor),
@@ -251,7 +260,7 @@ def microphones_in_use(
 
 
 def _above_floor(intensities: Intensities, noise: IntensityNoise, use: np.ndarray) -> np.ndarray:
-    """Frames in which any microphone's intensity exceeds the threshold for silence."""
+    """Mask of the frames in which the intensity of at least one microphone exceeds the detection threshold."""
     power = np.where(use, intensities.power, -np.inf)
     if np.any(intensities.floor > 0) and np.isfinite(intensities.freedom):
         least = intensities.floor * (chdtri(intensities.freedom, _FALSE_ALARM / use.shape[1]) / intensities.freedom - 1)
@@ -261,8 +270,8 @@ def _above_floor(intensities: Intensities, noise: IntensityNoise, use: np.ndarra
     return np.asarray((power > least).any(axis=1))
 
 
-def _padded(power: np.ndarray, use: np.ndarray, compiled: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Repeat the last frame up to a round number of frames, so that few sizes are compiled."""
+def _pad_frames(power: np.ndarray, use: np.ndarray, compiled: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Repeat the last frame up to a round number of frames if `compiled`, so that few sizes are compiled."""
     if not compiled:
         return power, use
     number = len(power)

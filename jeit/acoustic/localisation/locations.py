@@ -1,4 +1,4 @@
-"""`Locations`: position and status of every frame of a recording."""
+"""`Locations`: position and status of each frame of a recording."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-# Number of frames up to which NumPy is faster than compiling a program.
+# Number of frames up to which a computation with NumPy is faster than compiling it.
 FEW_FRAMES = 1024
 
 
 class LocationStatus(StrEnum):
-    """Status of a frame; see `Locations`."""
+    """Status of a frame; see `Locations` for the meaning of each."""
 
     TOUCH = "touch"
     NO_TOUCH = "no touch"
@@ -25,20 +25,31 @@ class LocationStatus(StrEnum):
 
 
 class Locations(eqx.Module):
-    """Positions and status of F frames of M microphones.
+    """Positions and status of F frames, from M microphones.
 
-    - `times`: (F,) seconds; `status`: (F,) a `LocationStatus` each.
-    - `position`: (F, d) metres; `covariance`: (F, d, d) m²; `strength`: (F,). NaN where there is no touch.
-    - `misfit`: (F,) chi-square of the residuals of one source, with `freedom`: (F,) degrees.
-    - `used`: (F, M) which microphones were used. `faults`: M strings, the fault of each microphone ("" if none).
-    - `second`: (F, d) and `second_strength`: (F,), of the weaker of two touches, NaN elsewhere.
-    - `overlap`: number of windows that share a sample, whose errors are correlated.
+    - `times`: (F,) middle of each frame in seconds.
+    - `position`: (F, d) in metres; `covariance`: (F, d, d) in m²; `strength`: (F,) in the unit of intensity. NaN where
+      no touch was located.
+    - `status`: (F,) `LocationStatus` of each frame.
+    - `misfit`: (F,) chi-square of the residuals; `freedom`: (F,) its degrees of freedom.
+    - `used`: (F, M) mask of the microphones that were used.
+    - `second`: (F, d) position in metres, and `second_strength`: (F,) strength, of the weaker of two touches; NaN for
+      other frames.
+    - `overlap`: length of a window divided by the hop between windows; the errors of overlapping windows are
+      correlated.
+    - `faults`: M descriptions of the fault of each microphone; "" for none.
     - `notes`: remarks on the whole recording.
+    - `name`: name of the recording.
 
-    Status: "touch"; "no touch", nothing is above the floor; "outside", the intensities indicate a position beyond the
-    outline, and the position given is the best on it; "two touches", one source does not explain the frame but two do;
-    "misfit", neither does, and the covariance is widened accordingly; "ambiguous", two positions explain the frame
-    about as well; "unusable", fewer than three microphones could be used.
+    Values of the status:
+
+    - "touch": one source on the skin explains the intensities.
+    - "no touch": no intensity exceeds the detection threshold.
+    - "outside": the intensities indicate a position beyond the outline. `position` is the best position on the outline.
+    - "two touches": one source does not explain the intensities, but two sources do.
+    - "misfit": neither one nor two sources explain the intensities. `covariance` is enlarged accordingly.
+    - "ambiguous": two positions explain the intensities about equally well, or the position is very uncertain.
+    - "unusable": fewer than three microphones could be used.
     """
 
     times: Float[np.ndarray, " F"]
@@ -58,9 +69,9 @@ class Locations(eqx.Module):
 
     @property
     def located(self) -> Bool[np.ndarray, " F"]:
-        """Frames that have a position."""
+        """Mask (F,) of the frames that have a position."""
         return np.asarray(np.isfinite(self.position).all(axis=1))
 
     def counts(self) -> dict[str, int]:
-        """Number of frames of each status."""
+        """Number of frames with each status that occurs."""
         return {str(status): int((self.status == status).sum()) for status in LocationStatus if status in self.status}

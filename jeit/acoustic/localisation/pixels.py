@@ -1,4 +1,4 @@
-"""The grid of pixels on which losses are evaluated, and losses drawn over the skin."""
+"""Rasters of pixels on which objectives are evaluated, and images of touches computed from the maps."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from numpy.typing import ArrayLike
 from jeit.acoustic.surface import chart_grid
 from jeit_solvers.engines import as_array, namespace, set_at
 
-# A second valley is descended if its screened value is at most this factor times the best plus this offset; on rasters
-# with more pixels only the best valley is descended.
+# Condition for a minimisation from the second valley: its value is less than this factor times the value of the best
+# valley, plus this offset. On rasters with more than this number of pixels, only the best valley is used.
 _WORTH, _WORTH_MORE, _FINE = 1.5, 8.0, 2000
 
 
 class Pixels(eqx.Module):
-    """A raster over the outline's box: chart coordinates (2, P), which are `inside` (P,), rows and columns, and
-    whether all are inside (`full`)."""
+    """A raster of P pixels over the bounding box of an outline.
+
+    **Fields**: `chart`: chart coordinates (2, P) of the pixels' centres in metres; `inside`: mask (P,) of the pixels
+    inside the outline; `shape`: numbers of rows and columns; `full`: whether all pixels are inside.
+    """
 
     chart: Float[Array, "2 P"]
     inside: Bool[Array, " P"]
@@ -26,8 +29,8 @@ class Pixels(eqx.Module):
 
     @classmethod
     def create(cls, surface, columns: int, rows: int) -> "Pixels":
-        """Create a raster of rows × columns pixels, bottom row first. Raises `ValueError` where no pixel lies inside
-        the outline."""
+        """Create a raster of rows × columns pixels, bottom row first. Raises `ValueError` if no pixel lies inside the
+        outline."""
         grid, within = chart_grid(surface, columns, rows)
         if not within.any():
             raise ValueError(f"shape: none of {columns} × {rows} pixels has its middle inside the outline; take more.")
@@ -35,8 +38,11 @@ class Pixels(eqx.Module):
 
 
 def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Array]:
-    """Chart coordinates (2, F) of the minimum pixel of each map and of the lowest other local minimum, and a mask (F,)
-    of the frames where the latter is worth a descent."""
+    """Find the two lowest local minima (valleys) of each map.
+
+    Returns the chart coordinates (2, F) of the lowest pixel and of the second lowest local minimum, and the mask (F,)
+    of the frames in which the second is low enough for a minimisation.
+    """
     rows, columns = pixels.shape
     inside, xp = pixels.inside.reshape(rows, columns), namespace(maps, pixels)
 
@@ -44,13 +50,13 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
         fair = ~xp.isnan(values) if pixels.full else inside & ~xp.isnan(values)
         return xp.where(fair, values, xp.inf)
 
-    # First the row of the minimum, then the pixel in it, which is faster than a search over all pixels.
+    # The row of the minimum is found first, and then the pixel in the row, which is faster than a single search.
     square = maps.reshape(-1, rows, columns)
     row = xp.argmin(xp.min(known(square, inside), axis=2), axis=1)
     in_row = known(xp.take_along_axis(square, row[:, None, None], axis=1)[:, 0], inside[row])
     best = row * columns + xp.argmin(in_row, axis=1)
     first = pixels.chart[:, best]
-    if rows * columns > _FINE:  # on such fine rasters, noise causes spurious valleys
+    if rows * columns > _FINE:  # fine rasters have spurious local minima
         return first, first, xp.zeros(best.shape, bool)
     square = known(square, inside)
     values = square.reshape(len(best), -1)
@@ -69,12 +75,13 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
 def brightness(
     maps: ArrayLike, *, method: str = "likelihood", share: float = 0.02
 ) -> Float[np.ndarray, "F rows columns"]:
-    """Brightness of each pixel from the maps of frames: 1 at the best pixel of each map, falling to 0; 0 outside the
-    outline.
+    """Convert maps to brightness: 1 at the best pixel of each map, decreasing to 0 with the value of the map, and 0
+    outside the outline.
 
-    `maps` (F, rows, columns), as from `Localiser.with_maps`. For "likelihood" maps it is the likelihood relative to the
-    best pixel's, exp(−(map − least)). The paper's loss ("consistency") has no such scale: its brightness falls to 1/e
-    where the loss is that of the best `share` of the pixels. Raises `ValueError` for other methods or shapes.
+    `maps` (F, rows, columns): as returned by `Localiser.maps`. For the method "likelihood", brightness is the
+    likelihood divided by that of the best pixel, exp(−(map − minimum)). For "consistency", brightness is exp(−(map −
+    minimum) / scale); it is 1/e where the loss equals the quantile `share` over the pixels. Raises `ValueError` for
+    other methods or shapes.
     """
     values = np.asarray(maps, float)
     if values.ndim != 3:
@@ -96,12 +103,12 @@ def brightness(
 
 
 def overlay(images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3) -> Float[np.ndarray, "F rows columns"]:
-    """Overlay every frame with those before it, which fade as exp(−age / `time_constant`): (F, rows, columns).
+    """Overlay each frame with the frames before it, which fade as exp(−age / `time_constant`).
 
-    `images` (F, rows, columns), zero where there is no touch, NaN counts as zero; `times` (F,) in seconds, increasing.
-    Each pixel shows the maximum of the faded frames, so that a source at rest does not saturate. The last image is the
-    picture of the whole recording. Raises `ValueError` for shapes that disagree and a time constant that is not
-    positive.
+    `images` (F, rows, columns): brightness, zero where there is no touch; NaN counts as zero. `times` (F,): increasing
+    times in seconds. `time_constant`: in seconds. Each pixel of the result (F, rows, columns) is the maximum over the
+    faded frames, so that a source at rest does not saturate it. The last image shows the whole recording. Raises
+    `ValueError` for shapes that disagree, times that do not increase, and a time constant that is not positive.
     """
     frames, when = np.nan_to_num(np.asarray(images, float)), np.asarray(times, float)
     if frames.ndim != 3 or when.shape != (len(frames),) or not len(frames):
@@ -119,10 +126,9 @@ def overlay(images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3) 
 
 
 def fade(images: ArrayLike, times: ArrayLike, *, at: float, time_constant: float) -> Float[np.ndarray, "rows columns"]:
-    """Faded overlay of some frames `at` a time (seconds): the last picture of their `overlay`, without computing the
-    others.
+    """Compute the last image (rows, columns) of an `overlay` only, as seen at the time `at` in seconds.
 
-    For a long recording, the picture of the whole is the maximum of the pictures of its parts.
+    A long recording can be processed in parts: the image of the whole is the maximum of the images of its parts.
     """
     age = np.maximum(at - np.asarray(times, float), 0.0)
     weight = np.exp(-age / time_constant)

@@ -1,5 +1,5 @@
-"""Detection of changes since the calibration from the misfit: exchanged microphones, or a microphone with another
-gain."""
+"""Detection of changes since the calibration from the misfit: exchanged microphones, or a microphone whose response has
+changed."""
 
 from __future__ import annotations
 
@@ -12,16 +12,22 @@ from jaxtyping import Bool, Float
 from jeit.acoustic.localisation.localiser import Localiser
 from jeit.acoustic.microphones import MicrophoneArray
 
-# Number of loudest frames used; misfit per degree of freedom above which a change is searched for, and at which it is
-# clipped; fraction to which a change must lower the misfit to be accepted.
+# Number of the loudest frames that are used; misfit per degree of freedom above which changes are searched for; value
+# at which the misfit per degree of freedom is clipped; maximum ratio of the misfits after and before an accepted
+# change.
 _FRAMES, _WRONG, _MOST, _BETTER = 24, 3.0, 100.0, 0.7
+# Maximum number of changes that are searched for.
 _MOST_CHANGES = 4
-# Least number of remaining microphones for a test without one microphone to be meaningful.
+# A single microphone is left out for a test only if more than this number of microphones remain.
 _LEAST_LEFT = 5
 
 
 class SetupChanges(NamedTuple):
-    """`exchanged`: pairs of exchanged microphones; `altered`: microphones whose response has changed."""
+    """Changes of the setup since the calibration.
+
+    **Fields**: `exchanged`: pairs of indices of exchanged microphones; `altered`: indices of microphones whose response
+    has changed.
+    """
 
     exchanged: list[tuple[int, int]]
     altered: list[int]
@@ -30,12 +36,13 @@ class SetupChanges(NamedTuple):
 def find_setup_changes(
     microphone_array: MicrophoneArray, power: Float[np.ndarray, "F M"], use: Bool[np.ndarray, "F M"]
 ) -> SetupChanges:
-    """Find the microphones, or pairs of exchanged microphones, after whose removal or re-exchange one source explains
-    the frames; empty where no such change does.
+    """Find changes of the setup that explain the misfit: with the microphones exchanged back, or left out, one source
+    explains the frames.
 
-    `power` (F, M): intensities above the floor of frames with a touch. Uses the loudest frames; returns nothing for
-    fewer than three frames, or where the typical frame is explained already. The search is greedy, the best change
-    first: of several changes, only those are found each of which lowers the misfit alone.
+    `power` (F, M): intensities minus the floor of frames with a touch; `use` (F, M): mask of the usable intensities.
+    Only the loudest frames are used. The search is greedy: it repeatedly accepts the change that lowers the misfit
+    most, so it finds several changes only if each of them alone lowers the misfit. No changes are returned for fewer
+    than three frames, if one source explains the frames without a change, or if no change explains them.
     """
     loudest = np.argsort(-np.where(use, power, 0.0).sum(axis=1))[:_FRAMES]
     changes = SetupChanges([], [])
@@ -46,7 +53,7 @@ def find_setup_changes(
     localiser = Localiser.create(microphone_array)
 
     def misfit(tried: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        """Mean misfit per degree of freedom for each of several pairs of channel order and mask."""
+        """Mean misfit per degree of freedom for each candidate, given by the order and the mask of the channels."""
         found = localiser(
             np.concatenate([power[:, order] for order, _ in tried]),
             np.concatenate([use[:, order] & kept for order, kept in tried]),
@@ -58,10 +65,11 @@ def find_setup_changes(
     now = float(misfit([state])[0])
     left = np.flatnonzero(use.any(axis=0))
     while now > _WRONG and len(changes.exchanged) + len(changes.altered) < _MOST_CHANGES and left.size:
-        # An altered microphone is tested before exchanges with it, which may lower the misfit a little too.
+        # Altered microphones come first among the candidates, since exchanging an altered microphone may lower the
+        # misfit too.
         singles = [(int(k),) for k in left if left.size > _LEAST_LEFT]
         candidates = singles + [(int(k), int(m)) for k, m in combinations(left, 2)]
-        tried = [_changed(state, which) for which in candidates]
+        tried = [_apply_change(state, which) for which in candidates]
         values = misfit(tried)
         best = int(values.argmin())
         if not values[best] < _BETTER * now:
@@ -76,8 +84,8 @@ def find_setup_changes(
     return changes if now <= _WRONG else SetupChanges([], [])
 
 
-def _changed(state: tuple[np.ndarray, np.ndarray], which: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Order and mask of the channels with a pair exchanged or one channel left out."""
+def _apply_change(state: tuple[np.ndarray, np.ndarray], which: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the order and the mask of the channels after exchanging two channels, or leaving out one."""
     order, kept = (part.copy() for part in state)
     if len(which) == 2:
         order[list(which)] = order[list(which[::-1])]

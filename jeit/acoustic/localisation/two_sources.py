@@ -1,4 +1,4 @@
-"""Localisation of two simultaneous sources, for frames that one source does not explain."""
+"""Localisation of two simultaneous sources, for frames that a single source does not explain."""
 
 from __future__ import annotations
 
@@ -16,13 +16,17 @@ from jeit.acoustic.surface import bounding_box, in_space, longer_side
 from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import at_once, has_values, namespace, on_device, on_host, scan
 
-# Number of positions whose pairs are all screened, and of pairs that are refined.
+# Approximate number of grid positions, all pairs of which are screened; number of pairs that are refined.
 _PLACES, _STARTS = 150, 3
 
 
 class TwoSources(eqx.Module):
-    """`position` (F, 2, d) metres, the stronger source first; `covariance` (F, 2, d, d) m²; `strength` (F, 2); `misfit`
-    (F,), chi-square with `freedom` (F,); `converged` (F,)."""
+    """Estimated pairs of sources of F frames.
+
+    **Fields**: `position`: (F, 2, d) in metres, the stronger source first; `covariance`: (F, 2, d, d) in m²;
+    `strength`: (F, 2) in the unit of intensity; `misfit`: (F,) chi-square of the residuals; `freedom`: (F,) its degrees
+    of freedom; `converged`: (F,) whether the minimisation converged.
+    """
 
     position: Float[Array, "F 2 d"]
     covariance: Float[Array, "F 2 d d"]
@@ -35,13 +39,13 @@ class TwoSources(eqx.Module):
 def locate_two(
     microphone_array: MicrophoneArray, power: ArrayLike, use: ArrayLike | None = None, *, compiled: bool = False
 ) -> TwoSources:
-    """Locate the most probable pair of sources of each frame: all pairs of a coarse grid are screened, the best three
-    refined.
+    """Locate the most probable pair of sources of each frame. All pairs of positions on a coarse grid are screened, and
+    the best three pairs are refined.
 
-    `power` (F, M): intensities above the floor; `use`: mask of those to use, all finite ones unless given. The six
-    unknowns need six microphones or more: frames with fewer give NaN. Both sources are searched for inside the
-    outline's box. `compiled`: whether to compile the program, for repeated calls; traced calls are compiled in any
-    case.
+    `power` (F, M): intensities minus the floor. `use` (F, M): mask of the intensities to use; by default all finite
+    ones. Since there are six unknowns, frames with fewer than six usable microphones give NaN. Both sources are
+    searched for within the bounding box of the outline. `compiled`: whether to compile the computation, for repeated
+    calls; calls within a JAX transformation are always compiled.
     """
     at_hand = not compiled and np.size(power) > 0 and has_values(microphone_array, power, use)
     xp = np if at_hand else jnp
@@ -105,11 +109,11 @@ def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -
 
 
 def _best_pairs(power, use, response, pixels: Pixels, microphone_array: MicrophoneArray) -> Float[Array, "starts 6"]:
-    """The pairs of positions, apart from each other, with the lowest residual of the frame at their best two
-    strengths."""
+    """Find the pairs of grid positions with the lowest weighted residuals of a frame, each with its best-fitting
+    strengths. Pairs that are neighbours of a better pair are excluded. Returns the unknowns (starts, 6)."""
     xp = namespace(response, power)
     weight = xp.where(use, 1 / microphone_array.noise.variance(xp.maximum(power, 0.0)), 0.0)
-    # Intensities may have any unit: scale all numbers to near one.
+    # The unit of intensities is arbitrary, so they are divided by the highest intensity of the frame.
     scale = xp.max(xp.where(use, power, 0.0))
     weight = weight * scale**2
     seen = xp.where(use, power, 0.0) / scale

@@ -30,12 +30,12 @@ def plot_pairs(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot true positions (P, d) and estimated positions `found` (P, d) in pairs, over `microphones` (M, d); all in
-    metres.
+    """Plot true positions (P, d) and the corresponding estimates `found` (P, d), on a drawing of the surface with its
+    `microphones` (M, d). All positions are in metres.
 
-    `surface`: an outline, a surface, a `MicrophoneArray` or a `Calibration`. Positions that were not found (NaN) are
-    drawn as hollow markers. The default title is mean ± standard deviation of the error. Raises `ValueError` for shapes
-    that disagree.
+    `surface`: an outline, a surface, a `MicrophoneArray` or a `Calibration`. The true positions of sources without an
+    estimate (NaN) are drawn as hollow markers. The default title is the mean ± standard deviation of the error. Raises
+    `ValueError` for shapes that disagree.
     """
     view = view_of(surface, microphones)
     place, guess = view.chart(true, "true"), view.chart(found, "found")
@@ -73,11 +73,12 @@ def plot_error_curve(
 ) -> Axes:
     """Plot localisation errors of one or several methods against `values` (K,) of a `quantity`.
 
-    `errors`: the name of each method with its errors in metres: (K, N), of N positions each, drawn as their `statistic`
-    ("median", "mean" or "rms") over a band from the lower to the upper quartile; or (K,), a line alone. NaN is ignored.
-    `bound`: the Cramér-Rao bound, (K,), or (K, N) of which the same statistic is drawn. `logarithmic`: whether the axis
-    of `values` is logarithmic, which suits a number of microphones. The axis of errors always is. Raises `ValueError`
-    for shapes that disagree, no errors, and more than six methods.
+    `errors`: dictionary from the name of each method to its errors in metres. For errors (K, N) of N positions per
+    value, the `statistic` ("median", "mean" or "rms") is drawn as a line, and the interquartile range as a band; errors
+    (K,) are drawn as a line only. NaN is ignored. `bound`: the Cramér-Rao bound in metres, (K,) or (K, N); for (K, N)
+    the same statistic is drawn. `logarithmic`: whether the axis of `values` is logarithmic, for example for numbers of
+    microphones; the axis of errors is always logarithmic. Raises `ValueError` for shapes that disagree, for no errors,
+    and for more than six methods.
     """
     x = np.asarray(values, float)
     if x.ndim != 1 or not x.size or not np.isfinite(x).all() or (logarithmic and not (x > 0).all()):
@@ -110,7 +111,7 @@ def plot_error_curve(
 
 
 def _mark_axes(ax: Axes, x: np.ndarray, logarithmic: bool) -> None:
-    """Set ticks and grid lines of an error curve against `x`."""
+    """Set the ticks and grid lines of the axes of an error curve with abscissae `x`."""
     if logarithmic:
         ax.set_xscale("log", base=2)
         ax.set_xticks(x)
@@ -126,7 +127,7 @@ def _mark_axes(ax: Axes, x: np.ndarray, logarithmic: bool) -> None:
 
 
 def _rows(errors: ArrayLike, name: str, number: int) -> np.ndarray:
-    """Errors (K, N) in millimetres."""
+    """Convert errors in metres, (K,) or (K, N), to an array (K, N) in millimetres, and check its shape and values."""
     array = np.asarray(errors, float)
     rows = array[:, None] if array.ndim == 1 else array
     if rows.ndim != 2 or len(rows) != number or not rows.shape[1]:

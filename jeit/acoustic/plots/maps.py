@@ -1,4 +1,4 @@
-"""Draw maps over the skin: the loss of a touch, and the receptive fields of microphones."""
+"""Plots over the skin: the map of the loss for one frame, and the receptive fields of microphones."""
 
 from __future__ import annotations
 
@@ -30,9 +30,11 @@ from jeit.arguments import check_kind, check_name
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar, soften_axes
 from jeit_solvers.engines import on_host
 
-# Range in decibels over which the size of a microphone's circle shows the received intensity.
+# Dynamic range in decibels of the circles that show the received intensities: the circle of a microphone this far below
+# the loudest one has the minimum size.
 _RANGE = 30.0
-# Range of a map above its minimum, in standard deviations or decibels.
+# Maximum of the colour scale above the minimum of the map: standard deviations ("likelihood"), decibels
+# ("consistency").
 _MOST = {"likelihood": 15.0, "consistency": 40.0}
 _MAP_LABELS = {
     "likelihood": "Standard deviations worse than the best place",
@@ -41,8 +43,11 @@ _MAP_LABELS = {
 
 
 class Marks(NamedTuple):
-    """Positions marked on a map: the `truth` (d,) and an `estimate` (d,), metres, whose `covariance` (d, d), m², is
-    drawn as its 95 % ellipse."""
+    """Positions to mark on a map.
+
+    **Fields**: `truth`: true position (d,) in metres; `estimate`: estimated position (d,) in metres; `covariance`:
+    covariance of the estimate (d, d) in m², drawn as a 95 % ellipse.
+    """
 
     truth: ArrayLike | None = None
     estimate: ArrayLike | None = None
@@ -61,14 +66,15 @@ def plot_loss_map(
     colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the map of one frame from `Localiser.with_maps`; it is brightest where the touch most probably is.
+    """Plot the map of one frame from `Localiser.with_maps`. The most probable positions have the brightest colours.
 
-    `values` (rows, columns), bottom row first, over the box of the outline, NaN outside it. `surface`: a `Calibration`,
-    `MicrophoneArray`, a surface, or an outline. `microphones` (M, d): metres, those of the array unless given; the size
-    of their circles increases with the intensities `received` (M,). `marks`: the truth and an estimate to mark.
-    `method`: "likelihood" maps are drawn as √(2 (map − least)), the number of standard deviations by which a position
-    is worse than the best; the paper's loss, "consistency", in decibels above its minimum. Raises `ValueError` for
-    other methods and shapes, and for marks that are none.
+    `values` (rows, columns): the map over the bounding box of the outline, bottom row first, NaN outside the outline.
+    `surface`: a `Calibration`, a `MicrophoneArray`, a surface or an outline. `microphones`: positions (M, d) in metres;
+    by default those of the array. `received` (M,): intensities shown by the size of the microphones' circles. `marks`:
+    true and estimated position to mark. `method`: "likelihood" or "consistency". A likelihood map is drawn as
+    √(2 (map − minimum)), the number of standard deviations by which a position is worse than the best; a map of the
+    consistency loss (Park 2022) is drawn in decibels above its minimum. Raises `ValueError` for other methods, shapes
+    that disagree, and `marks` that are not `Marks`.
     """
     if marks is not None:
         check_kind("marks", marks, Marks, "Marks, such as Marks(truth=(0.02, 0.01))")
@@ -101,7 +107,8 @@ def plot_loss_map(
 
 
 def _draw_marks(ax: Axes, view: View, marks: Marks) -> list[Line2D]:
-    """Draw the marks and return their legend entries. Raises `ValueError` for shapes that do not match the surface."""
+    """Draw the marked positions and return their legend entries. Raises `ValueError` for shapes that do not match the
+    surface, and for a covariance without an estimate."""
     if marks.covariance is not None and marks.estimate is None:
         raise ValueError("covariance needs an estimate: the place that it is the covariance of.")
     handles = []
@@ -122,13 +129,14 @@ def _above_least(pixels: np.ndarray, method: str) -> np.ndarray:
     least = np.nanmin(pixels)
     if method == "likelihood":
         return np.sqrt(2 * (pixels - least))
-    # The loss may vanish in the noiseless case: it is clipped at 120 dB below its maximum.
+    # Without noise the minimum of the loss may be zero: the loss is clipped at 120 dB below its maximum.
     bottom = max(least, 1e-12 * np.nanmax(pixels), np.finfo(float).tiny)
     return 10 * np.log10(np.maximum(pixels, bottom) / bottom)
 
 
 def _draw_levels(ax: Axes, place: np.ndarray, received: np.ndarray) -> Line2D:
-    """Draw the microphones as circles with areas proportional to their levels in decibels above the least shown."""
+    """Draw the microphones as circles whose area grows linearly with the received level in decibels; return the legend
+    entry."""
     positive = np.isfinite(received) & (received > 0)
     loudest = received[positive].max(initial=1e-300)
     level = 10 * np.log10(np.where(positive, received, 1e-300) / loudest)
@@ -152,14 +160,14 @@ _TAP = "#8fb4d9"
 def plot_receptive_fields(
     fit: CalibrationFit, *, microphones: ArrayLike | None = None, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Plot the intensity at each microphone, relative to the strength of the tap, against distance, with the fitted
-    curve.
+    """Plot the receptive field of each microphone: the intensity of each tap, divided by the strength of the tap,
+    against distance, with the fitted decay model.
 
-    `microphones`: indices of those to draw, all unless given; they are numbered from 0, as in the calibration's
-    messages. Red circles are taps excluded from the fit; the panel of an unusable microphone states the reason. The
-    dashed line is the noise, one standard deviation, relative to a tap of median strength; the number beside the index
-    is the distance at which a microphone receives half the intensity of a tap directly above it. The panels are insets
-    of the returned axes. Raises `ValueError` for microphones that do not exist, and for what is no `CalibrationFit`.
+    `microphones`: indices of the microphones to draw, from 0 as in the messages of the calibration; by default all. Red
+    circles are taps excluded from the fit. The panel of an unusable microphone states the reason. The dashed line is
+    the standard deviation of the noise divided by the median strength of the taps. The number beside the index is the
+    distance at which the response is half that to a tap directly above the microphone. The panels are insets of the
+    returned axes. Raises `ValueError` for microphones that do not exist, and if `fit` is not a `CalibrationFit`.
     """
     check_kind("fit", fit, CalibrationFit, "a CalibrationFit, as of calibrate_microphones")
     number = fit.power.shape[1]
@@ -172,7 +180,7 @@ def plot_receptive_fields(
     rows = -(-chosen.size // columns)
     ax = axes_or_new(ax, (max(4.8, min(11.0, 2.2 * columns)), max(3.6, min(9.0, 1.75 * rows))))
     ax.set_axis_off()
-    # The height is fixed: matplotlib would search all panels for it.
+    # The position of the title is fixed, since matplotlib would derive it from all panels.
     ax.set_title(title or "", loc="left", y=1.0, pad=26)
     distance = np.linspace(0, float(fit.distance.max()), 200)
     decay = on_host(fit.calibration.microphone_array.decay)
@@ -188,7 +196,7 @@ def plot_receptive_fields(
     for place, index in enumerate(chosen):
         row, column = divmod(place, columns)
         panel = ax.inset_axes((column * wide, 1 - (row + 1) * tall, 0.93 * wide, 0.9 * tall))
-        panel.set_in_layout(False)  # their labels extend beyond the axes
+        panel.set_in_layout(False)  # the labels of panels extend beyond the axes
         _draw_field(panel, fit, int(index), relative[:, index], (distance, curve[index], noise[index]), columns)
         panel.set_xlim(0, 1e3 * distance[-1])
         panel.set_ylim(low, high)
@@ -198,7 +206,7 @@ def plot_receptive_fields(
 
 
 def _label(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
-    """Draw the axis labels shared by all panels, and the legend above them."""
+    """Draw the axis labels shared by all panels, and the legend above the panels."""
     label: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": INK}
     label["annotation_clip"] = False
     ax.annotate("Distance (mm)", (0.5, 0), (0, -22), ha="center", va="top", **label)
@@ -217,8 +225,8 @@ def _label(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
 
 
 def _strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
-    """Strength of every tap. Taps excluded from the fit get the median of the strengths estimated from the
-    microphones."""
+    """Strength of each tap. For taps excluded from the fit it is the median over the usable microphones of intensity
+    divided by response."""
     response = np.asarray(on_host(fit.calibration.microphone_array.decay).response(fit.distance.T**2)).T
     strength = np.where((fit.power > 0) & fit.calibration.usable, fit.power / response, np.nan)
     received = np.isfinite(strength).any(axis=1)
@@ -228,7 +236,8 @@ def _strengths(fit: CalibrationFit) -> Float[np.ndarray, " T"]:
 
 
 def _draw_field(panel: Axes, fit: CalibrationFit, index: int, relative, lines, columns: int) -> None:
-    """Draw one panel: taps, curve and noise of a microphone; `lines`: distances (m), the curve there, and the noise."""
+    """Draw the panel of one microphone: its taps, fitted curve and noise. `lines`: distances in metres, the response at
+    these distances, and the noise."""
     distance, curve, noise = lines
     reason = fit.calibration.reasons[index]
     shown = np.isfinite(relative) & (relative > 0)

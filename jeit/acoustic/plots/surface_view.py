@@ -1,4 +1,4 @@
-"""Common parts of plots of touches: the surface seen from above, its microphones, and error ellipses of touches."""
+"""Elements shared by all plots of touches: the surface seen from above, its microphones, and error ellipses."""
 
 from __future__ import annotations
 
@@ -21,15 +21,18 @@ from jeit_solvers.engines import host, on_host, slopes
 
 MICROPHONE, FOUND = "#1f6fb4", "#c8102e"
 HALO = (withStroke(linewidth=2.5, foreground="white"),)
-# Radius, in standard deviations, of the ellipse that holds 95 % of a normal distribution in the plane.
+# Radius, in standard deviations, of the ellipse that contains 95 % of a two-dimensional normal distribution.
 _REACH = float(np.sqrt(chdtri(2, 0.05)))
 
 AnySurface = Calibration | MicrophoneArray | AbstractSurface | Domain | ArrayLike
 
 
 class View(NamedTuple):
-    """A surface seen along the normal of its chart: `surface`, with NumPy arrays; `microphones` (M, 2) in the chart;
-    `usable`, which of them are."""
+    """A surface seen along the normal of its chart.
+
+    **Fields**: `surface`: the surface, with NumPy arrays; `microphones`: chart coordinates (M, 2) of the microphones in
+    metres; `usable`: mask (M,) of the usable microphones.
+    """
 
     surface: AbstractSurface
     microphones: np.ndarray
@@ -37,25 +40,27 @@ class View(NamedTuple):
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """(x_min, x_max, y_min, y_max) of the outline, metres."""
+        """Bounding box (x_min, x_max, y_min, y_max) of the outline in metres."""
         (left, bottom), (right, top) = bounding_box(self.surface)
         return float(left), float(right), float(bottom), float(top)
 
     def chart(self, points: ArrayLike, name: str) -> np.ndarray:
-        """Chart coordinates (n, 2) of `points` (n, d); raises `ValueError` that names the argument."""
+        """Chart coordinates (n, 2) of `points` (n, d) in metres. Raises `ValueError` for other shapes; `name` is the
+        argument's name in the message."""
         return chart_of(self.surface, points, name)
 
     def chart_point(self, point: ArrayLike, name: str) -> np.ndarray:
-        """Chart coordinates (2,) of one `point` (d,), metres; raises `ValueError` that names the argument."""
+        """Chart coordinates (2,) of one `point` (d,) in metres. Raises `ValueError` for another shape; `name` is the
+        argument's name in the message."""
         place = np.asarray(point, float)
         if place.shape != (self.surface.dimension,):
             raise ValueError(f"{name} has shape {place.shape}; give one place ({self.surface.dimension},) in metres.")
         return self.chart(place[None], name)[0]
 
     def chart_covariance(self, covariance: ArrayLike, point: ArrayLike, name: str = "covariance") -> np.ndarray:
-        """Covariance (2, 2), m², in the chart of a `covariance` (d, d), m², at `point` (d,), metres.
+        """Transform a `covariance` (d, d) in m² at `point` (d,) in metres to a covariance (2, 2) in the chart.
 
-        Raises `ValueError` for another shape, by `name`.
+        Raises `ValueError` for another shape; `name` is the argument's name in the message.
         """
         spread, d = np.asarray(covariance, float), self.surface.dimension
         if spread.shape != (d, d):
@@ -66,9 +71,10 @@ class View(NamedTuple):
 
 
 def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: ArrayLike | None = None) -> View:
-    """Create the view of a calibration, an array, a surface or an outline; `microphones` (M, d) for the latter two.
+    """Create the view of a calibration, an array, a surface or an outline.
 
-    Raises `ValueError` for shapes that disagree.
+    `microphones` (M, d): positions in metres, by default those of the calibration or array. `usable` (M,): mask of the
+    usable microphones. Raises `ValueError` for shapes that disagree.
     """
     if isinstance(surface, Calibration):
         usable = surface.usable if usable is None else usable
@@ -85,7 +91,8 @@ def view_of(surface: AnySurface, microphones: ArrayLike | None = None, usable: A
 
 
 def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarray:
-    """Chart coordinates (n, 2) of `points` (n, d), metres; raises `ValueError` that names the argument."""
+    """Chart coordinates (n, 2) of `points` (n, d) in metres. Raises `ValueError` for other shapes; `name` is the
+    argument's name in the message."""
     place = np.asarray(points, float)
     if place.ndim != 2 or place.shape[1] != surface.dimension:
         raise ValueError(f"{name} has shape {place.shape}; give (n, {surface.dimension}) in metres.")
@@ -93,22 +100,22 @@ def chart_of(surface: AbstractSurface, points: ArrayLike, name: str) -> np.ndarr
 
 
 def outline_of(view: View) -> Path:
-    """Outline and its holes, in the chart."""
+    """Path of the outline and its holes in chart coordinates."""
     loops = (Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in view.surface.outline.loops())
     return Path.make_compound_path(*loops)
 
 
 def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool = False) -> list[Line2D]:
-    """Draw outline, scale bar and microphones, unusable ones crossed; return the legend entries."""
+    """Draw the outline, a scale bar and the microphones, with crosses for unusable ones; return the legend entries."""
     ax.add_patch(
         PathPatch(outline_of(view), facecolor="none", edgecolor=INK, linewidth=0.9, joinstyle="round", zorder=2)
     )
-    # Microphones may stand beside the surface.
+    # Microphones may lie outside the outline.
     shown = np.concatenate([np.reshape(view.extent, (2, 2)).T, view.microphones])
     x_min, x_max, y_min, y_max = extent_of(shown)
     room = 0.06 * max(x_max - x_min, y_max - y_min)
     bare(ax, (x_min, x_max, y_min, y_max))
-    # Nothing stands outside but the scale bar, which can be nearer than where numbers of electrodes are.
+    # The scale bar is closer to the outline than in plots of electrodes, since no labels are drawn outside the outline.
     draw_scale_bar(ax, (x_min + room, x_max, y_min + room, y_max))
     ax.set_xlim(x_min - 0.5 * room, x_max + 0.5 * room)
     ax.set_ylim(y_min - 2 * room, y_max + 0.5 * room)
@@ -127,7 +134,8 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool 
 
 
 def draw_ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray, *, colour: str = FOUND) -> None:
-    """Draw the 95 % ellipse of a normal distribution: `middle` (2,), metres, and `covariance` (2, 2), m²."""
+    """Draw the 95 % ellipse of a normal distribution with mean `middle` (2,) in metres and `covariance` (2, 2) in
+    m²."""
     variances, axes = np.linalg.eigh(covariance)
     long, short = 2 * _REACH * np.sqrt(np.maximum(variances[::-1], 0))
     angle = np.degrees(np.arctan2(axes[1, 1], axes[0, 1]))
@@ -138,10 +146,10 @@ def draw_ellipse(ax: Axes, middle: np.ndarray, covariance: np.ndarray, *, colour
 
 
 def draw_legend(ax: Axes, handles: list) -> None:
-    """Draw a legend below the plot, with as many columns as fit; none without entries."""
+    """Draw a legend below the plot, with as many columns as fit. Without entries, no legend is drawn."""
     if not handles:
         return
-    # Widths in inches: of a marker with its gaps, and of a letter.
+    # 0.45 inches for a marker with its gaps, and 0.065 inches for each letter.
     widths = [0.45 + 0.065 * len(str(handle.get_label())) for handle in handles]
     room = ax.bbox.width / ax.figure.dpi
     columns = len(handles) if sum(widths) <= room else max(1, int(room / max(widths)))

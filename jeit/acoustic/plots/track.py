@@ -1,4 +1,4 @@
-"""Plot of the touches of a recording: onset, path and offset of each, over the fading overlay of the maps."""
+"""Plot of the touches in a recording: onset, path and offset of each touch, on an overlay of the maps of all frames."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ from jeit.plot.axes import INK, SOFT, axes_or_new, draw_colour_bar
 
 _GLOW = LinearSegmentedColormap.from_list("glow", ["#ffffff", "#bccddf", "#6a8aae"])
 _TIME = LinearSegmentedColormap.from_list("time", ["#0d0887", "#7e03a8", "#cc4778", "#f89540", "#fbd724"])
-# Markers of frames with a status other than "touch".
-_ODD = {
+# Markers of located frames whose status is not "touch".
+_STATUS_MARKERS = {
     LocationStatus.TWO_TOUCHES: "D",
     LocationStatus.OUTSIDE: "^",
     LocationStatus.MISFIT: "X",
     LocationStatus.AMBIGUOUS: "P",
 }
-# A touch that moved by less than so many standard deviations, or this fraction of the surface, is drawn at rest.
+# Thresholds of motion below which a touch is drawn as a single position: the distance of its path from the mean of the
+# path, in standard deviations; and the diameter of the path, as a fraction of the size of the surface.
 _MOVED, _LEAST = 4.0, 0.05
 
 
@@ -43,14 +44,15 @@ def plot_track(
     colour_bar: bool = True,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the path of every touch, coloured by time, with its onset and offset; dots are the individual frames.
+    """Plot the path of every touch, coloured by time, with its onset and offset. Dots are the positions of individual
+    frames.
 
-    `array`: the `Calibration`, whose unusable microphones are crossed, as are those not used at all in `locations`; or
-    `MicrophoneArray`. `overlay` (rows, columns), bottom row first, over the box of the outline: brightness, 0 to 1, as
-    the last image of `jeit.acoustic.localisation.pixels`. `truth` (N, d), metres: the true path, if known. A touch at
-    rest is drawn as a dot with its 95 % ellipse. Frames with a status other than "touch" are marked, and listed in the
-    legend. On a curved surface everything is in its chart. Raises `ValueError` for shapes that disagree, and for
-    arguments of the wrong type.
+    `array`: a `Calibration` or `MicrophoneArray`; microphones that are unusable, or not used in any frame of
+    `locations`, are drawn as crosses. `overlay` (rows, columns): brightness from 0 to 1 over the bounding box of the
+    outline, bottom row first, as in the last image of `jeit.acoustic.localisation.pixels.overlay`. `truth` (N, d): true
+    path in metres, if known. A touch at rest is drawn as a dot with its 95 % ellipse. Frames whose status is not
+    "touch" have their own markers, explained in the legend. A curved surface is drawn in the coordinates of its chart.
+    Raises `ValueError` for shapes that disagree, and for arguments of the wrong type.
     """
     check_kind("track", track, Track, "a Track, as of jeit.acoustic.track(locations)")
     check_kind("locations", locations, Locations, "Locations, as of jeit.acoustic.locate")
@@ -78,7 +80,7 @@ def plot_track(
     if known is not None:
         handles += ax.plot(*known.T, color=INK, linewidth=0.9, linestyle=(0, (4, 3)), zorder=3.6, label="truth")
     if not track.touches:
-        _say_that_there_is_none(ax, view, locations)
+        _write_no_touch(ax, view, locations)
         draw_legend(ax, handles)
         return ax
     first, last = track.touches[0].onset, track.touches[-1].offset
@@ -92,7 +94,7 @@ def plot_track(
     return ax
 
 
-def _say_that_there_is_none(ax: Axes, view: View, locations: Locations) -> None:
+def _write_no_touch(ax: Axes, view: View, locations: Locations) -> None:
     left, right, bottom, top = view.extent
     words = "no touch" if (locations.status != LocationStatus.UNUSABLE).any() else "no usable frame"
     box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
@@ -101,7 +103,7 @@ def _say_that_there_is_none(ax: Axes, view: View, locations: Locations) -> None:
 
 
 def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: ScalarMappable, named: set) -> list:
-    """Draw a touch; return its legend entries that are not yet in the legend."""
+    """Draw a touch and return its legend entries whose labels are not in `named`."""
     frames = slice(touch.first, touch.last + 1)
     places, when = path[frames], track.times[frames]
     surest = touch.first + int(np.argmin(np.trace(track.covariance[frames], axis1=1, axis2=2)))
@@ -128,28 +130,30 @@ def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: S
 
 
 def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, times: ScalarMappable) -> list:
-    """Draw the position of each frame: dots, rings around those that the track rejects, and markers by status."""
+    """Draw the position of each frame: a dot; a ring if the track rejects the position; a marker for each status other
+    than "touch". Return the legend entries."""
     places = view.chart(locations.position, "locations")
-    plain = locations.located & ~np.isin(locations.status, list(_ODD))
+    plain = locations.located & ~np.isin(locations.status, list(_STATUS_MARKERS))
     believed, doubted = plain & ~track.rejected, locations.located & track.rejected
     handles = []
     dots = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
     ax.scatter(*places[believed].T, color=times.to_rgba(track.times[believed]), **dots)
     if doubted.any():
-        # Around the marker of a frame with another status.
+        # If the frame has a marker for its status, the ring is drawn larger, around that marker.
         rings: dict[str, Any] = {"s": np.where(plain, 16, 60)[doubted], "linewidths": 0.8, "facecolors": "none"}
         rings |= {"zorder": 3.7, "edgecolors": times.to_rgba(track.times[doubted])}
         ax.scatter(*places[doubted].T, **rings)
         ring: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markeredgecolor": SOFT}
         handles.append(Line2D([], [], marker="o", markersize=4, label=f"not believed ({doubted.sum()})", **ring))
-    return handles + _draw_odd(ax, view, locations, places, times)
+    return handles + _draw_other_frames(ax, view, locations, places, times)
 
 
-def _draw_odd(ax: Axes, view: View, locations: Locations, places: np.ndarray, times: ScalarMappable) -> list:
-    """Draw frames that are outside, misfits, ambiguous, or of two touches, and the second touch of the latter."""
+def _draw_other_frames(ax: Axes, view: View, locations: Locations, places: np.ndarray, times: ScalarMappable) -> list:
+    """Draw frames with the status "outside", "misfit", "ambiguous" or "two touches", and the second touch of the last;
+    return the legend entries."""
     handles = []
     second = view.chart(locations.second, "locations.second")
-    for status, marker in _ODD.items():
+    for status, marker in _STATUS_MARKERS.items():
         which = (locations.status == status) & locations.located
         if not which.any():
             continue

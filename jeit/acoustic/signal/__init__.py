@@ -1,1 +1,1 @@
-"""Intensities from samples: recordings and their files, band power, faults of microphones."""
+"""Recordings and their files, detection of faulty microphones, and sound intensities computed from samples."""

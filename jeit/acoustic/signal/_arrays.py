@@ -1,4 +1,4 @@
-"""Validation of the arrays and numbers of recordings and taps."""
+"""Validation of the arrays and numbers in recordings and taps."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ from scipy.spatial import KDTree
 
 from jeit.mesh.topology import distance, inside
 
-# Lowest sampling rate at which the vibrations of a touch can be recorded.
+# Minimum sampling rate at which the vibrations of a touch can be recorded.
 LOWEST_RATE = 100.0  # Hz
-# Largest plausible length of a skin; beyond it coordinates are likely in millimetres.
+# Maximum plausible length of a skin. Larger coordinates are probably in millimetres.
 LARGEST_EXTENT = 5.0  # m
-# Taps may lie outside the outline by this fraction of the skin's length; microphones closer than this coincide.
+# Maximum distance of a tap from the outline, as a fraction of the skin's length; distance in metres below which two
+# microphones coincide.
 _BESIDE, _SAME = 0.05, 1e-6  # of the length; m
-# Metres from the origin beyond which squares of lengths are of no use.
+# Maximum magnitude of a coordinate in metres; squares of larger lengths would lose precision.
 _FARTHEST = 1e9
 
 
 def either(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
-    """Name of the one of two arrays that the file contains. Raises `ValueError` for both, and for neither."""
+    """Return which of the arrays named `first` and `second` the file contains. Raises `ValueError` if it contains both
+    or neither."""
     if first in arrays and second in arrays:
         raise ValueError(f"it holds both '{first}' and '{second}'; keep the one to use.")
     if second not in arrays and first not in arrays:
@@ -28,13 +30,16 @@ def either(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
 
 
 def short(values: np.ndarray) -> str:
-    """Text of a few numbers, or of the shape of more."""
+    """Text of an array for a message: its values if it has at most four, otherwise its shape."""
     return f"of shape {values.shape}" if values.size > 4 else str(values.tolist())
 
 
 def real(value, label: str, axes: str) -> np.ndarray:
-    """Real array with the named axes; float32 is kept, other types become float64. Raises `ValueError` for anything
-    else."""
+    """Convert `value` to a real array with as many axes as `axes` names, separated by commas.
+
+    float32 is kept; other types become float64. Raises `ValueError` for values that are not real, another number of
+    axes, and empty arrays.
+    """
     try:
         array = np.asarray(value)
     except ValueError:
@@ -49,7 +54,7 @@ def real(value, label: str, axes: str) -> np.ndarray:
 
 
 def number(value, label: str) -> float:
-    """One real number, from a number or an array of one. Raises `ValueError` for anything else."""
+    """Convert a number, or an array with one element, to a float. Raises `ValueError` for anything else."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.size != 1:
         raise ValueError(f"{label} must be one real number; it is {array.dtype} of shape {array.shape}.")
@@ -57,7 +62,8 @@ def number(value, label: str) -> float:
 
 
 def sampling_rate(value) -> float:
-    """Sampling rate in Hz that is high enough to record touches. Raises `ValueError` for anything else."""
+    """Return the sampling rate in Hz as a float. Raises `ValueError` if it is not a finite number, or too low to record
+    touches."""
     rate = number(value, "rate")
     if not np.isfinite(rate) or rate < LOWEST_RATE:
         raise ValueError(
@@ -68,7 +74,8 @@ def sampling_rate(value) -> float:
 
 
 def check_full_scale(value) -> float | None:
-    """The largest possible |sample|, or None. Raises `ValueError` for what is not positive and finite."""
+    """Return the largest possible magnitude of a sample as a float; None if unknown. Raises `ValueError` for values
+    that are not positive and finite."""
     full_scale = None if value is None else number(value, "full_scale")
     if full_scale is not None and not 0 < full_scale < np.inf:
         raise ValueError(f"full_scale must be the largest sample possible, positive and finite; it is {full_scale:g}.")
@@ -76,8 +83,8 @@ def check_full_scale(value) -> float | None:
 
 
 def coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
-    """Points (n, 2) or (n, 3), metres, with as many coordinates as `dimension` = (2,) or (3,). Raises `ValueError`
-    otherwise."""
+    """Return points as an array (n, d) in metres, with `dimension` = (d,) and d = 2 or 3. Raises `ValueError` for other
+    shapes, and for coordinates that are not finite."""
     points = real(value, label, "points, 2 or 3").astype(float)
     if points.shape[1] not in (2, 3) or points.shape[1:] != dimension:
         raise ValueError(
@@ -92,7 +99,8 @@ def coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
 
 
 def check_extent(points: np.ndarray, label: str) -> None:
-    """Raise `ValueError` where points (n, d) are farther apart than a skin is long."""
+    """Raise `ValueError` if the extent of points (n, d) along an axis exceeds the maximum plausible length of a
+    skin."""
     extent = np.ptp(points, axis=0).max()
     if extent > LARGEST_EXTENT:
         raise ValueError(
@@ -102,8 +110,8 @@ def check_extent(points: np.ndarray, label: str) -> None:
 
 
 def check_microphones(places: np.ndarray, skin: np.ndarray) -> None:
-    """Raise `ValueError` for microphones (M, d) farther from the box of points of the skin (n, d) than it is long, and
-    for two at one place."""
+    """Raise `ValueError` if two of the microphones `places` (M, d) coincide, or if one is farther from the bounding box
+    of the points `skin` (n, d) than the length of the box. All are in metres."""
     low, high = skin.min(axis=0), skin.max(axis=0)
     extent = (high - low).max()
     beyond = np.linalg.norm(places - np.clip(places, low, high), axis=1)
@@ -122,7 +130,7 @@ def check_microphones(places: np.ndarray, skin: np.ndarray) -> None:
 
 
 def check_taps(places: np.ndarray, outline: np.ndarray) -> None:
-    """Raise `ValueError` for taps (T, 2) well outside the outline (K, 2)."""
+    """Raise `ValueError` if a tap (T, 2) is outside the outline (K, 2) by more than 5 % of the skin's length."""
     extent = np.ptp(outline, axis=0).max()
     outside = np.flatnonzero(~inside(places, [outline]))
     beyond = distance(places[outside], outline, np.roll(outline, -1, axis=0)).min(axis=1)

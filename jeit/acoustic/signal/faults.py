@@ -1,8 +1,9 @@
-"""Detection of faulty microphones and faulty stretches of their sound, from the samples alone.
+"""Detection of faulty microphones and faulty stretches of sound, from the samples alone.
 
-Four faults are distinguished: a channel that never changes (dead), one that stops changing (stuck), one that reaches
-the end of its range (clipping), and samples that are not finite. Similar signals without a fault are accepted: a
-converter that holds each value for several samples, a quiet channel of a few converter steps, one loud peak.
+Four faults are distinguished: the samples of a channel never change (dead), do not change for a while (stuck), are cut
+off at an end of the channel's range (clipping), or are not finite. Similar signals without a fault are accepted: a
+converter that holds each value for several samples, a quiet channel with an amplitude of a few converter steps, and a
+single loud peak.
 """
 
 from __future__ import annotations
@@ -12,27 +13,30 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Shaped, UInt8
 
-# Codes that `sample_faults` returns for each sample, in the order in which reasons list them.
+# Fault codes of samples, as returned by `sample_faults`. Descriptions list the faults in this order.
 SOUND, NOT_FINITE, STUCK, CLIPPING = range(4)
 _WORDS = {NOT_FINITE: "NaN or infinite", STUCK: "stuck", CLIPPING: "clipping"}
 
-# Least duration of a stuck stretch: seconds, and number of samples.
+# Minimum duration of a stuck stretch: in seconds, and in samples.
 _STUCK_TIME, _STUCK_SAMPLES = 0.02, 64
-# A channel whose signal decays to within so many converter steps, or this fraction of its range, is silent, not stuck.
+# A constant stretch is silence, not a fault, if the signal elsewhere decays to a range of at most this many converter
+# steps, or at most this fraction of the channel's range.
 _REST_STEPS, _REST_RANGE = 3.0, 1e-4
-# Samples within this fraction of the range count as extreme; the same as a fraction of the full scale, if known.
+# Samples are at an end of the range if they are closer to it than this fraction of the channel's range, or, where the
+# full scale is known, closer to it than this fraction of the full scale.
 _TOP_RANGE, _TOP_FULL_SCALE = 3e-4, 1e-3
-# A peak of three conversions or more is clipped if the sound beside it falls this many times as far as a parabola.
+# Minimum number of converted values at the top of a clipped peak, and minimum ratio of the fall beside it to the fall
+# of a parabola.
 _FLAT, _SHARP = 3, 3.0
 
 
 def sample_faults(
     samples: Float[np.ndarray, " S"], rate: float, full_scale: float | None = None
 ) -> tuple[UInt8[np.ndarray, " S"], str]:
-    """Fault code of each sample of one channel, and the reason why the whole channel is dead ("" if it is not).
+    """Return the fault code of each sample of one channel, and the reason why the channel is dead ("" if it is not).
 
-    The code is 0 for a good sample, else `NOT_FINITE`, `STUCK` or `CLIPPING`. `rate` is in Hz; `full_scale` is the
-    largest |sample| possible, None when not known.
+    The code is 0 (`SOUND`) for a good sample, otherwise `NOT_FINITE`, `STUCK` or `CLIPPING`. `rate`: sampling rate in
+    Hz. `full_scale`: largest possible magnitude of a sample, or None if unknown.
     """
     kind = np.zeros(samples.shape, np.uint8)
     finite = np.isfinite(samples)
@@ -59,10 +63,10 @@ def sample_faults(
 def window_faults(
     kind: UInt8[np.ndarray, "*batch S"], dead: str, length: int, hop: int
 ) -> tuple[Bool[np.ndarray, "*batch F"], str]:
-    """Mask of the usable windows of one channel, and a description of the channel's fault ("" for none).
+    """Return the mask of the usable windows of one channel, and a description of the channel's faults ("" for none).
 
-    `kind` and `dead` come from `sample_faults`; windows of `length` samples begin every `hop` samples along the last
-    axis. A window with one bad sample is not usable.
+    `kind`, `dead`: as returned by `sample_faults`. Windows of `length` samples begin every `hop` samples along the last
+    axis. A window with at least one faulty sample is not usable.
     """
     number = 1 + (kind.shape[-1] - length) // hop
     usable = np.ones((*kind.shape[:-1], number), bool)
@@ -83,7 +87,8 @@ def window_faults(
 
 
 def intensity_faults(power: Float[np.ndarray, "F M"]) -> tuple[Bool[np.ndarray, "F M"], tuple[str, ...]]:
-    """Usable values and faults of intensities given without samples: NaN, infinity, and channels of zeros only."""
+    """Return the mask of the usable intensities and a description of each channel's fault, for intensities given
+    without samples. Faults are NaN, infinity, and channels that contain only zeros."""
     finite = np.isfinite(power)
     dead = ~(finite & (power != 0)).any(axis=0)
     reasons = []
@@ -98,7 +103,8 @@ def intensity_faults(power: Float[np.ndarray, "F M"]) -> tuple[Bool[np.ndarray, 
 
 
 def describe_faults(reasons: Sequence[str]) -> str:
-    """One line of text from the fault of each microphone ("" for none): "microphones 0-2, 5: dead; microphone 3: …"."""
+    """Summarise the fault of each microphone ("" for none) in a line such as "microphones 0-2, 5: dead; microphone 3:
+    …"."""
     groups: dict[str, list[int]] = {}
     for k, reason in enumerate(reasons):
         if reason:
@@ -110,7 +116,7 @@ def describe_faults(reasons: Sequence[str]) -> str:
 
 
 def _ranges(numbers: np.ndarray) -> str:
-    """Rising whole numbers as text: 0, 1, 2, 5 are "0-2, 5"."""
+    """Format increasing integers as ranges: 0, 1, 2, 5 as "0-2, 5"."""
     parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
     return ", ".join(f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts)
 
@@ -120,27 +126,29 @@ def _share(hit: np.ndarray) -> str:
 
 
 def _runs(flags: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
-    """Start and end indices of the stretches of True."""
+    """Start and end indices of the runs of True; the end is exclusive."""
     change = np.flatnonzero(np.diff(flags, prepend=False, append=False))
     return np.stack([change[::2], change[1::2]])
 
 
 def _step(samples: np.ndarray) -> float:
-    """The converter's step: the least difference of successive samples that is not zero."""
+    """Step of the analogue-to-digital converter: the smallest nonzero difference between successive samples."""
     change = np.abs(np.diff(samples))
     return float(np.fmin.reduce(np.where(change > 0, change, np.inf)))
 
 
 def _stuck(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, " S"] | None:
-    """Samples in long stretches of one value, of a channel that never comes to rest elsewhere; None for none."""
+    """Mask of the samples in long constant stretches, unless the signal also comes to rest elsewhere; None if no sample
+    is stuck. `extent`: range of the samples."""
     stretch = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
-    # A stretch this long covers at least two whole blocks: runs are searched for only where there is one.
+    # A stuck stretch covers at least two whole blocks. Runs are searched for only if a block is constant, which saves
+    # time.
     block = stretch // 4
     blocks = samples[: samples.size // block * block].reshape(-1, block)
     span = blocks.max(axis=1) - blocks.min(axis=1)
     if not (span == 0).any():
         return None
-    # One flag for each pair of equal neighbours, so that a run of n pairs is n + 1 samples.
+    # Each flag stands for a pair of equal neighbours, so a run of n flags is a stretch of n + 1 samples.
     start, stop = _runs(samples[1:] == samples[:-1])
     long = stop - start + 1 >= stretch
     if not long.any():
@@ -148,15 +156,15 @@ def _stuck(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, 
     stuck = np.zeros(samples.shape, bool)
     for first, last in zip(start[long], stop[long], strict=True):
         stuck[first : last + 1] = True
-    # The silence of a converter or of a noiseless simulation is constant too. But sound fades into silence, so that
-    # some blocks hardly change. A channel with its own noise has no such blocks.
+    # Silence can be constant too: with a coarse converter, or in a simulation without noise. The sound then fades into
+    # silence, so that some other blocks are almost constant. In a stuck channel with noise no other block is.
     live = ~stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(span)
     rest = max(_REST_STEPS * _step(samples), _REST_RANGE * extent)
     return None if live.any() and span[live].min() <= rest else stuck
 
 
 def _clipping(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray, " S"] | None:
-    """Samples at an end of the channel's range, if its tops are cut off there; None if they are not."""
+    """Mask of the samples at an end of the channel's range, if its peaks are cut off there; None if they are not."""
     lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
     found = None
     step = hold = 0.0
@@ -165,7 +173,7 @@ def _clipping(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray,
         if full_scale is not None and top >= (1 - _TOP_FULL_SCALE) * full_scale:
             heights.append(top - (1 - _TOP_FULL_SCALE) * full_scale)
         fall = top - sign * samples
-        # Most channels return here: too few samples at the top for clipping, even with a coarse converter.
+        # Most channels need no further test: they have too few samples near the end of the range to be clipped.
         if np.count_nonzero(fall <= max(heights)) < _FLAT:
             continue
         if not hold:
@@ -178,13 +186,13 @@ def _clipping(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray,
 
 
 def _flat(fall: np.ndarray, near: Bool[np.ndarray, " S"], height: float, hold: float) -> bool:
-    """Whether any stretch of samples `near` the top is a clipped peak; `fall` (S,) is the distance of each below the
-    top.
+    """Whether any run of samples `near` the top is a clipped peak.
 
-    A whole peak is a parabola: if n samples in a row stay within `height`, they span n - 1 intervals at least, and k
-    samples further on it has fallen by `height` ((n - 1 + 2k) / (n - 1))² at most. A clipped peak falls by about the
-    clipped height in the same time. So slow and loud peaks are accepted, however many samples they have at the top, and
-    so is one value that the converter holds, which is one sample here.
+    `fall` (S,): distance of each sample below the top. `hold`: number of samples per converted value. An unclipped peak
+    is nearly a parabola: if n successive converted values stay within `height` of the top, then k values later it has
+    fallen by at most `height` · ((n - 1 + 2k) / (n - 1))². A clipped peak falls by much more, about the height that was
+    cut off. Slow or loud peaks are thus accepted, however many samples they have near the top, and so is a single value
+    that the converter holds for several samples.
     """
     start, stop = _runs(near)
     conversions = (stop - start) / hold
@@ -200,6 +208,7 @@ def _flat(fall: np.ndarray, near: Bool[np.ndarray, " S"], height: float, hold: f
 
 
 def _hold(samples: np.ndarray) -> float:
-    """Number of samples for which the channel holds each conversion: the length of its short runs."""
+    """Number of samples for which the converter holds each value, estimated as the 5 % quantile of the lengths of
+    constant runs."""
     lengths = np.diff(np.flatnonzero(samples[1:] != samples[:-1]))
     return float(np.partition(lengths, lengths.size // 20)[lengths.size // 20]) if lengths.size else 1.0

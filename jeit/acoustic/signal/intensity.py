@@ -1,23 +1,17 @@
-"""Sound intensities of recordings in a frequency band, corrected for background noise.
+"""Sound intensity: the band power of each microphone in sliding windows, minus its noise floor.
 
-Band power of sound in sliding windows, and its distribution for white noise.
+For a window x of N samples at sampling rate r, with the Hann window w and X_k = Σ_n w_n x_n exp(-2πi kn/N), the band
+power is
 
-For a window x of N samples at rate r, with a Hann window w and X_k = Σ_n w_n x_n exp(-2πi kn/N), the band power is
+    P = 2 / (N Σ w²) · Σ_k W_k |X_k|².
 
-    P = 2 / (N Σ w²) · Σ_k W_k |X_k|²,
+The weight W_k is the fraction of the frequency interval (k ± 1/2) r / N of bin k, clipped to 0 to r/2, that lies in the
+band. A sine of amplitude A well inside the band has P = A²/2 (Parseval). White noise of variance σ² has the mean power
+σ² · (high - low) / (r/2), also if the edges of the band fall between bins. The mean of each window is subtracted, which
+does not affect bins from k = 2 on; these relations are therefore exact for low ≥ 1.5 / window.
 
-W_k the part of bin k's own stretch of frequency, (k ± 1/2) r / N within 0 to r/2, that lies in the band. A sine of
-amplitude A well inside the band has P = A²/2 (Parseval), and white noise of variance σ² has the mean
-σ² · (high - low) / (r/2), wherever the edges of the band fall between bins. The mean of each window is removed; it
-has no part in bins from 2 on, so that this holds exactly for low ≥ 1.5 / window.
-
-P is a quadratic form xᵀAx. For white noise its mean is σ² tr A and its variance 2 σ⁴ tr A², so that it is distributed
-nearly as mean · χ²_ν / ν, with ν = (tr A)² / tr A² degrees of freedom.
-
-Intensity of sound: the band power of each microphone in sliding windows, above its noise floor.
-
-A sine of amplitude A within the band has the intensity A²/2; white noise of variance σ² has σ² times the band's share
-of the range from 0 to half the rate. `jeit.acoustic.signal.intensity` has the formulas and the variance of noise.
+P is a quadratic form xᵀAx. For white noise its mean is σ² tr A and its variance 2 σ⁴ tr A². Its distribution is nearly
+that of mean · χ²_ν / ν, with ν = (tr A)² / tr A² degrees of freedom.
 """
 
 from __future__ import annotations
@@ -35,14 +29,18 @@ from jeit.acoustic.signal.faults import intensity_faults, sample_faults, window_
 from jeit.acoustic.signal.recording import Intensities, Recording, Taps
 from jeit.arguments import check_kind
 
-# Least number of bins in the band.
+# Minimum number of frequency bins in the band.
 _FEWEST_BINS = 4.0
-# Samples transformed at a time: 2 MiB, which fits into the cache with the transforms.
+# Number of samples transformed at a time: 2 MiB, so that samples and transforms fit into the processor's cache.
 _CHUNK = 2**18
 
 
 class Grid(NamedTuple):
-    """Windows in samples; the Hann window (N,); weights W_k (K,) of bins from `first` on, with the factor of P."""
+    """Windows and band of a recording, in samples and frequency bins.
+
+    **Fields**: `length`, `hop`: length of a window and distance between windows, in samples; `taper`: Hann window (N,);
+    `first`: index of the first bin in the band; `weights`: 2 W_k / (N Σ w²) of the bins in the band (K,).
+    """
 
     length: int
     hop: int
@@ -52,7 +50,11 @@ class Grid(NamedTuple):
 
 
 def make_grid(settings, rate: float, samples: int | None, name: str) -> Grid:
-    """Windows of `IntensitySettings` at `rate` Hz; raises `ValueError` where band, window and rate do not fit."""
+    """Convert `IntensitySettings` to windows and bins at the sampling rate `rate` in Hz.
+
+    `samples`: number of samples of the recording, if known; `name`: its name in messages. Raises `ValueError` if band,
+    window, rate and number of samples are not compatible.
+    """
     length, hop = round(settings.window * rate), max(1, round(settings.hop * rate))
     if settings.high > rate / 2:
         raise ValueError(
@@ -71,7 +73,7 @@ def make_grid(settings, rate: float, samples: int | None, name: str) -> Grid:
             f"{name}: {samples} samples at {rate:g} Hz last {samples / rate:.3g} s, less than one window of "
             f"{settings.window:g} s. Record longer, or shorten window=."
         )
-    # Periodic, not symmetric: then its transform is zero but for three bins.
+    # The periodic Hann window is used instead of the symmetric one: its transform is nonzero in three bins only.
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
     edges = np.clip((np.arange(length // 2 + 2) - 0.5) * rate / length, 0, rate / 2)
     overlap = np.clip(edges, settings.low, settings.high)
@@ -82,12 +84,12 @@ def make_grid(settings, rate: float, samples: int | None, name: str) -> Grid:
 
 
 def band_power(samples: np.ndarray, grid: Grid) -> np.ndarray:
-    """(F, M) band power of samples (M, S)."""
+    """Band power (F, M) of samples (M, S) in F windows."""
     finite = np.isfinite(samples)
     if not finite.all():
-        # Windows with these samples are not usable: the value does not matter.
+        # Windows that contain these samples are marked as not usable, so their values do not matter.
         samples = np.where(finite, samples, 0)
-    # A large constant would lose digits; its remainder in each window is removed below.
+    # A large constant would cost precision. The remaining mean of each window is removed below.
     samples = samples - samples.mean(axis=1, keepdims=True, dtype=float)
     windows = sliding_window_view(samples, grid.length, axis=-1)[:, :: grid.hop]
     count, number = windows.shape[:2]
@@ -101,21 +103,23 @@ def band_power(samples: np.ndarray, grid: Grid) -> np.ndarray:
         tapered = np.multiply(part, grid.taper, out=room[: part.size].reshape(part.shape))
         spectrum = np.asarray(scipy.fft.rfft(tapered, workers=2))[..., grid.first : last]
         if grid.first < 2:
-            # Elsewhere the Hann window's own transform is zero, and the mean with it.
+            # In bins from 2 on, the transform of the Hann window is zero, and the mean has no effect.
             spectrum = spectrum - part.mean(axis=-1)[..., None] * constant
         power[start : start + step] = ((np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ grid.weights).T
     return power
 
 
 def _trace(grid: Grid, lag: int) -> float:
-    """tr(A_0 A_lag) of two windows `lag` samples apart: half the covariance of their powers for noise of variance 1.
+    """tr(A_0 A_lag) for two windows `lag` samples apart: half the covariance of their powers for white noise of
+    variance 1.
 
-    With g(d) = Σ_k W_k cos(2πkd/N), A_nm = w_n w_m g(n - m), of period N in n - m. So the trace is Σ_d g(d)² r(d) with
-    r the autocorrelation of u_n = w_n w_(n+lag) where both windows reach: no N × N matrix is needed.
+    With g(d) = Σ_k W_k cos(2πkd/N), which has the period N, A_nm = w_n w_m g(n - m). The trace is therefore
+    Σ_d g(d)² r(d), where r is the autocorrelation of u_n = w_n w_(n+lag) over the overlap of the windows. No N × N
+    matrix is needed.
     """
     weights = np.zeros(grid.length // 2 + 1)
     weights[grid.first : grid.first + len(grid.weights)] = grid.weights
-    # The inverse transform counts bins between the ends twice.
+    # The inverse real transform counts all bins twice except the first and, for even N, the last.
     weights[1 : (grid.length + 1) // 2] /= 2
     squared = (grid.length * np.fft.irfft(weights, grid.length)) ** 2
     both = np.zeros(grid.length)
@@ -125,14 +129,14 @@ def _trace(grid: Grid, lag: int) -> float:
 
 
 def white_freedom(grid: Grid) -> float:
-    """Degrees of freedom ν of one window's power of white noise; exact except for the mean's removal in bins 0 and
-    1."""
-    # tr A = Σ w² Σ W, with the factor of P in the weights already.
+    """Degrees of freedom ν of the power of white noise in one window. The value is exact, except that the subtraction
+    of the mean in bins 0 and 1 is neglected."""
+    # tr A = Σ w² Σ W, where the weights W include the factor 2 / (N Σ w²).
     return float(((grid.taper**2).sum() * grid.weights.sum()) ** 2 / _trace(grid, 0))
 
 
 def shared_noise(grid: Grid, windows: int) -> Float[np.ndarray, "F F"]:
-    """Correlation of the powers of white noise in windows i and j."""
+    """Correlation (F, F) between the powers of white noise in any two of the `windows`, which overlap."""
     overlapping = range(min(windows, -(-grid.length // grid.hop)))
     by_lag = np.zeros(windows)
     by_lag[: len(overlapping)] = [_trace(grid, j * grid.hop) for j in overlapping]
@@ -140,15 +144,18 @@ def shared_noise(grid: Grid, windows: int) -> Float[np.ndarray, "F F"]:
     return by_lag[between] / by_lag[0]
 
 
-# A tap is audible in the windows with at least this fraction of its greatest loudness.
+# A tap is audible in a window if its loudness there is at least this fraction of its maximum loudness.
 _AUDIBLE = 0.5
 
 
 class IntensitySettings(eqx.Module):
-    """Settings of intensity: the band `low` to `high`, Hz, and windows of `window` s that begin every `hop` s.
+    """Frequency band and windows in which intensities are computed.
 
-    The sound of touches on a soft skin is below 1 kHz; below 50 Hz are motions of the skin and of the arm that wears
-    it. Raises `ValueError` for an invalid band, and for times that are not in seconds.
+    **Fields**: `low`, `high`: limits of the band in Hz; `window`: length of a window in seconds; `hop`: time between
+    the starts of successive windows in seconds.
+
+    The sound of touches on a soft skin is below 1 kHz. Below 50 Hz, motion of the skin and of the arm that wears it
+    dominates. Raises `ValueError` for an invalid band, and for times that are invalid or probably not in seconds.
     """
 
     low: float = 50.0
@@ -178,7 +185,8 @@ class IntensitySettings(eqx.Module):
 
 
 def check_settings(name: str, settings: IntensitySettings | None) -> None:
-    """Raises `ValueError`, about the argument `name`, for what are neither settings nor None."""
+    """Raises `ValueError` if `settings` is neither an `IntensitySettings` nor None; `name` is the argument's name in
+    the message."""
     if settings is not None:
         check_kind(name, settings, IntensitySettings, "IntensitySettings, such as IntensitySettings(window=0.05)")
 
@@ -186,10 +194,11 @@ def check_settings(name: str, settings: IntensitySettings | None) -> None:
 class TapIntensities(NamedTuple):
     """Intensities of T taps at M microphones, as returned by `tap_intensities`.
 
-    - `power`: (T, M) mean band power above the noise floor while the tap is audible; may be negative.
+    - `power`: (T, M) mean band power while the tap is audible, minus the noise floor. Values may be negative.
     - `floor`: (M,) noise power that was subtracted.
-    - `freedom`: (T,) degrees of freedom ν of each mean, so that noise alone has the variance 2 floor² / ν.
-    - `usable`: (T, M), `faults`: M strings, as in `Intensities`.
+    - `freedom`: (T,) degrees of freedom ν of the mean: for noise alone, its variance is 2 floor² / ν.
+    - `usable`: (T, M) mask of the usable values.
+    - `faults`: M descriptions of the fault of each channel; "" for none.
     """
 
     power: Float[np.ndarray, "T M"]
@@ -202,11 +211,11 @@ class TapIntensities(NamedTuple):
 def intensities(
     recording: Recording, settings: IntensitySettings | None = None, floor: Float[np.ndarray, " M"] | None = None
 ) -> Intensities:
-    """Intensities of a recording in sliding windows; windows with faults are marked as not usable.
+    """Compute the intensities of a recording in sliding windows. Windows with faults are marked as not usable.
 
-    The noise floor (M,), in the square of the samples' unit, is estimated from the quietest windows, a fifth of which
-    at least must be free of touch; give `floor` where it is known, from a recording of silence, or where the touch
-    never pauses. Raises `ValueError` where band, window and recording do not fit each other.
+    `floor` (M,): noise floor in the squared unit of the samples. By default it is estimated from the quietest windows,
+    which requires that at least a fifth of all windows contain no touch. If touches never pause, give the floor
+    measured in silence. Raises `ValueError` if band, window and recording are not compatible.
     """
     check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
     check_settings("settings", settings)
@@ -234,17 +243,18 @@ def intensities(
 
 
 def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> TapIntensities:
-    """Intensity of each tap at each microphone, for calibration.
+    """Compute the intensity of each tap at each microphone, for calibration.
 
-    A tap's power is the mean over the windows in which it is audible, the same for all microphones: those in which the
-    sum over microphones of power / floor, less that of noise, is at least half its maximum. A microphone with a fault
-    in one of them is not usable for that tap: its mean over other windows would be of another loudness. The floor comes
-    from the quietest windows of all taps, so that the taps should hold some silence, before or after. The windows
-    overlap; `freedom` counts what they share exactly, for white noise. It does not account for the selection of
-    windows: for a tap that is not audible at all, the loudest windows of noise are taken, somewhat above the floor.
+    The power of a tap is the mean over the windows in which it is audible, the same windows for all microphones. The
+    loudness of a window is the sum over microphones of (power − floor) / floor; the tap is audible where the loudness
+    is at least half its maximum. A microphone with a fault in one of these windows is not usable for the tap, since
+    other windows have another loudness. The noise floor is estimated from the quietest windows of all taps, so the
+    recordings should include some silence before or after the taps. `freedom` accounts for the overlap of windows,
+    exactly for white noise, but not for the selection of windows: if a tap is not audible at all, the loudest windows
+    of noise are selected, and its power is somewhat too high.
 
-    Taps that already hold intensities are returned as they are, with a floor of zero and infinite freedom. Raises
-    `ValueError` for what is no `Taps`, and where band, window and samples do not fit each other.
+    If `taps` contains intensities instead of samples, these are returned unchanged, with a floor of zero and infinite
+    `freedom`. Raises `ValueError` if `taps` is not a `Taps`, and if band, window and samples are not compatible.
     """
     check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
     check_settings("settings", settings)
@@ -257,7 +267,8 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     grid = make_grid(settings or IntensitySettings(), rate, samples.shape[-1], taps.name)
     good, faults = [], []
     for m in range(samples.shape[1]):
-        # All taps of a microphone together: its range, its steps and its silence are the same throughout.
+        # All taps of a microphone are tested together, since range, converter step and silence are properties of the
+        # channel.
         kind, dead = sample_faults(samples[:, m].ravel(), rate, taps.full_scale)
         one, reason = window_faults(kind.reshape(-1, samples.shape[-1]), dead, grid.length, grid.hop)
         good.append(one)
@@ -267,12 +278,12 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     count, windows, microphones = power.shape
     freedom = white_freedom(grid)
     floor = noise_floor(power.reshape(-1, microphones), usable.reshape(-1, microphones), freedom)
-    # A noiseless simulated channel would otherwise dominate; a dead channel is ignored.
+    # The minimum floor prevents a simulated channel without noise from dominating. Dead channels are ignored.
     alive = usable.any(axis=(0, 1))
     least = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
     loudness = np.where(alive, power / least - floor / least, 0).sum(axis=-1)
     audible = loudness >= _AUDIBLE * loudness.max(axis=1, keepdims=True)
-    # Where no window is above the floor the rule selects too few or too many: include the loudest.
+    # The loudest window is always included, also if no window is above the floor.
     audible |= loudness == loudness.max(axis=1, keepdims=True)
     mean = np.einsum("tf,tfm->tm", audible, power) / audible.sum(axis=1)[:, None]
     shared = shared_noise(grid, windows)
@@ -284,17 +295,17 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
 def noise_floor(
     power: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, "F M"], freedom: float, share: float = 0.2
 ) -> Float[np.ndarray, " M"]:
-    """Noise floor (M,): mean band power of the noise, estimated from F windows of which some contain touches.
+    """Estimate the noise floor (M,), the mean band power of the noise, from F windows of which some contain touches.
 
-    At least the part `share` of the windows must be quiet. The start is a low quantile of the powers over that of χ²_ν
-    / ν, as in minimum statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). That start is up to a
-    few tenths too high when most windows are loud, since the share that is quiet is not known. So it is refined: the
-    mean of the powers below c times the floor, divided by that mean for χ²_ν / ν truncated at c, repeated until
-    convergence. `freedom` is ν; with ν infinite the low quantile is returned as it is. A channel without usable windows
-    has the floor 0.
+    `share`: minimum fraction of the windows that are free of touches. `freedom`: degrees of freedom ν of the power of
+    noise. The initial estimate is a low quantile of the powers divided by the same quantile of χ²_ν / ν, as in minimum
+    statistics (R. Martin, IEEE Trans. Speech Audio Process. 9, 504-512, 2001). It is up to a few tenths too high if
+    most windows are loud, since the actual fraction of quiet windows is unknown. It is refined iteratively: the new
+    floor is the mean of the powers below c times the floor, divided by the mean of χ²_ν / ν truncated at c. If ν is
+    infinite, the low quantile itself is returned. The floor of a channel without usable windows is 0.
 
-    Noise that is much louder at one end of the band scatters more than ν of white noise says, and its floor comes out
-    low: for power as 1/f from 50 to 1000 Hz by 8 %, as 1/f² by a third.
+    If the noise is not white, its power varies more than ν indicates, and the floor is underestimated: by 8 % for a
+    spectrum 1/f from 50 to 1000 Hz, and by a third for 1/f².
 
     Raises `ValueError` for shapes that disagree, usable windows that are not finite, and a share or freedom out of
     range.
@@ -313,14 +324,15 @@ def noise_floor(
         raise ValueError("power is NaN or infinite in windows that usable calls usable; mark those False.")
     number = usable.sum(axis=0)
     ordered = np.sort(np.where(usable, power, np.inf), axis=0)
-    # The median of the windows that are certainly quiet.
+    # The median of the quietest `share` of the windows.
     rank = np.clip(np.floor(0.5 * share * number).astype(int), 0, max(len(power) - 1, 0))
     floor = np.take_along_axis(ordered, rank[None], axis=0)[0] if len(power) else np.zeros(power.shape[1])
     floor = np.where(number > 0, floor, 0.0)
     if np.isinf(freedom):
         return floor
     half = freedom / 2
-    # Quantiles of χ²_ν / ν, and its mean below the cut-off: ∫ y p(y) dy is the distribution function of ν + 2.
+    # Quantiles of χ²_ν / ν, and its mean below the cut-off c: ∫_0^c y p(y) dy is the distribution function of χ² with
+    # ν + 2 degrees of freedom, at ν c.
     floor = floor / (gammaincinv(half, 0.5 * share) / half)
     cut = gammaincinv(half, 0.9) / half
     below = gammainc(half + 1, half * cut) / 0.9
@@ -335,8 +347,8 @@ def noise_floor(
 
 
 def degrees_of_freedom(settings: IntensitySettings, rate: float) -> float:
-    """Degrees of freedom ν of one window's power of white noise sampled at `rate` Hz: its variance is exactly 2 mean² /
-    ν."""
+    """Degrees of freedom ν of the power of white noise in one window, sampled at `rate` Hz. The variance of the power
+    is 2 mean² / ν."""
     return white_freedom(make_grid(settings, rate, None, "settings"))
 
 

@@ -1,7 +1,7 @@
-"""Recordings of microphones, and the sound files they are read from.
+"""Recordings of microphones, and the files from which they are read.
 
-All input is validated here, so that later steps need not check it again: real numbers, shapes, metres and hertz. The
-output of a broken microphone (NaN, zeros, flat tops) is accepted; `jeit.acoustic.signal.faults` detects it.
+All input is validated here: types, shapes, metres and hertz. Later steps do not check it again. The signals of a broken
+microphone (NaN, zeros, clipped peaks) are accepted here; `jeit.acoustic.signal.faults` detects them.
 """
 
 from __future__ import annotations
@@ -34,19 +34,21 @@ from jeit.arguments.extras import optional
 from jeit.files import check_memory, need, npz_arrays, read_as, reason, written_whole
 from jeit.mesh.topology import check_loop
 
-# Bytes of memory for each byte of a file with eight bits per sample.
+# Bytes of memory needed per byte of a file with eight bits per sample.
 _IN_MEMORY = 16
-# First bytes of other formats: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
+# First bytes of the formats read by `soundfile`: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
 _OTHERS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
-# Formats that soundfile does not read either: MP4 from its fifth byte on, WebM, WMA, AMR.
+# Bytes that identify formats which `soundfile` does not read: MP4 (from the fifth byte on); WebM, WMA and AMR.
 _MP4, _CLOSED = b"ftyp", (b"\x1aE\xdf\xa3", b"0&\xb2u", b"#!AMR")
 
 
 def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
-    """Samples (M, S), rate in Hz and full scale of a sound file; None for a file of an unknown format.
+    """Read the samples (M, S), the sampling rate in Hz and the full scale of a sound file. Returns None if the format
+    is unknown.
 
-    Integers become fractions of full scale, -1 to 1; floats are unchanged, and where they exceed 1 the full scale is
-    unknown. Raises `ValueError` for broken files, and for those that need `soundfile` where it is not installed.
+    Integer samples are converted to fractions of full scale, from -1 to 1. Floats are unchanged; if any exceeds 1, the
+    full scale is None (unknown). Raises `ValueError` for broken files, for formats that cannot be read, and if
+    `soundfile` is needed but not installed.
     """
     check_memory(path.name, _IN_MEMORY * path.stat().st_size)
     with path.open("rb") as file:
@@ -64,7 +66,7 @@ def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
 
 
 def _is_mp3(start: bytes) -> bool:
-    """Whether a frame of MPEG layer III begins: eleven bits that are set, any version, and the layer."""
+    """Whether the bytes are the start of an MPEG layer III frame: eleven set bits, any version, and the layer."""
     return len(start) > 1 and start[0] == 0xFF and start[1] & 0xE6 == 0xE2
 
 
@@ -74,12 +76,12 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
         warnings.simplefilter("always")
         try:
             rate, data = scipy.io.wavfile.read(path)
-        except Exception as error:  # of many kinds: it stumbles over what is damaged
+        except Exception as error:  # damaged files raise exceptions of many types
             problem = error
-    # The reader only warns of these, or stumbles later; its other warnings are of chunks that hold no sound.
+    # SciPy only warns of a truncated file, or fails later. Its other warnings concern chunks without sound.
     if any("prematurely" in str(one.message) for one in said):
         raise ValueError("the WAV file is cut off: it holds fewer samples than its header says. Copy it again.")
-    if "Unknown wave file format" in str(problem):  # A-law, ADPCM, and such
+    if "Unknown wave file format" in str(problem):  # A-law or ADPCM, for example
         return _read_other(path)
     if problem is not None:
         raise ValueError(f"not a readable WAV file, or cut off ({reason(problem)}); write it as plain PCM or float.")
@@ -87,7 +89,7 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
     if data.dtype == np.uint8:
         return (samples - 128.0) / 128.0, rate, 1.0
     if data.dtype.kind == "i":
-        # 24 bits come as the upper bits of 32, so that this holds for them too.
+        # SciPy returns 24-bit samples in the upper bits of 32-bit integers, so this scale is right for them too.
         return samples / -float(np.iinfo(data.dtype.name).min), rate, 1.0
     return samples, rate, _full_scale(samples)
 
@@ -96,7 +98,7 @@ def _read_other(path: Path) -> tuple[np.ndarray, float, float | None]:
     try:
         soundfile: Any = optional("soundfile", "a format that is not plain WAV", "Or convert it to plain WAV.")
     except ImportError as error:
-        raise ValueError(str(error)) from None  # of this file, as other faults are: further files may be read
+        raise ValueError(str(error)) from None  # like other faults of this file: the caller may read further files
     unread = "not a sound file that soundfile reads"
     with read_as(unread):
         file = soundfile.SoundFile(path)
@@ -104,31 +106,32 @@ def _read_other(path: Path) -> tuple[np.ndarray, float, float | None]:
         check_memory(path.name, 16.0 * file.frames * file.channels)
         with read_as(unread):
             data, rate, kind = file.read(file.frames, "float64", always_2d=True), file.samplerate, file.subtype
-    # What is compressed may overshoot 1 a little; its full scale is 1 all the same.
+    # Decoded samples of compressed formats may slightly exceed 1, although their full scale is 1.
     return data.T, rate, _full_scale(data) if kind in ("FLOAT", "DOUBLE") else 1.0
 
 
 def _full_scale(samples: np.ndarray) -> float | None:
-    """Full scale of float samples: 1, or None (unknown) if any exceed 1, since they are then in some other unit."""
+    """Full scale of float samples: 1; or None (unknown) if the magnitude of any sample exceeds 1, since the samples are
+    then in another unit."""
     return None if (np.abs(samples[np.isfinite(samples)]) > 1.0).any() else 1.0
 
 
-# Message for files that are neither.
+# Error message for files of an unknown format.
 _OTHERWISE = "neither an NPZ nor a sound file"
 
 
-# Greatest sample in any unit; squares of larger ones would be infinite in single precision.
+# Maximum magnitude of a sample in any unit; squares of larger samples would overflow in single precision.
 _LOUDEST = 1e15
 
 
 class Recording(eqx.Module):
-    """Samples of M microphones, taken simultaneously.
+    """Simultaneous samples of M microphones.
 
-    - `samples`: (M, S) in any unit (volts, counts, fractions of full scale); NaN or infinite as given by the device,
-      and infinite beyond 1e15.
-    - `rate`: samples a second of each microphone, Hz.
-    - `full_scale`: the largest |sample| that the device can give, or None if unknown.
-    - `name`: the source of the recording.
+    - `samples`: (M, S), in any unit (volts, counts, fractions of full scale). NaN and infinite samples are kept;
+      magnitudes above 1e15 are replaced by infinity.
+    - `rate`: sampling rate of each microphone in Hz.
+    - `full_scale`: largest magnitude of a sample that the device can return, or None if unknown.
+    - `name`: name of the recording, used in messages.
     """
 
     samples: Float[np.ndarray, "M S"]
@@ -139,7 +142,8 @@ class Recording(eqx.Module):
     def __init__(
         self, samples: ArrayLike, rate: ArrayLike, *, full_scale: ArrayLike | None = None, name: str = "recording"
     ):
-        """Raises `ValueError` for what is not real, not (M, S), transposed, or sampled at no plausible rate."""
+        """Raises `ValueError` for samples that are not real, have another shape than (M, S) or look transposed, and for
+        an implausible rate."""
         given = real(samples, "samples", "microphones, samples")
         beyond = np.abs(given) > _LOUDEST if given.dtype.kind == "f" else np.zeros(0, bool)
         self.samples = np.where(beyond, np.inf, given) if beyond.any() else given
@@ -155,16 +159,17 @@ class Recording(eqx.Module):
 class Intensities(eqx.Module):
     """Band power of M microphones in F time windows.
 
-    - `times`: (F,) seconds, the middle of each window.
-    - `power`: (F, M) band power above the noise floor, in the square of the samples' unit; may be negative. NaN only
-      where it is not usable.
-    - `floor`: (M,) noise power that was subtracted; zeros when unknown.
-    - `freedom`: degrees of freedom ν of one window's power of white noise, so that its variance is 2 floor² / ν;
-      infinite when unknown.
-    - `overlap`: windows that share a sample, window / hop; 1 where none do.
-    - `usable`: (F, M) False where a fault spoils the window.
-    - `faults`: M strings that describe the fault of each channel; "" for none.
-    - `name`: their source. `notes`: remarks on how they were measured.
+    - `times`: (F,) middle of each window in seconds.
+    - `power`: (F, M) band power minus the noise floor, in the squared unit of the samples. Values may be negative, and
+      are NaN only where they are not usable.
+    - `floor`: (M,) noise power that was subtracted; zero if unknown.
+    - `freedom`: degrees of freedom ν of the power of white noise in a window: its variance is 2 floor² / ν. Infinite if
+      unknown.
+    - `overlap`: length of a window divided by the hop between windows; 1 if windows do not overlap.
+    - `usable`: (F, M) mask of the windows without a fault.
+    - `faults`: M descriptions of the fault of each channel; "" for none.
+    - `name`: name of the recording, used in messages.
+    - `notes`: remarks on the measurement.
     """
 
     times: Float[np.ndarray, " F"]
@@ -190,9 +195,10 @@ class Intensities(eqx.Module):
         name: str = "intensities",
         notes: Sequence[str] | np.ndarray = (),
     ):
-        """`usable` and `faults` are derived from NaN and dead channels if not given.
+        """By default, `usable` and `faults` are derived from NaN, infinite values and dead channels.
 
-        Raises `ValueError` for what is not real, for shapes that disagree, and for times that do not increase.
+        Raises `ValueError` for values that are not real or out of range, for shapes that disagree, and for times that
+        do not increase.
         """
         self.times, self.power = real(times, "times", "windows"), real(power, "intensity", "windows, microphones")
         shape, length = self.power.shape, len(self.times)
@@ -230,11 +236,13 @@ class Intensities(eqx.Module):
 class Taps(eqx.Module):
     """T touches at known positions, for calibration; d = 2 or 3.
 
-    - `microphones`: (M, d), `positions`: (T, d), `outline`: (K, d) corners of the skin in order; metres. A plane
-      outline is turned counter-clockwise.
-    - `power`: (T, M) intensity of each tap above the noise floor, or None;
-    - `samples`: (T, M, S) recording of each tap, or None, and `rate` in Hz.
-    - `name`, `full_scale`: as in `Recording`.
+    - `microphones`: (M, d) positions of the microphones in metres.
+    - `positions`: (T, d) positions of the taps in metres.
+    - `outline`: (K, d) vertices of the skin's outline in order, in metres. A plane outline is ordered
+      counter-clockwise.
+    - `power`: (T, M) intensity of each tap above the noise floor, or None.
+    - `samples`: (T, M, S) recording of each tap, or None; `rate`: sampling rate in Hz, or None.
+    - `full_scale`, `name`: as in `Recording`.
     """
 
     microphones: Float[np.ndarray, "M d"]
@@ -258,10 +266,11 @@ class Taps(eqx.Module):
         full_scale: ArrayLike | None = None,
         name: str = "taps",
     ):
-        """Give either `power`, or `samples` and `rate`.
+        """Either `power` or `samples` and `rate` must be given.
 
         Raises `ValueError` for invalid arrays, for microphones farther from the skin than its length, for two
-        microphones at one position, and in the plane for taps farther outside the outline than 5 % of its length.
+        microphones at the same position, and, on a plane skin, for taps farther outside the outline than 5 % of its
+        length.
         """
         self.outline = coordinates(outline, "outline", np.shape(microphones)[-1:])
         self.microphones = coordinates(microphones, "microphones", self.outline.shape[1:])
@@ -302,12 +311,13 @@ class Taps(eqx.Module):
 
 
 def read_recording(path: str | Path) -> Recording | Intensities:
-    """Read a recording from a WAV file with any number of channels, an NPZ file, or a file that `soundfile` reads
-    (FLAC, Ogg, AIFF …) where that is installed.
+    """Read a recording from a WAV file with any number of channels, from an NPZ file, or, if `soundfile` is installed,
+    from another sound file (FLAC, Ogg, AIFF, …).
 
-    An NPZ file holds `samples` (M, S) and `rate` in Hz, optionally `full_scale`; or `intensity` (F, M) and `times` (F,)
-    in seconds, optionally `floor` (M,), `freedom` and `overlap`. Integers of a sound file become fractions of full
-    scale, -1 to 1. Raises `ValueError` for any other content, and `OSError` where there is no such file.
+    An NPZ file contains either `samples` (M, S), `rate` in Hz and optionally `full_scale`; or `intensity` (F, M),
+    `times` (F,) in seconds and optionally `floor` (M,), `freedom` and `overlap`, as in `Intensities`. Integer samples
+    of a sound file are converted to fractions of full scale, from -1 to 1. Raises `ValueError` for any other content,
+    and `OSError` if the file cannot be opened.
     """
     path = Path(path)
     try:
@@ -335,9 +345,9 @@ def read_recording(path: str | Path) -> Recording | Intensities:
 def read_taps(path: str | Path) -> Taps:
     """Read calibration taps from an NPZ file.
 
-    The file contains `microphones` (M, d), `outline` (K, d), `positions` (T, d), and `intensity` (T, M), or `samples`
-    (T, M, S) with `rate`; optionally `full_scale`. Raises `ValueError` for other content, `OSError` where there is no
-    such file.
+    The file contains `microphones` (M, d), `outline` (K, d) and `positions` (T, d) in metres; either `intensity` (T, M)
+    or `samples` (T, M, S) and `rate` in Hz; and optionally `full_scale`. Raises `ValueError` for other content, and
+    `OSError` if the file cannot be opened.
     """
     path = Path(path)
     geometry = ("microphones", "outline", "positions")
@@ -357,7 +367,7 @@ def read_taps(path: str | Path) -> Taps:
 
 
 def write_recording(path: str | Path, recording: Recording | Intensities) -> None:
-    """Write an NPZ file that `read_recording` reads; windows that are not usable become NaN."""
+    """Write a recording to an NPZ file for `read_recording`. Intensities that are not usable are written as NaN."""
     if isinstance(recording, Recording):
         _write(path, samples=recording.samples, rate=recording.rate, full_scale=recording.full_scale)
     else:
@@ -366,7 +376,7 @@ def write_recording(path: str | Path, recording: Recording | Intensities) -> Non
 
 
 def write_taps(path: str | Path, taps: Taps) -> None:
-    """Write an NPZ file that `read_taps` reads."""
+    """Write taps to an NPZ file for `read_taps`."""
     geometry = {"microphones": taps.microphones, "outline": taps.outline, "positions": taps.positions}
     _write(path, **geometry, intensity=taps.power, samples=taps.samples, rate=taps.rate, full_scale=taps.full_scale)
 

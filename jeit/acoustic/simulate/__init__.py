@@ -1,4 +1,4 @@
-"""Simulated sound: an acoustic skin, its microphones, and touches on it."""
+"""Simulation of an acoustic skin with microphones, and of the sound of touches on it."""
 
 from __future__ import annotations
 

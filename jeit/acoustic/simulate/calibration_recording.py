@@ -1,4 +1,4 @@
-"""Simulated calibration taps at known positions of a skin."""
+"""Simulation of calibration taps at known positions on a skin."""
 
 from __future__ import annotations
 
@@ -29,12 +29,16 @@ from jeit.acoustic.simulate.synthesis import (
     transform_size,
 )
 
-# Number of values computed at once: 32 MB.
+# Number of samples computed at once: 32 MB.
 PIECE = 2**22
 
 
 class CalibrationTaps(eqx.Module):
-    """Taps at known positions: `samples` (T, M, S), `rate`, `positions` (T, 2) metres, `strengths` (T,)."""
+    """Recordings of taps at known positions.
+
+    **Fields**: `samples`: recorded samples (T, M, S); `rate`: sampling rate in Hz; `positions`: positions of the taps
+    (T, 2) in metres; `strengths`: true strengths of the taps (T,).
+    """
 
     samples: Float[np.ndarray, "T M S"]
     rate: float
@@ -54,11 +58,11 @@ def calibration_taps(
     noise: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationTaps:
-    """Simulate `repeats` taps at each of `positions` (P, 2), metres: T = P · repeats recordings, grouped by position.
+    """Simulate `repeats` taps at each of `positions` (P, 2) in metres: T = P · repeats recordings, ordered by position.
 
-    Strengths are log-normal about that of `burst` with standard deviation `strength_spread` in the logarithm, as for a
-    hand or a vibrator; a calibration does not know them. `progress` is called with the progress. Otherwise as `tap`.
-    Raises `ValueError` as `tap` does.
+    The strengths are log-normal with the median `burst.strength` and the standard deviation `strength_spread` of the
+    logarithm; they are unknown to a calibration. `progress` is called with a text after each part of the computation.
+    The other arguments are those of `tap`. Raises `ValueError` as `tap` does.
     """
     check_skin_and_key(skin, key)
     places = skin.layer.check_inside("positions", positions)
@@ -76,11 +80,12 @@ def calibration_taps(
     samples = np.empty((len(places), repeats, skin.num_microphones, len(times)))
     level = noise_power(skin) if noise else None
     keys = jax.random.split(rest, len(places))
-    # In pieces of one size, so that memory beside the result is small, and one compiled program serves all.
+    # The taps are computed in pieces, which limits memory. All pieces have the same size, so that one compiled program
+    # serves all.
     pieces = min(len(places), -(-samples.size // PIECE))
     for part in np.array_split(np.arange(-(-len(places) // pieces) * pieces), pieces):
         part = np.minimum(part, len(places) - 1)
-        samples[part] = _still(
+        samples[part] = _tap_samples(
             skin, keys[part], places[part], strengths[part], envelope, level, size, filled_bins(skin, size)
         )
         if progress is not None:
@@ -91,7 +96,7 @@ def calibration_taps(
 
 
 @partial(jax.jit, static_argnums=(6, 7))
-def _still(skin, keys, places, strengths, envelope, level, size, bins):
+def _tap_samples(skin, keys, places, strengths, envelope, level, size, bins):
     frequencies = bin_frequencies(skin, size, bins)
 
     def at(item):

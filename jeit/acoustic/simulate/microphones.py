@@ -1,4 +1,4 @@
-"""The microphones of a simulated skin: positions, properties, and readout."""
+"""Microphones of a simulated skin: positions, properties, and readout."""
 
 from __future__ import annotations
 
@@ -9,22 +9,23 @@ from jeit.acoustic.simulate.checks import check_not_negative
 from jeit.arguments import check_metres
 from jeit.layout.layout import LARGEST
 
-# Text S3: eight 4:1 multiplexers step together every 25 µs, so each microphone is sampled every 100 µs.
+# Time between two slots of a multiplexer in seconds, and number of slots. Eight 4:1 multiplexers switch simultaneously
+# every 25 µs, so each microphone is sampled every 100 µs (Park 2022, text S3).
 STEP = 25e-6
 SLOTS = 4
 
 
 class MicrophoneModel(eqx.Module):
-    """Properties of the microphones under a skin, and their spread.
+    """Properties of the microphones under a skin, and their variation between microphones.
 
     **Fields**
 
-    - `depth`: metres under the surface, of the nominal microphone.
-    - `reach`, metres, and `snr_db`: a steady source of strength 1 at horizontal distance `reach` from a nominal
-      microphone, no edge near, is received with this signal-to-noise ratio in the band. The paper's microphones sense
-      from "about 5.5 cm" (Fig. S15), read here as 0 dB.
-    - `gain_spread_db`, `noise_spread_db`, in decibels of power, and `depth_spread`, relative: standard deviations, all
-      log-normal, this library's choices, not the paper's.
+    - `depth`: depth of the nominal microphone under the surface, in metres.
+    - `reach`, `snr_db`: signal-to-noise ratio in the band, in decibels, at which a nominal microphone receives a steady
+      source of strength 1 at the horizontal distance `reach` in metres, far from all edges. The microphones of Park
+      2022 sense touches up to "about 5.5 cm" (Fig. S15), interpreted here as the distance for 0 dB.
+    - `gain_spread_db`, `noise_spread_db`: standard deviations of gain and noise power, in decibels of power.
+    - `depth_spread`: standard deviation of the logarithm of depth. All three spreads are choices of this library.
 
     Raises `ValueError` for invalid properties.
     """
@@ -46,17 +47,18 @@ class MicrophoneModel(eqx.Module):
 
 
 class Readout(eqx.Module):
-    """Readout of the microphones: analogue filters, multiplexers, and the converter's clock.
+    """Readout of the microphones: analogue filters, multiplexers, and sampling.
 
     **Fields**
 
-    - `band` (low, high), Hz, where the source and the analogue filters have half their power.
-    - `coupling_db`: what is left, in a multiplexer, of the microphone read 25 µs earlier, in decibels below 0; -∞ for
-      nothing.
-    - `multiplexed`: samples at 10 kHz, microphone i later than the first by (i mod 4) · 25 µs; or all microphones at
-      once at 40 kHz, with no coupling. The paper's device has 8 inputs; here there are as many as are needed.
+    - `band`: (low, high) in Hz, the frequencies at which the filters halve the power of the source and of the noise.
+    - `coupling_db`: crosstalk in a multiplexer from the microphone read 25 µs earlier, in decibels, below 0; −∞ for no
+      crosstalk.
+    - `multiplexed`: if True, the sampling rate is 10 kHz and microphone i is sampled (i mod 4) · 25 µs after the first.
+      If False, all microphones are sampled simultaneously at 40 kHz, without crosstalk. The device of Park 2022 has 8
+      multiplexers; here their number is not limited.
 
-    Raises `ValueError` for a band that the rate cannot hold, and for a coupling that amplifies.
+    Raises `ValueError` for a band that is too high for the sampling rate, and for crosstalk of 0 dB or more.
     """
 
     band: tuple[float, float] = (60.0, 900.0)
@@ -75,23 +77,23 @@ class Readout(eqx.Module):
 
     @property
     def rate(self) -> float:
-        """Samples of each microphone per second."""
+        """Sampling rate of each microphone in Hz."""
         return 1 / (SLOTS * STEP) if self.multiplexed else 1 / STEP
 
     @property
     def coupling(self):
-        """Amplitude of the crosstalk from the microphone read before."""
+        """Amplitude of the crosstalk from the previously read microphone."""
         return 10 ** (self.coupling_db / 20)
 
     def stagger(self, number: int) -> np.ndarray:
-        """Delay of the sampling of each of `number` microphones after the first, (M,) seconds."""
+        """Sampling delay (M,) of each of `number` microphones relative to the first, in seconds."""
         return STEP * (np.arange(number) % SLOTS) * self.multiplexed
 
 
 def microphone_grid(number: int, *, width: float = 0.2, height: float = 0.2) -> np.ndarray:
-    """The centres (number², 2), metres, of number x number equal cells of the skin, row by row from the lower left.
+    """Centres (number², 2) in metres of number × number equal cells of the skin, row by row from the lower left.
 
-    Raises `ValueError` for less than one in a row.
+    Raises `ValueError` if `number` is less than 1.
     """
     if number < 1:
         raise ValueError(f"number: give how many points a row has, at least 1; it is {number}.")

@@ -1,4 +1,4 @@
-"""Simulated people who pat, tickle, stroke and blow on a skin with microphones, with individual traits."""
+"""Simulation of people with individual traits who pat, tickle, stroke and blow on a skin with microphones."""
 
 from __future__ import annotations
 
@@ -18,14 +18,18 @@ from jeit.acoustic.simulate.touches import NOMINAL_SPEED
 from jeit.acoustic.simulate.wind_sound import TURBULENCE, room_sound, wind
 from jeit.arguments import check_key, check_kind, check_name, describe
 
-# From clip to clip of one person, the deviation of the logarithm of every trait; and of `slope`, which is no size, the
-# deviation itself, half of that among people.
+# Standard deviation of the logarithm of a trait between the clips of one person; and standard deviation of `slope`,
+# which varies linearly, between people. Between the clips of one person, `slope` varies half as much.
 WITHIN, SLOPE_AMONG = 0.25, 0.3
 
 
 @dataclass(frozen=True)
 class Trait:
-    """The `median` of a trait among people, in SI units, and the `spread` of its logarithm from person to person."""
+    """Distribution of a trait among people.
+
+    **Fields**: `median`: median in SI units; `spread`: standard deviation of the logarithm, or of the trait itself for
+    `slope`.
+    """
 
     median: float
     spread: float
@@ -59,28 +63,32 @@ SOUND_MANNERS: dict[str, dict[str, Trait]] = {
     },
     "none": {},
 }
-"""Of each modality its traits; nobody touches the skin in "none"."""
+"""Traits of each touch modality. In the modality "none" nobody touches the skin."""
 
 MODALITIES = tuple(SOUND_MANNERS)
-"""Their names, in the paper's order."""
+"""Names of the touch modalities, in the order of Park 2022."""
 
 
-# From tap to tap of one clip, deviations of the logarithms of strength and rhythm; and metres by which a hand that pats
-# lands elsewhere.
-_STRENGTH, _RHYTHM, _ELSEWHERE = 0.25, 0.12, 4e-3
-# Least distance of a touch's centre from the edge, metres; least speed of a hand at a turn, relative to its mean.
+# Standard deviations between the taps of one clip: of the logarithm of strength, and of the logarithm of the interval;
+# and maximum distance in metres of a pat from its mean position.
+_STRENGTH, _RHYTHM, _PAT_RADIUS = 0.25, 0.12, 4e-3
+# Minimum distance of the centre of a touch from the edge, in metres; minimum speed of a hand at a turn, divided by its
+# mean speed.
 _MARGIN, _SLOWEST = 0.02, 0.1
-# Least length of a burst in samples, whatever trait is drawn.
+# Minimum length of a burst in seconds, which limits random values.
 _SHORTEST = 0.01
 
 
 class SoundingPerson(eqx.Module):
-    """Traits of one person: `medians`, for each modality its traits by name, in SI units."""
+    """Traits of one person.
+
+    **Fields**: `medians`: for each modality, dictionary of the person's traits by name, in SI units.
+    """
 
     medians: Mapping[str, Mapping[str, float]] = eqx.field(static=True)
 
     def __check_init__(self):
-        """Raises `ValueError` for modalities and traits other than those of `SOUND_MANNERS`, and what is no size."""
+        """Raises `ValueError` if the traits are not those of `SOUND_MANNERS`, or are not positive numbers."""
         check_kind("medians", self.medians, Mapping, "traits by modality, such as of SoundingPerson.draw(key)")
         for name, traits in SOUND_MANNERS.items():
             if set(self.medians.get(name, {})) != set(traits):
@@ -90,8 +98,8 @@ class SoundingPerson(eqx.Module):
 
     @classmethod
     def draw(cls, key: Array) -> "SoundingPerson":
-        """Draw a person: traits log-normal about the population medians, `slope` normal. Raises `ValueError` for no
-        key."""
+        """Draw a random person. Traits are log-normal about the medians of the population; `slope` is normal. Raises
+        `ValueError` if `key` is not a random key."""
         check_key(key)
         rng = _generator(key)
         own = {}
@@ -106,10 +114,10 @@ class SoundingPerson(eqx.Module):
         return cls(own)
 
     def touch(self, key: Array, modality: str, skin: SoundingSkin, *, duration: float = 2.9) -> SimulatedSound:
-        """Simulate `duration` seconds of one modality at a random position of the skin, without noise.
+        """Simulate `duration` seconds of a touch of this person at a random position on the skin, without noise.
 
-        Traits are log-normal about the person's own with a deviation of 0.25. Raises `ValueError` for what is no key,
-        skin, modality or duration.
+        `modality`: one of `MODALITIES`. The traits of the touch are log-normal about those of the person, with a
+        standard deviation of the logarithm of 0.25; `slope` is normal. Raises `ValueError` for invalid arguments.
         """
         check_skin_and_key(skin, key)
         check_name("modality", modality, MODALITIES)
@@ -117,38 +125,41 @@ class SoundingPerson(eqx.Module):
         drawn, rest = jax.random.split(key)
         rng = _generator(drawn)
         if modality == "none":
-            return _silent(skin, duration)
+            return _silence(skin, duration)
         traits = {}
         for name, own in self.medians[modality].items():
             if name == "slope":
                 traits[name] = max(own + SLOPE_AMONG / 2 * rng.normal(), 0.1)
             else:
                 traits[name] = float(own * np.exp(WITHIN * rng.normal()))
-        # The touch has its own spectral slope; the microphones' noise, which depends on the skin's, is not added here.
+        # The touch is simulated with its own spectral slope in place of the skin's. The microphones' noise depends on
+        # the skin's slope and is therefore not added here.
         toned = eqx.tree_at(lambda one: one.spectral_slope, skin, traits.pop("slope"))
         return _MAKES[modality](rng, toned, rest, traits, duration)
 
 
 def _taps(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
-    """Simulate pats and tickles: taps of random strength and rhythm, at positions within `radius`."""
+    """Simulate a pat or tickle: taps of random strength and rhythm at random positions within a small disc."""
     burst = Burst(traits["strength"], max(traits["length"], _SHORTEST))
-    interval, radius = traits["interval"], traits.get("radius", _ELSEWHERE)
+    interval, radius = traits["interval"], traits.get("radius", _PAT_RADIUS)
     count = int(np.ceil(2 * duration / interval)) + 2
     gaps = interval * np.exp(_RHYTHM * rng.normal(size=count))
-    # The recording begins at any moment of the rhythm.
+    # The recording begins at a random phase of the rhythm.
     onsets = ONSET - rng.uniform(0, interval) + np.cumsum(gaps) - gaps[0]
     onsets = onsets[(onsets > -burst.length) & (onsets < duration)]
     strengths = burst.strength * np.exp(_STRENGTH * rng.normal(size=len(onsets)))
     times = sample_times(skin, duration)
     spread = radius * np.sqrt(rng.uniform(size=len(onsets)))
     angle = rng.uniform(0, 2 * np.pi, len(onsets))
-    landed = _within(skin, _somewhere(rng, skin) + np.stack([spread * np.cos(angle), spread * np.sin(angle)], axis=-1))
+    landed = _clip_to_skin(
+        skin, _somewhere(rng, skin) + np.stack([spread * np.cos(angle), spread * np.sin(angle)], axis=-1)
+    )
     blocks = np.maximum(np.searchsorted(onsets, block_times(skin, len(times)) + HOP, side="right") - 1, 0)
     return record(skin, key, landed[blocks], burst.envelope(times, onsets, strengths), False)
 
 
 def _stroke(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
-    """Simulate a stroke to and fro along a straight path, slower at the turns."""
+    """Simulate a stroke back and forth along a straight path, slower at the turns."""
     angle, phase = rng.uniform(0, 2 * np.pi, 2)
     half = traits["path"] / 2 * np.array([np.cos(angle), np.sin(angle)])
     room = np.array([skin.layer.width, skin.layer.height]) / 2 - _MARGIN
@@ -156,24 +167,24 @@ def _stroke(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: di
     length = 2 * float(np.linalg.norm(half))
     middle = np.clip(_somewhere(rng, skin), -(room - np.abs(half)), room - np.abs(half))
     times = sample_times(skin, duration)
-    # The mean speed of a sine of amplitude L/2 and angular frequency w is L w / π.
+    # The mean speed of a sinusoidal motion of amplitude L/2 and angular frequency w is L w / π.
     turning = np.pi * traits["speed"] / length
     speed = np.maximum(length / 2 * turning * np.abs(np.cos(turning * times + phase)), _SLOWEST * traits["speed"])
     centres = block_times(skin, len(times))
-    places = _within(skin, middle + np.sin(turning * centres + phase)[:, None] * half)
+    places = _clip_to_skin(skin, middle + np.sin(turning * centres + phase)[:, None] * half)
     return record(skin, key, places, traits["strength"] * np.sqrt(speed / NOMINAL_SPEED), False)
 
 
 def _wind(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
-    """Simulate an air jet held over one position."""
+    """Simulate an air jet at a random position."""
     return wind(skin, key, _somewhere(rng, skin), slope=skin.spectral_slope, duration=duration, noise=False, **traits)
 
 
 _MAKES: dict[str, Callable[..., SimulatedSound]] = {"pat": _taps, "tickle": _taps, "stroke": _stroke, "wind": _wind}
 
 
-def _silent(skin: SoundingSkin, duration: float) -> SimulatedSound:
-    """Simulate silence, with nobody there."""
+def _silence(skin: SoundingSkin, duration: float) -> SimulatedSound:
+    """Simulate a recording without a touch and without noise."""
     silence = quiet(skin, jax.random.key(0), duration=duration)
     return SimulatedSound(
         np.zeros_like(silence.samples), skin.rate, np.zeros((0, 2)), np.zeros(0), silence.active, False
@@ -185,7 +196,7 @@ def _somewhere(rng: np.random.Generator, skin: SoundingSkin) -> np.ndarray:
     return rng.uniform(-1, 1, 2) * np.maximum(half - _MARGIN, half / 2)
 
 
-def _within(skin: SoundingSkin, places: np.ndarray) -> np.ndarray:
+def _clip_to_skin(skin: SoundingSkin, places: np.ndarray) -> np.ndarray:
     half = np.array([skin.layer.width, skin.layer.height]) / 2
     return np.clip(places, -half, half)
 
@@ -194,14 +205,19 @@ def _generator(key: Array) -> np.random.Generator:
     return np.random.default_rng(np.asarray(jax.random.bits(key, (4,))).tolist())
 
 
-# Decibels: level of the room's sound relative to the microphones' own noise, and its deviation between clips.
+# Mean level of the room's sound relative to the microphones' noise, and its standard deviation between clips, in
+# decibels.
 _ROOM, _ROOM_SPREAD = -6.0, 4.0
 
 
 @dataclass(frozen=True)
 class SoundClip:
-    """One clip: the `touch` with its truth, and the `noise` (M, S) added to it; its `modality`, and `person`, a number.
-    The recorded sound is `samples`."""
+    """Recording of one touch.
+
+    **Fields**: `touch`: sound of the touch without noise, with the true source; `noise`: noise (M, S) of the
+    microphones and the room; `modality`: name of the modality; `person`: index of the person. `samples` is the recorded
+    sound.
+    """
 
     touch: SimulatedSound
     noise: Float[np.ndarray, "M S"]
@@ -210,11 +226,11 @@ class SoundClip:
 
     @property
     def samples(self) -> Float[np.ndarray, "M S"]:
-        """Sum of touch and noise."""
+        """Recorded samples: the sum of touch and noise."""
         return self.touch.samples + self.noise
 
     def noisier(self, decibels: float) -> Float[np.ndarray, "M S"]:
-        """Samples of the touch with the noise raised by a number of decibels."""
+        """Samples with the level of the noise raised by a number of decibels."""
         return self.touch.samples + 10 ** (decibels / 20) * self.noise
 
 
@@ -227,10 +243,12 @@ def sound_clips(
     modalities: Sequence[str] = MODALITIES,
     duration: float = 2.9,
 ) -> Iterator[SoundClip]:
-    """Yield `each` clips of each modality by each person, in this order, one at a time: a set need not fit into memory.
+    """Yield `each` clips of each modality by each person, ordered by person and modality. Clips are generated one at a
+    time, so that a large set need not fit into memory.
 
-    Noise is the microphones' own and the room's, normal in decibels about -6 dB of that. Every clip has a key of its
-    own. Raises `ValueError` for what is no key, skin, person, modality or number, and no people.
+    The noise consists of the microphones' noise and the room's sound, whose level in decibels relative to that noise is
+    normal with a mean of -6 dB. Every clip has its own random key. Raises `ValueError` for invalid arguments, and for
+    an empty list of people.
     """
     check_skin_and_key(skin, key)
     check_kind("people", people, (list, tuple), "a list of them, such as [SoundingPerson.draw(key)]")

@@ -1,6 +1,6 @@
 """Propagation of sound from a touch to the microphones: spreading, loss, dispersion, edge echoes, and the multiplexer.
 
-Sound is propagated frequency by frequency; powers are integrals over frequency with no random numbers in them.
+Sound is propagated in the frequency domain. Expected powers are integrals over frequency and involve no random numbers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from jeit.acoustic.simulate.sounding_skin import SoundingSkin
 
 
 def band_filter(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
-    """Power response (F,) of the filters: 1 in the band, 1/2 at its ends, nothing from half an octave outside."""
+    """Power response (F,) of the analogue filters: 1 in the band, 1/2 at its limits, and 0 more than half an octave
+    outside."""
     octaves = jnp.log2(jnp.maximum(frequencies, 1e-9))
     low, high = jnp.log2(skin.readout.band[0]), jnp.log2(skin.readout.band[1])
     rising, falling = jnp.clip(octaves - low + 0.5, 0, 1), jnp.clip(high - octaves + 0.5, 0, 1)
@@ -23,25 +24,28 @@ def band_filter(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Ar
 
 
 def source_density(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
-    """Power density (F,), per hertz, of a source of strength 1: it integrates to 1 over the positive frequencies."""
+    """Power spectral density (F,) of a source of strength 1, in 1/Hz. Its integral over positive frequencies is 1."""
 
     lowest, highest = skin.readout.band
 
     def shape(f):
         return band_filter(skin, f) * (jnp.maximum(f, 1e-9) / lowest) ** -skin.spectral_slope
 
-    # Even in log-frequency, where the filter's two skirts are equally wide: ∫ S df = ∫ S f d(ln f).
+    # The integral uses a uniform grid of log-frequency, in which both edges of the filter have the same width:
+    # ∫ S df = ∫ S f d(ln f).
     grid = lowest * jnp.exp(jnp.linspace(-0.35, jnp.log(highest / lowest) + 0.35, 2001))
     return shape(frequencies) / jnp.trapezoid(shape(grid) * grid, jnp.log(grid))
 
 
 @jax.jit
 def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Float[Array, "2"]) -> Complex[Array, "M F"]:
-    """Transfer functions (M, F) from a source at `position` to each channel: paths, gain, coupling and stagger.
+    """Transfer functions (M, F) from a source at `position` (2,) in metres to each channel.
 
-    A path of length ρ, ρ² = (horizontal distance)² + (microphone's depth)², contributes spreading(ρ) times
-    exp(-(loss(f) + i wavenumber(f)) ρ). Paths are the straight one, the echoes of the four edges (images of the source
-    behind each, times `reflection`) and of the four corners (times its square). The faces' echoes are in the spreading.
+    A path of length ρ contributes spreading(ρ) · exp(-(loss(f) + i wavenumber(f)) ρ), with ρ² = (horizontal distance)²
+    + (depth of the microphone)². The paths are the direct path, the echoes from the four edges, which are image sources
+    multiplied by `reflection`, and the echoes from the four corners, multiplied by its square. Echoes from the top and
+    bottom faces are part of the spreading. The transfer functions include the gain of each microphone and, for a
+    multiplexed readout, crosstalk and the delays of the sampling times.
     """
     layer = skin.layer
     x, y = position
@@ -58,7 +62,7 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
     received = jnp.sum(amplitude[..., None] * jnp.exp(-length[..., None] * decay), axis=1)
     if not skin.readout.multiplexed:
         return received
-    # Microphone i is slot i mod 4 of multiplexer i div 4. What it follows there, 25 µs earlier, may be an open slot.
+    # Microphone i is connected to slot i mod 4 of multiplexer i div 4. The slot read 25 µs earlier may be open.
     index = np.arange(skin.num_microphones)
     before = index - index % SLOTS + (index - 1) % SLOTS
     connected = before < skin.num_microphones
@@ -68,13 +72,15 @@ def transfer(skin: SoundingSkin, frequencies: Float[Array, " F"], position: Floa
 
 
 def expected_power(skin: SoundingSkin, positions) -> Float[np.ndarray, "P M"]:
-    """Mean square (P, M) of each channel, noise apart, for a steady source of strength 1 at each of `positions` (P, 2).
+    """Mean square (P, M) of each channel without noise, for a steady source of strength 1 at each of `positions` (P, 2)
+    in metres.
 
-    The integral over frequency of the source's density times |transfer|², no random numbers in it; a source of
-    strength s gives s² of it. Raises `ValueError` for positions off the skin.
+    It is the integral over frequency of the source's spectral density times |transfer|². For a source of strength s it
+    is multiplied by s². Raises `ValueError` for positions outside the skin.
     """
     points = skin.layer.check_inside("positions", positions)
-    # |transfer|² beats between two echoes at most once per 1 / delay; four points a beat make the sum exact, nearly.
+    # Interference of two echoes makes |transfer|² oscillate with a period of at least 1 / (longest delay) in frequency.
+    # Four points per period make the sum nearly exact.
     step = min(1 / (4 * skin.layer.longest_delay), skin.readout.band[0] / 10)
     frequencies = np.arange(1, np.ceil(np.sqrt(2) * skin.readout.band[1] / step)) * step
     return np.asarray(_expected_power(skin, jnp.asarray(points), jnp.asarray(frequencies), step))
@@ -87,7 +93,8 @@ def _expected_power(skin, points, frequencies, step):
 
 
 def nominal_power(skin: SoundingSkin, distances) -> Float[np.ndarray, " K"]:
-    """Mean square (K,) that a nominal microphone receives from horizontal `distances` (K,), metres, no edge near."""
+    """Mean square (K,) received by a nominal microphone from a source of strength 1 at horizontal `distances` (K,) in
+    metres, far from all edges."""
     return np.asarray(_nominal_power(skin, jnp.hypot(jnp.asarray(distances, float), skin.microphone_model.depth)))
 
 
@@ -101,6 +108,6 @@ def _nominal_power(skin, length):
 
 
 def noise_power(skin: SoundingSkin) -> Float[np.ndarray, " M"]:
-    """Mean square (M,) of each channel's own noise, all of it in the band; see `MicrophoneModel`."""
+    """Mean square (M,) of the noise of each microphone, which lies in the band; see `MicrophoneModel`."""
     nominal = nominal_power(skin, skin.microphone_model.reach) * 10 ** (-skin.microphone_model.snr_db / 10)
     return nominal * np.asarray(skin.noise_factor)

@@ -1,7 +1,7 @@
-"""Simulated recordings: the channels' samples for a source, with its true position and amplitude.
+"""Simulation of recordings: the samples of all channels for a source, with its true position and amplitude.
 
-A touch of envelope e(t) at one place is received, on average over keys, with the energy Σ e² times `expected_power`,
-but for what rings on beyond the recording's ends.
+A touch with envelope e(t) at a fixed position is received with a mean energy (over random keys) of Σ e² times
+`expected_power`, except for sound beyond the ends of the recording.
 """
 
 from __future__ import annotations
@@ -27,17 +27,19 @@ from jeit.acoustic.simulate.synthesis import (
     transform_size,
 )
 
-# A moving source stands still for one Hann block of two hops; the blocks overlap by half and sum to one. In 10 ms a
-# brisk stroke of 0.5 m/s moves by 5 mm, well under the distances over which loudness changes.
+# Time in seconds between the positions of a moving source. The source is at rest during each Hann-weighted block of two
+# hops; blocks overlap by half, and their weights sum to one. In 10 ms, a fast stroke of 0.5 m/s moves by 5 mm, much
+# less than the distance over which the received power changes.
 HOP = 0.01
 
 
 class SimulatedSound(eqx.Module):
-    """Samples of the channels of a skin during a touch, and the true source.
+    """Samples of all channels during a touch, and the true source.
 
-    **Fields**: `samples` (M, S), in units of the skin's sources; `rate`, samples per second; `position` (N, 2) metres,
-    where the source is (or was last, or will be first) at `position_times` (N,), seconds; N is 0 for `quiet`. `active`
-    (S,): the source's root mean square at `times`, when it leaves the source. `noisy`: whether noise was added.
+    **Fields**: `samples`: (M, S), in the unit of source strength; `rate`: sampling rate in Hz; `position`: positions
+    (N, 2) of the source in metres at `position_times` (N,) in seconds, where N = 0 for `quiet`, and a silent source has
+    the position of its last or first sound; `active`: root mean square (S,) of the source at `times`, without the delay
+    of propagation; `noisy`: whether the samples include noise.
     """
 
     samples: Float[np.ndarray, "M S"]
@@ -49,12 +51,12 @@ class SimulatedSound(eqx.Module):
 
     @property
     def times(self) -> np.ndarray:
-        """Sampling times of the first channel, (S,) seconds from the start; the others follow by `skin.stagger`."""
+        """Sampling times (S,) of the first channel in seconds. Other channels are delayed by `skin.stagger`."""
         return np.arange(self.samples.shape[1]) / self.rate
 
 
 def quiet(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -> SimulatedSound:
-    """Simulate the microphones' own noise only, for `duration` seconds. Raises `ValueError` for an invalid duration."""
+    """Simulate `duration` seconds of microphone noise without a source. Raises `ValueError` for an invalid duration."""
     check_skin_and_key(skin, key)
     check_positive("duration", duration)
     times = sample_times(skin, duration)
@@ -63,9 +65,10 @@ def quiet(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -> Simulated
 
 
 def superpose(skin: SoundingSkin, key: Array | None, *recordings: SimulatedSound) -> Float[np.ndarray, "M S"]:
-    """Samples (M, S) of several touches at once, the microphones' noise added once; with key None, none is.
+    """Return the samples (M, S) of several simultaneous touches, with microphone noise added unless `key` is None.
 
-    The recordings must be of one skin and length and made with `noise=False`, or noise would count twice: `ValueError`.
+    Raises `ValueError` if there are no recordings, if they differ in duration or do not match the skin, or if they
+    include noise; simulate them with `noise=False`.
     """
     check_skin_and_key(skin, jax.random.key(0) if key is None else key)
     if not recordings:
@@ -82,14 +85,16 @@ def superpose(skin: SoundingSkin, key: Array | None, *recordings: SimulatedSound
 
 
 def record(skin: SoundingSkin, key: Array, places: np.ndarray, envelope: np.ndarray, noise: bool) -> SimulatedSound:
-    """Simulate the samples for a source of root mean square `envelope` (S,), in the blocks at `places` (B, 2), or (1,
-    2)."""
+    """Simulate the recording of a source with the root mean square `envelope` (S,) at the positions `places` in metres:
+    (B, 2), one per block, or (1, 2) for a source at rest."""
     source, own = jax.random.split(key)
     count, centres = len(envelope), block_times(skin, len(envelope))
     places = np.broadcast_to(places, (len(centres), 2))
     whole = transform_size(count, RINGING, skin.rate)
     block = transform_size(2 * round(HOP * skin.rate), skin.layer.longest_delay, skin.rate)
-    samples = np.asarray(_moving(skin, source, places, envelope, whole, block, filled_bins(skin, block, blur=4 / HOP)))
+    samples = np.asarray(
+        _moving_source_samples(skin, source, places, envelope, whole, block, filled_bins(skin, block, blur=4 / HOP))
+    )
     if noise:
         samples = samples + microphone_noise(skin, own, count)
     kept = centres <= count / skin.rate
@@ -97,12 +102,12 @@ def record(skin: SoundingSkin, key: Array, places: np.ndarray, envelope: np.ndar
 
 
 def block_times(skin: SoundingSkin, count: int) -> np.ndarray:
-    """The middles of the blocks that cover `count` samples, seconds: 0, one hop, two hops, ..."""
+    """Middles of the blocks that cover `count` samples, in seconds: 0, one hop, two hops, …"""
     return HOP * np.arange(int(np.ceil(count / round(HOP * skin.rate))) + 1)
 
 
 @partial(jax.jit, static_argnums=(4, 5, 6))
-def _moving(skin, key, places, envelope, whole, block, bins):
+def _moving_source_samples(skin, key, places, envelope, whole, block, bins):
     count, hop = envelope.shape[0], round(HOP * skin.rate)
     sound = jnp.fft.irfft(source_spectrum(skin, key, envelope, whole, whole // 2 + 1), whole)[:count]
     sound = jnp.pad(sound, (hop, places.shape[0] * hop + hop - count))

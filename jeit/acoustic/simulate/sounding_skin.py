@@ -1,9 +1,10 @@
-"""A simulated skin of an elastic layer with microphones, which turns touches into recordings.
+"""Simulated skin: an elastic layer with microphones.
 
-No openly licensed recording of a skin with microphones exists; this stands in where one is needed. Sound is propagated
-frequency by frequency, with spreading, viscoelastic loss, delays and echoes of the edges, so that localisation is
-*not* tested on the decay model a/(r² + b) that it fits. The setup is that of Park et al., Science Robotics 7,
-eabm7187 (2022). The physics is in `jeit.acoustic.simulate.propagation`, touches in `jeit.acoustic.simulate.touches`.
+Simulated recordings replace measured ones, since no openly licensed recording of a skin with microphones exists. Sound
+is propagated in the frequency domain with spreading, viscoelastic loss, delays and edge echoes. The simulation thus
+differs from the decay model a/(r² + b) that localisation fits, and is a meaningful test of it. The setup is that of
+Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.propagation` for the physics, and
+`jeit.acoustic.simulate.touches` for touches.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ from jeit.layout.layout import LARGEST
 
 
 class Elastomer(eqx.Module):
-    """A soft rubber. A touch radiates mostly shear waves in it, of speed √(modulus / density).
+    """A soft rubber, in which a touch radiates mainly shear waves of speed √(shear modulus / density).
 
-    **Fields**: `shear_modulus` in pascals and `density` in kg/m³: about 100 kPa, a soft silicone, gives 10 m/s at
-    `attenuation_frequency` (Hz). `attenuation` in nepers per metre at that frequency, growing as frequency to the
-    `attenuation_exponent`. With loss tangent d it is π f d / speed; 4 /m at 100 Hz is d = 0.13, as of soft rubber (a
-    choice of this library, not of the paper's). Raises `ValueError` for values that no rubber has.
+    **Fields**: `shear_modulus`: shear modulus in Pa; `density`: density in kg/m³; `attenuation`: attenuation in nepers
+    per metre at `attenuation_frequency`, in Hz; `attenuation_exponent`: the attenuation is proportional to frequency to
+    this power.
+
+    The default shear modulus, of a soft silicone, gives a speed of 10 m/s at `attenuation_frequency`. For a loss
+    tangent d the attenuation is π f d / speed; the default of 4 /m at 100 Hz corresponds to d = 0.13, typical of soft
+    rubber (chosen by this library, not given in Park 2022). Raises `ValueError` for values that no rubber has.
     """
 
     shear_modulus: float = 1e5
@@ -47,20 +51,22 @@ class Elastomer(eqx.Module):
 
     @property
     def wave_speed(self):
-        """Speed of shear waves, metres per second."""
+        """Speed of shear waves in metres per second."""
         return (self.shear_modulus / self.density) ** 0.5
 
     def loss(self, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
-        """Attenuation (F,) in nepers per metre at `frequencies` (F,), Hz."""
+        """Attenuation (F,) in nepers per metre at `frequencies` (F,) in Hz."""
         return self.attenuation * (frequencies / self.attenuation_frequency) ** self.attenuation_exponent
 
     def wavenumber(self, frequencies: Float[Array, " F"]) -> Float[Array, " F"]:
-        """Phase (F,) per metre, 2πf / speed, with the dispersion that a loss ∝ f^n has where no sound comes too early.
+        """Wavenumber (F,) in radians per metre at `frequencies` (F,) in Hz: 2πf / speed plus the dispersion that
+        causality requires for an attenuation proportional to f^n.
 
-        Kramers and Kronig's relation for a power law gives loss(f0) tan(πn/2) (x^n - x), x = f / f0, as in Szabo, J.
-        Acoust. Soc. Am. 96 (1994) 491: with the default loss, speed grows by an eighth over the band.
+        The Kramers-Kronig relation for a power law gives the dispersion loss(f0) tan(πn/2) (x^n - x) with x = f / f0
+        (Szabo, J. Acoust. Soc. Am. 96 (1994) 491). With the default attenuation, the speed increases by an eighth over
+        the band.
         """
-        # At n = 1 it tends to a logarithm, to which this close an n is near enough.
+        # The limit for n → 1 is a logarithm, which this value of n approximates closely enough.
         exponent = jnp.where(jnp.abs(self.attenuation_exponent - 1) < 1e-6, 1 + 1e-6, self.attenuation_exponent)
         relative = frequencies / self.attenuation_frequency
         dispersion = self.attenuation * jnp.tan(jnp.pi / 2 * exponent) * (relative**exponent - relative)
@@ -70,9 +76,9 @@ class Elastomer(eqx.Module):
 class ElastomerLayer(eqx.Module):
     """A rectangular layer of an elastomer, centred at the origin.
 
-    **Fields**: `width`, `height`, `thickness` in metres; `material`; `reflection`, amplitude of the echo of an edge: -1
-    for a clamped edge, +1 for a free one; a layer that ends in a soft seal or frame lies near zero, between about -0.3
-    and 0.3. Raises `ValueError` for what is no layer.
+    **Fields**: `width`, `height`, `thickness`: dimensions in metres; `material`: the elastomer; `reflection`: amplitude
+    reflection coefficient of the edges, -1 for a clamped edge, +1 for a free edge, and between about -0.3 and 0.3 for
+    an edge in a soft seal or frame. Raises `ValueError` for invalid values.
     """
 
     width: float = 0.2
@@ -91,19 +97,21 @@ class ElastomerLayer(eqx.Module):
 
     @property
     def longest_delay(self) -> float:
-        """Travel time of sound along the longest simulated path, seconds."""
+        """Travel time of sound along the longest simulated path, in seconds."""
         return 2 * float(np.hypot(self.width, self.height)) / self.material.wave_speed
 
     def spreading(self, length: Array, depth) -> Array:
-        """Amplitude after a path of `length` metres, relative to that at a nominal microphone `depth` m under a source.
+        """Amplitude after a path of `length` metres, relative to the amplitude at a nominal microphone `depth` metres
+        directly below the source.
 
-        Near its source a wave spreads as in a body (amplitude 1/ρ). Beyond a thickness or so it is guided by the layer
-        and spreads as in a sheet (1/√ρ). √(1 + ρ/thickness) / ρ has both limits.
+        Near the source, the wave spreads in three dimensions, with amplitude 1/ρ. Beyond about one thickness, the layer
+        guides it in two dimensions, with amplitude 1/√ρ. The formula √(1 + ρ/thickness) / ρ has both limits.
         """
         return jnp.sqrt((1 + length / self.thickness) / (1 + depth / self.thickness)) * depth / length
 
     def check_inside(self, name: str, points) -> Float[np.ndarray, "P 2"]:
-        """`points` (P, 2), metres, as floats; raises `ValueError` that says `name` unless all are on the layer."""
+        """Return `points` (P, 2) in metres as floats. Raises `ValueError` unless all are finite and on the layer;
+        `name` is the argument's name in the message."""
         try:
             place = np.asarray(points, float)
         except (TypeError, ValueError) as error:
@@ -129,16 +137,18 @@ class ElastomerLayer(eqx.Module):
 class SoundingSkin(eqx.Module):
     """An elastomer layer with microphones under its surface.
 
-    A source of strength 1 is one whose sound, received by a nominal microphone right below it with no loss and no
-    echoes, would have a mean square of 1; this is the (arbitrary) unit of all samples.
+    The unit of samples is arbitrary: a source of strength 1 has a mean square of 1 at a nominal microphone directly
+    below it, without loss and echoes.
 
     **Fields**
 
-    - `microphones` (M, 2), metres; `microphone_depth` (M,) metres under the surface; `gain` (M,), in amplitude;
-      `noise_factor` (M,), power of each microphone's own noise relative to the nominal one.
-    - `layer`: its shape and material. `microphone_model`: what the nominal microphone is like.
-      `readout`: how all are read.
-    - `spectral_slope`: the power density of a touch falls as frequency to minus this (1: 3 dB per octave).
+    - `microphones`: positions (M, 2) in metres. `microphone_depth`: depth (M,) under the surface in metres.
+    - `gain`: amplitude gain (M,) of each microphone. `noise_factor`: noise power (M,) of each microphone divided by
+      that of the nominal microphone.
+    - `layer`: shape and material of the layer. `microphone_model`: properties of the nominal microphone. `readout`:
+      filters and sampling.
+    - `spectral_slope`: the power spectral density of a touch is proportional to frequency to the power
+      −`spectral_slope` (1 is 3 dB per octave).
     """
 
     microphones: Float[Array, "M 2"]
@@ -160,10 +170,11 @@ class SoundingSkin(eqx.Module):
         readout: Readout | None = None,
         spectral_slope: float = 1.0,
     ):
-        """`key` draws by how much the microphones differ, as `microphone_model` has it: the same key gives the same
-        microphones, whatever the other arguments. `microphones`: (M, 2) metres; a grid of 5 × 5 unless given.
-        `layer`, `microphone_model` and `readout`: those of the paper's device unless given. Raises `ValueError` for
-        microphones off the layer, and for things of another kind.
+        """Create a skin with randomly varying microphones.
+
+        `key`: random key for the deviations of the microphones from `microphone_model`. `microphones`: positions (M, 2)
+        in metres; by default a grid of 5 × 5. The defaults of `layer`, `microphone_model` and `readout` describe the
+        device of Park 2022. Raises `ValueError` for microphones outside the layer, and for arguments of the wrong type.
         """
         check_key(key)
         self.layer = ElastomerLayer() if layer is None else layer
@@ -195,16 +206,16 @@ class SoundingSkin(eqx.Module):
 
     @property
     def rate(self) -> float:
-        """Samples of each microphone per second."""
+        """Sampling rate of each microphone in Hz."""
         return self.readout.rate
 
     @property
     def stagger(self) -> np.ndarray:
-        """Delay of the sampling of each microphone after the first, (M,) seconds."""
+        """Sampling delay (M,) of each microphone relative to the first, in seconds."""
         return self.readout.stagger(self.num_microphones)
 
 
 def check_skin_and_key(skin: SoundingSkin, key: Array) -> None:
-    """Raises `ValueError` for what is no `SoundingSkin`, and for what is no random key."""
+    """Raises `ValueError` if `skin` is not a `SoundingSkin`, or `key` is not a random key."""
     check_kind("skin", skin, SoundingSkin, "a SoundingSkin, such as SoundingSkin(jax.random.key(0))")
     check_key(key)

@@ -1,7 +1,8 @@
-"""Synthesis of noise with a spectrum, and of bursts.
+"""Synthesis of noise with a given spectrum, and of bursts of noise.
 
-A touch of soft rubber is random noise in a band, in bursts or steadily. White noise is shaped in time first and in
-frequency after. Every function takes an explicit key: the same key, the same samples.
+The sound of a touch on soft rubber is modelled as band-limited random noise, steady or in bursts: white noise is
+multiplied by an envelope and then filtered. All functions take an explicit random key; the same key gives the same
+samples.
 """
 
 from __future__ import annotations
@@ -20,39 +21,42 @@ from jeit.acoustic.simulate.propagation import band_filter, noise_power, source_
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin
 from jeit.arguments import check_kind
 
-# The source's filter has no phase: it rings before and after a burst, for about the inverse of its lowest frequency.
+# Duration in seconds for which the source's filter rings before and after a burst, since it has zero phase: about the
+# inverse of its lowest frequency.
 RINGING = 0.05
 
 
 def bin_frequencies(skin: SoundingSkin, size: int, bins: int) -> Array:
-    """The lowest `bins` frequencies (bins,), Hz, of a transform of `size` samples."""
+    """Frequencies (bins,) in Hz of the lowest `bins` bins of a transform of `size` samples."""
     return jnp.arange(bins) * (skin.rate / size)
 
 
 def filled_bins(skin: SoundingSkin, size: int, *, blur: float = 0.0) -> int:
-    """Number of nonzero bins of a real transform of `size` samples: half an octave over the band, and `blur`."""
+    """Number of bins of a real transform of `size` samples up to half an octave above the band plus `blur` in Hz. The
+    remaining bins are zero."""
     return min(int((np.sqrt(2) * skin.readout.band[1] + blur) * size / skin.rate) + 1, size // 2)
 
 
 def transform_size(count: int, padding: float, rate: float) -> int:
-    """A fast transform length for `count` samples and at least `padding` seconds of zeros."""
+    """Length in samples of a fast transform of `count` samples with at least `padding` seconds of zeros."""
     needed = count + int(np.ceil(padding * rate))
     return 2 * int(np.asarray(next_fast_len((needed + 1) // 2)))
 
 
 def source_spectrum(skin: SoundingSkin, key: Array, envelope: Array, size: int, bins: int) -> Array:
-    """Transform (bins,) of white noise under `envelope`, filtered to the source's density.
+    """Fourier transform (bins,) of white noise multiplied by `envelope` and filtered to the spectral density of a
+    source.
 
-    Real noise of variance 1 has the density 2 / rate over its positive frequencies.
+    Real white noise of variance 1 has the density 2 / rate at positive frequencies.
     """
     white = jnp.fft.rfft(jax.random.normal(key, envelope.shape) * envelope, size)[:bins]
     return white * jnp.sqrt(source_density(skin, bin_frequencies(skin, size, bins)) * skin.rate / 2)
 
 
 def noise_spectrum(skin: SoundingSkin, key: Array, level: Array, size: int, bins: int) -> Array:
-    """Transform (M, bins) of noise of mean square `level` (M,), flat in the band.
+    """Fourier transform (M, bins) of noise with mean square `level` (M,) and a flat spectrum in the band.
 
-    Of a real signal of `size` samples, bin k > 0 with variance v_k adds 2 v_k / size² to the mean square.
+    In a real signal of `size` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square.
     """
     shape = band_filter(skin, bin_frequencies(skin, size, bins))
     variance = level[:, None] * shape / jnp.sum(shape) * size**2 / 2
@@ -66,24 +70,28 @@ def _noise_samples(skin, key, level, count, size, bins):
 
 
 def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> Float[np.ndarray, "M S"]:
-    """Simulate `count` samples (M, S) of the microphones' own noise."""
-    # Noise made from a spectrum repeats after `size` samples; a tail that is cut off parts its end from its beginning.
+    """Simulate `count` samples (M, S) of microphone noise."""
+    # Noise synthesised from a spectrum is periodic with period `size`. More samples than needed are generated, so that
+    # the last samples are independent of the first.
     size = transform_size(count, RINGING, skin.rate)
     return np.asarray(_noise_samples(skin, key, noise_power(skin), count, size, filled_bins(skin, size)))
 
 
 def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]:
-    """Sampling times of the first channel in `duration` seconds, (S,) s."""
+    """Sampling times (S,) of the first channel in seconds, for a recording of `duration` seconds."""
     return np.arange(max(2, round(duration * skin.rate))) / skin.rate
 
 
-# When the first burst begins, seconds: time for its ringing.
+# Time in seconds at which the first burst begins, which leaves room for the ringing of the filter.
 ONSET = 0.02
 
 
 class Burst(eqx.Module):
-    """Envelope of one tap: it rises fast and decays within `length` seconds, over which its root mean square is
-    `strength`. Raises `ValueError` for what is not positive."""
+    """Envelope of a tap, which rises fast and then decays.
+
+    **Fields**: `strength`: root mean square over `length`; `length`: duration in seconds. Raises `ValueError` for
+    values that are not positive.
+    """
 
     strength: float = 1.0
     length: float = 0.06
@@ -93,7 +101,7 @@ class Burst(eqx.Module):
         check_positive("length", self.length)
 
     def check_fits(self, duration: float) -> None:
-        """Raises `ValueError` unless a recording of `duration` seconds holds one burst."""
+        """Raises `ValueError` if a recording of `duration` seconds is too short for one burst."""
         check_positive("duration", duration)
         if duration < ONSET + self.length:
             raise ValueError(
@@ -104,23 +112,25 @@ class Burst(eqx.Module):
     def envelope(
         self, times: Float[np.ndarray, " S"], onsets: Float[np.ndarray, " N"], strengths: Float[np.ndarray, " N"]
     ) -> Float[np.ndarray, " S"]:
-        """Root mean square at `times` (s) of N bursts of this length that begin at `onsets` (s), with `strengths`.
+        """Root mean square (S,) at `times` in seconds of N bursts of this length, with the given `onsets` in seconds
+        and `strengths`.
 
-        A burst is t e^(-t / a), a = length / 6: risen in a sixth of `length`, at its end down to 4 %. Its square,
-        t² e^(-2t / a), integrates to a³ / 4: divided by `length`, that is the mean square to scale by.
+        The shape of a burst is t e^(-t / a) with a = length / 6. It reaches its maximum after a sixth of `length`, and
+        is 4 % of it at the end. The integral of its square is a³ / 4; divided by `length`, this is the mean square by
+        which the shape is normalised.
         """
         rise = self.length / 6
         after = np.maximum(times - onsets[:, None], 0)
         shape = after * np.exp(-after / rise) / np.sqrt(rise**3 / 4 / self.length)
-        # Bursts that overlap are independent noises: their powers add.
+        # Overlapping bursts are treated as independent noises, so their powers add.
         return np.sqrt(((strengths[:, None] * shape) ** 2).sum(axis=0))
 
 
 def check_burst(burst: Burst, duration: float) -> None:
-    """Raises `ValueError` for what is no `Burst`, and unless a recording of `duration` seconds holds one of it."""
+    """Raises `ValueError` if `burst` is not a `Burst`, or if a recording of `duration` seconds is too short for it."""
     check_kind("burst", burst, Burst, "a Burst, such as Burst(strength=2.0)")
     burst.check_fits(duration)
 
 
-# A vibrator with a rubber tip, the palm of a hand, and fingers that tickle.
+# Bursts of a vibrator with a rubber tip, of the palm of a hand, and of tickling fingers.
 VIBRATOR, FIRM, LIGHT = Burst(), Burst(2.0, 0.08), Burst(0.7, 0.04)

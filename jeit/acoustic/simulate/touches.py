@@ -1,6 +1,6 @@
-"""Simulated touches on an acoustic skin: taps, pats, tickles and strokes, with the true source beside the samples.
+"""Simulation of touches on an acoustic skin: taps, pats, tickles and strokes. Results include the true source.
 
-Every function takes an explicit key: the same key, the same samples.
+All functions take an explicit random key; the same key gives the same samples.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, recor
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import FIRM, LIGHT, ONSET, VIBRATOR, Burst, check_burst, sample_times
 
-# Friction turns force times speed into heat and sound: a stroke's power goes as its speed, its amplitude as the root.
+# Speed in m/s at which a stroke has its nominal strength. The power dissipated by friction is force times speed, so the
+# sound's power is taken as proportional to speed, and its amplitude to the square root of speed.
 NOMINAL_SPEED = 0.1
 
 
@@ -32,11 +33,12 @@ def tap(
     duration: float = 0.15,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate `repeats` of a `burst` at one `position` (2,), metres, at `frequency`, Hz, as by a vibrator with a
-    rubber tip.
+    """Simulate taps at one `position` (2,) in metres, as by a vibrator with a rubber tip.
 
-    `duration` of the recording in seconds, made longer where the bursts need it. `noise`: whether to add the
-    microphones' own. Raises `ValueError` for a position off the skin, and for what is not positive or does not fit.
+    `burst`: envelope of a tap. `repeats`: number of taps; `frequency`: taps per second. `duration`: duration of the
+    recording in seconds, extended if the taps take longer. `noise`: whether to add the microphones' noise. Raises
+    `ValueError` for a position outside the skin, for values that are not positive, and if `duration` is too short for
+    one tap.
     """
     check_skin_and_key(skin, key)
     check_positive("frequency", frequency)
@@ -60,7 +62,7 @@ def pat(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate a few firm taps of a hand at one `position` (2,), metres, `interval` seconds apart; see `tap`."""
+    """Simulate firm taps of a hand at one `position` (2,) in metres, `interval` seconds apart; see `tap`."""
     check_positive("interval", interval)
     repeated = {"repeats": taps, "frequency": 1 / interval}
     return tap(skin, key, position, burst=burst, **repeated, duration=duration, noise=noise)
@@ -77,11 +79,12 @@ def tickle(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate many light taps that wander around `position` (2,), metres, of random strength and rhythm.
+    """Simulate many light taps of random strength and rhythm near `position` (2,) in metres.
 
-    Each lands within `radius` metres of `position` (at the edge, on the skin), half way between a new place there and
-    the place before it. Strengths are log-normal about that of `burst` with standard deviation 0.3 in the logarithm,
-    the times random by a quarter of the interval. Raises `ValueError` as `tap` does.
+    Each tap is half way between the previous tap and a random position within `radius` metres of `position`; positions
+    outside the skin are moved to its edge. The strengths are log-normal with the median `burst.strength` and the
+    standard deviation 0.3 of the logarithm. Each tap is delayed by a random part of up to a quarter of the interval.
+    Raises `ValueError` as `tap` does.
     """
     check_skin_and_key(skin, key)
     middle = _place(skin, position)[0]
@@ -94,13 +97,13 @@ def tickle(
     onsets = ONSET + (np.arange(count) + 0.25 * np.asarray(jax.random.uniform(jitter, (count,)))) / taps_per_second
     strengths = burst.strength * np.exp(0.3 * np.asarray(jax.random.normal(loudness, (count,))))
     distance, angle = np.asarray(jax.random.uniform(where, (2, count)))
-    # The root spreads places evenly over the disc.
+    # The square root makes the positions uniform over the disc.
     offsets = (radius * np.sqrt(distance) * [np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)]).T
     for index in range(1, count):
         offsets[index] = (offsets[index - 1] + offsets[index]) / 2
     half = np.array([skin.layer.width, skin.layer.height]) / 2
     places = np.clip(middle + offsets, -half, half)
-    # From its onset on, the source is where that tap is.
+    # The source moves to the position of a tap at the onset of that tap.
     blocks = np.maximum(np.searchsorted(onsets, block_times(skin, len(times)) + HOP, side="right") - 1, 0)
     return record(skin, rest, places[blocks], burst.envelope(times, onsets, strengths), noise)
 
@@ -116,9 +119,9 @@ def stroke(
 ) -> SimulatedSound:
     """Simulate a finger that rubs along `path` for `duration` seconds.
 
-    `path`: corners (K, 2) of a line, metres, run along at even speed, or a function of times (N,) in seconds that gives
-    positions (N, 2). `strength`: root mean square at 0.1 m/s; it goes as the square root of the speed. Raises
-    `ValueError` for paths that leave the skin, or stand still.
+    `path`: vertices (K, 2) of a polyline in metres, traversed at constant speed; or a function that returns positions
+    (N, 2) in metres at times (N,) in seconds. `strength`: root mean square of the source at 0.1 m/s; it is proportional
+    to the square root of speed. Raises `ValueError` for paths that leave the skin or have no length.
     """
     check_skin_and_key(skin, key)
     check_positive("strength", strength)
@@ -131,7 +134,7 @@ def stroke(
     speed = np.linalg.norm(np.gradient(track, times, axis=0), axis=1)
     if not speed.any():
         raise ValueError("path: the finger stands still, which makes no sound. Give a path with some length, or a tap.")
-    # Fingers do not begin or end in a microsecond.
+    # The stroke fades in and out over 20 ms.
     ends = np.sin(np.pi / 2 * np.clip(np.minimum(times, duration - times) / 0.02, 0, 1))
     centres = block_times(skin, len(times))
     places = np.stack([np.interp(centres, times, axis) for axis in track.T], axis=-1)

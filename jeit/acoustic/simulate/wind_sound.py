@@ -1,4 +1,4 @@
-"""Simulated air noise: a jet that blows on a skin, and the sound of the surrounding room."""
+"""Simulation of airborne noise: an air jet that blows on a skin, and the sound of the surrounding room."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from jeit.acoustic.simulate.synthesis import (
     transform_size,
 )
 
-# Number of positions that a jet consists of, and of frequencies at which their sum is computed; it is smooth in
-# between.
+# Number of source positions in a jet, and number of frequencies at which their total power is computed. The power is
+# interpolated between these frequencies, where it is smooth.
 _PLACES, _FREQUENCIES = 64, 160
-# Kolmogorov's law of turbulence: the density of its energy falls as frequency to minus this.
+# Exponent of Kolmogorov's law of turbulence: the energy density is proportional to frequency to minus this power.
 TURBULENCE = 5 / 3
 
 
@@ -41,14 +41,15 @@ def wind(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate a steady jet of air about `position` (2,), metres, as of an air brush.
+    """Simulate a steady jet of air, such as from an air brush, at `position` (2,) in metres.
 
-    Eddies press at 64 places, normal about `position` with a deviation of `radius` metres, each a source of its own,
-    whose power density falls as frequency to minus `slope`; together their root mean square is `strength`. Eddies are
-    much smaller than the spacing of the microphones, and no two microphones receive the same ones: each microphone
-    receives the power that these positions give it, as independent noise. Loudness varies by `gusts`, the deviation of
-    its logarithm, within `gust_time` seconds. Raises `ValueError` for a position off the skin, and for what is not
-    positive.
+    Eddies act as independent sources at 64 random positions, normally distributed about `position` with the standard
+    deviation `radius` in metres. Their power spectral density is proportional to frequency to the power −`slope`, and
+    the root mean square of their sum is `strength`. Since eddies are much smaller than the spacing of the microphones,
+    the microphones receive independent noise, each with the total power that it receives from these positions. The
+    logarithm of the amplitude varies with the standard deviation `gusts` and the correlation time `gust_time` in
+    seconds. `noise`: whether to add the microphones' noise. Raises `ValueError` for a position outside the skin, and
+    for values out of range.
     """
     check_skin_and_key(skin, key)
     middle = skin.layer.check_inside("position", [position])[0]
@@ -60,9 +61,9 @@ def wind(
     half = np.array([skin.layer.width, skin.layer.height]) / 2
     places = np.clip(middle + radius * np.asarray(jax.random.normal(where, (_PLACES, 2))), -half, half)
     times = sample_times(skin, duration)
-    loud = np.exp(gusts * _wavering(gust, len(times), gust_time * skin.rate) - gusts**2)
+    loud = np.exp(gusts * _slow_noise(gust, len(times), gust_time * skin.rate) - gusts**2)
     density = _density(skin, slope, _received_power(skin, jnp.asarray(places), _grid(skin)))
-    samples = strength * loud * _coloured(skin, own, density, len(times))
+    samples = strength * loud * _coloured_noise(skin, own, density, len(times))
     if noise:
         samples = samples + microphone_noise(skin, rest, len(times))
     centres = block_times(skin, len(times))
@@ -73,10 +74,11 @@ def wind(
 def room_sound(
     skin: SoundingSkin, key: Array, *, level_db: float = 0.0, slope: float = 1.0, duration: float = 1.0
 ) -> SimulatedSound:
-    """Simulate the sound of a room: one signal received equally by all microphones, through air and mounting.
+    """Simulate the sound of a room: the same signal for all microphones, multiplied by their gains.
 
-    `level_db`: its power beside the nominal microphone's own noise, decibels; its density falls as frequency to minus
-    `slope`. Raises `ValueError` for a level that is not finite, a negative slope, and no duration.
+    `level_db`: its power relative to the noise of the nominal microphone, in decibels. `slope`: its power spectral
+    density is proportional to frequency to the power −`slope`. Raises `ValueError` for a level that is not finite, a
+    negative slope, and a duration that is not positive.
     """
     check_skin_and_key(skin, key)
     check_positive("duration", duration)
@@ -85,21 +87,21 @@ def room_sound(
         raise ValueError(f"level_db must be finite, in decibels; it is {level_db}.")
     times = sample_times(skin, duration)
     power = float(np.median(noise_power(skin) / np.asarray(skin.noise_factor))) * 10 ** (level_db / 10)
-    one = _coloured(skin, key, power * _density(skin, slope, np.ones((1, _FREQUENCIES))), len(times))
+    one = _coloured_noise(skin, key, power * _density(skin, slope, np.ones((1, _FREQUENCIES))), len(times))
     samples = np.asarray(skin.gain)[:, None] * one
     return SimulatedSound(samples, skin.rate, np.zeros((0, 2)), np.zeros(0), np.zeros(len(times)), False)
 
 
 def _grid(skin: SoundingSkin) -> Float[np.ndarray, " G"]:
-    """Frequencies over the band and half an octave beside it, Hz, evenly spaced in their logarithm."""
+    """Frequencies (G,) in Hz from half an octave below the band to half an octave above it, with equal ratios."""
     low, high = skin.readout.band
     return np.geomspace(low / np.sqrt(2), high * np.sqrt(2), _FREQUENCIES)
 
 
 @jax.jit
 def _received_power(skin: SoundingSkin, places: Array, frequencies: Array) -> Array:
-    """Power (M, G) received at each microphone from equal sources at all positions (P, 2), relative to that of the
-    sources."""
+    """Power (M, G) received by each microphone from equal sources at all positions (P, 2), divided by the total power
+    of the sources."""
     total = jnp.zeros((skin.microphones.shape[0], len(frequencies)))
 
     def add(index, total):
@@ -109,30 +111,31 @@ def _received_power(skin: SoundingSkin, places: Array, frequencies: Array) -> Ar
 
 
 def _density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.ndarray, "M G"]:
-    """Power densities, 1/Hz, received from sources of mean square 1 with the relative powers `received` (M, G)."""
+    """Power spectral densities (M, G) at the microphones, in 1/Hz, for sources of total mean square 1. `received` (M,
+    G): received power divided by source power."""
     grid = _grid(skin)
     shape = np.asarray(band_filter(skin, jnp.asarray(grid))) * (grid / grid[0]) ** -slope
     return np.asarray(received) * shape / np.trapezoid(shape, grid)
 
 
-def _coloured(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "M G"], count: int) -> np.ndarray:
-    """Simulate `count` samples (M, S) of independent noises of these densities."""
+def _coloured_noise(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "M G"], count: int) -> np.ndarray:
+    """Simulate `count` samples (M, S) of independent noises with the power spectral densities `density`."""
     size = transform_size(count, RINGING, skin.rate)
     bins = filled_bins(skin, size)
     frequencies = np.asarray(bin_frequencies(skin, size, bins))
     grid = _grid(skin)
-    # Of a real signal of `size` samples, bin k > 0 with variance v_k adds 2 v_k / size² to the mean square.
+    # In a real signal of `size` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square.
     variance = np.stack([np.interp(frequencies, grid, one, left=0.0, right=0.0) for one in density])
     draws = np.asarray(jax.random.normal(key, (2, len(density), bins)))
     spectrum = np.sqrt(variance * skin.rate * size / 4) * (draws[0] + 1j * draws[1])
     return np.fft.irfft(spectrum, size)[:, :count]
 
 
-def _wavering(key: Array, count: int, correlated: float) -> Float[np.ndarray, " S"]:
-    """Slow normal noise (S,) of variance 1, correlated over `correlated` samples."""
+def _slow_noise(key: Array, count: int, correlated: float) -> Float[np.ndarray, " S"]:
+    """Slowly varying normal noise (S,) of variance 1, with a correlation length of `correlated` samples."""
     knots = int(np.ceil(count / correlated)) + 3
     values = np.asarray(jax.random.normal(key, (knots,)))
-    # Between knots weights are the sine and cosine of one angle: the variance is 1 everywhere.
+    # The interpolation weights are the cosine and sine of the same angle, so the variance is 1 everywhere.
     at = np.arange(count) / correlated
     first = at.astype(int)
     angle = np.pi / 2 * (at - first)

@@ -1,1 +1,1 @@
-"""One file for each command: it parses, calls, and prints."""
+"""Commands, one file each: a command parses its options, calls functions of jeit, and prints the results."""

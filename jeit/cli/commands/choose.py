@@ -1,4 +1,4 @@
-"""`jeit choose`: the hyperparameter that every rule chooses for a measured file, and the images for them."""
+"""`jeit choose`: comparison of the rules for the hyperparameter on a measured file, with the image of each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`jeit demo`: a press on a simulated skin, imaged; needs no data."""
+"""`jeit demo`: simulate a press on a skin and image it; needs no data."""
 
 from __future__ import annotations
 

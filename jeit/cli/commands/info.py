@@ -9,7 +9,7 @@ import typer
 
 from jeit.cli.options import Description, Format, read_file
 
-# Names of solids on an outline, and of their sizes where a description uses other words for them.
+# Solids with a given outline: their name, and the words of a description for their sizes if they differ.
 _SOLIDS = {
     "rectangle": ("box", {"height": "depth", "thickness": "height"}),
     "disk": ("cylinder", {"thickness": "height"}),

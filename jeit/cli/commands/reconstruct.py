@@ -1,4 +1,4 @@
-"""`jeit reconstruct`: a measured file in; a picture, arrays and a report out."""
+"""`jeit reconstruct`: image a measured file, and write a picture, arrays and a report."""
 
 from __future__ import annotations
 
@@ -242,6 +242,6 @@ def _which(result: "ImagedDifference", asked: bool) -> str:
     said += f"{result.frame} of {result.num_frames}"
     if asked:
         return said
-    # Frames with names are of different things, whose mean is not useful.
+    # Named frames usually show different objects, so that their mean is not useful.
     mean = "" if names else ', or their mean: frames = "mean" in [data] of the description'
     return f"{said}, from 0; --frame takes another{mean}"

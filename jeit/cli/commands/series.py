@@ -1,4 +1,4 @@
-"""`jeit series`: images of every frame of a recording at once; curves of regions over time, and maps of
+"""`jeit series`: image all frames of a recording at once, with curves of regions over time and maps of
 oscillations."""
 
 from __future__ import annotations

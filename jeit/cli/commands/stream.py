@@ -1,4 +1,4 @@
-"""`jeit stream`: frame after frame to images, from a file or from standard input."""
+"""`jeit stream`: image frame by frame, from a file or from standard input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`jeit view`: look at an image that jeit wrote, turned and cut with the mouse, or in pictures from several sides."""
+"""`jeit view`: view a saved image in an interactive window, or write pictures of it from several sides."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Readers of measured data, one module for each file format: published data sets, instruments, and plain tables.
+"""Readers of measured data, one module per file format: published data sets, instruments, and plain tables.
 
-Files of instruments do not say where electrodes are: a description beside them (`[geometry]`, `[electrodes]`) does.
-What is not published of them, such as the scale of the numbers, is stated in a note of the measurement.
+Files of instruments do not state the positions of the electrodes; a description beside them (`[geometry]`,
+`[electrodes]`) does. Properties of a format that are not published, such as the scale of the voltages, are stated in
+the notes of the measurement.
 """

@@ -1,7 +1,7 @@
-"""MATLAB files: variables of numbers, with errors that a person can act on.
+"""Reader of numeric variables in MATLAB files, with error messages that tell the user what to do.
 
-Format 5 ("MAT-File Format" by The MathWorks) is read here, arrays of numbers alone: nothing is unpacked that is larger
-than the file says before, and SciPy's reader can be brought down by files that are made for it.
+Numeric arrays of format 5 ("MAT-File Format" by The MathWorks) are decoded here instead of by SciPy, whose reader can
+be crashed by crafted files. Nothing is decompressed beyond the size that the file declares.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ import scipy.io
 from jeit.arguments import listed
 from jeit.files import check_memory, read_as
 
-# Bytes of the header, and of an element's beginning that holds flags, shape and name; types of elements.
+# Length in bytes of the file header, and of the beginning of an element, which holds flags, shape and name; type
+# numbers of elements.
 _HEADER, _BEGINNING = 128, 4096
 _MATRIX, _COMPRESSED = 14, 15
-# Classes of arrays by the file's number: sparse ones, and those of numbers with their types.
+# Class numbers of arrays in the file: of sparse arrays, and of numeric arrays with their NumPy types.
 _SPARSE = 5
 _NUMERIC = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
-# Types in which numbers are stored; the flag of complex ones.
+# NumPy types of stored numbers by their type number in the file; flag of complex arrays.
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _COMPLEX = 0x800
-# Greatest number of bytes of a number in memory, and of everything else in an element.
+# Maximum number of bytes of one number in memory, and of everything else in an element.
 _BYTES, _BESIDE = 16, 2**16
 
 
@@ -37,14 +38,14 @@ class _Variable(NamedTuple):
     shape: tuple[int, ...]
     kind: int
     complex: bool
-    begin: int  # where its numbers do, in what is said of it
-    content: bytes  # of the element in the file, without its tag
+    begin: int  # where the numbers begin in the uncompressed element
+    content: bytes  # the element as stored in the file, without its tag
     packed: bool
-    order: str  # of bytes: "<" or ">"
+    order: str  # byte order: "<" or ">"
 
     @property
     def size(self) -> int:
-        """Bytes of its numbers at most, as it says."""
+        """Maximum memory of the variable in bytes, from its declared shape."""
         return _BYTES * math.prod(self.shape)
 
 
@@ -57,13 +58,13 @@ def variable_names(path: Path) -> set[str]:
 
 
 def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
-    """Load those of the variables `wanted` that hold numbers, by name, sparse matrices made dense, and under "" the
-    names of all variables. Other variables are not unpacked.
+    """Read the numeric ones of the variables `wanted`, by name. Sparse matrices are converted to dense arrays; the key
+    "" holds the names of all variables in the file. Other variables are not unpacked.
 
-    Raises `ValueError` when it cannot be read, and for what would not fit in memory (`check_memory`).
+    Raises `ValueError` if the file cannot be read, and if the variables would not fit in memory (`check_memory`).
     """
     if _is_format_4(path):
-        with read_as(_unreadable(path)):  # never compressed: of no more numbers than bytes
+        with read_as(_unreadable(path)):  # format 4 is never compressed, so it holds fewer numbers than bytes
             read = scipy.io.loadmat(str(path), variable_names=list(wanted), spmatrix=False)
         return {"": np.array(sorted(variable_names(path)), dtype=str)} | _plain(read, wanted)
     held = _variables(path)
@@ -75,7 +76,7 @@ def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
 
 
 def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
-    """The numeric variable `key`. Raises `ValueError` when it is missing or not numeric."""
+    """The numeric variable `key`. Raises `ValueError` if it is missing or not numeric."""
     if key not in content and key in content[""]:
         raise ValueError(f"{path.name}: variable '{key}' holds other things, not numbers.")
     if key not in content:
@@ -87,7 +88,7 @@ def numbers(content: dict[str, np.ndarray], key: str, path: Path) -> np.ndarray:
 
 
 def _plain(read: dict, wanted: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Arrays of variables that SciPy read from a file of format 4, sparse ones made dense."""
+    """Arrays that SciPy read from a file of format 4, with sparse matrices converted to dense arrays."""
     found = {name: read[name] for name in wanted if name in read}
     return {name: value.toarray() if hasattr(value, "toarray") else value for name, value in found.items()}
 
@@ -97,14 +98,15 @@ def _unreadable(path: Path) -> str:
 
 
 def _is_format_4(path: Path) -> bool:
-    """Format 4 begins with a number below 5,000; others with text. Raises `TooLarge`."""
+    """Whether a file is of format 4, which begins with a number below 5,000, where other formats begin with text.
+    Raises `TooLarge`."""
     check_memory(path.name, path.stat().st_size)
     with path.open("rb") as file:
         return 0 in file.read(4)
 
 
 def _variables(path: Path) -> list[_Variable]:
-    """Headers of the variables of a file of format 5. Raises `ValueError` for others."""
+    """Headers of the variables in a file of format 5. Raises `ValueError` for other formats."""
     content = path.read_bytes()
     if len(content) >= _HEADER and (content[:8] == b"\x89HDF\r\n\x1a\n" or 2 in content[124:126]):
         raise ValueError(
@@ -115,7 +117,7 @@ def _variables(path: Path) -> list[_Variable]:
 
 
 def _elements(content: bytes) -> Iterator[_Variable]:
-    """Arrays of the file, one after the other; of packed ones the beginning is unpacked."""
+    """Headers of the arrays in the file, in their order; of compressed arrays only the beginning is decompressed."""
     if len(content) < _HEADER or content[126:128] not in (b"IM", b"MI"):
         raise ValueError("it is of another kind")
     order = "<" if content[126:128] == b"IM" else ">"
@@ -137,7 +139,8 @@ def _elements(content: bytes) -> Iterator[_Variable]:
 
 
 def _header(beginning: bytes, order: str) -> tuple[str, tuple[int, ...], int, bool, int]:
-    """Name, shape, class, whether complex, and where numbers begin, of an array's first three sub-elements."""
+    """Name, shape, class, whether complex, and offset of the numbers, read from the first three sub-elements of an
+    array."""
     _, flags, place = _part(beginning, 0, order)
     _, shape, place = _part(beginning, place, order)
     _, name, place = _part(beginning, place, order)
@@ -149,7 +152,8 @@ def _header(beginning: bytes, order: str) -> tuple[str, tuple[int, ...], int, bo
 
 
 def _part(content: bytes, place: int, order: str) -> tuple[int, bytes, int]:
-    """Type and bytes of a sub-element, and where the next begins; those of four bytes and less lie in their own tag."""
+    """Type and bytes of a sub-element, and the offset of the next one. Sub-elements of four bytes or less are stored
+    inside their own tag."""
     kind = struct.unpack_from(f"{order}I", content, place)[0]
     if kind >> 16:
         kind, size, start, after = kind & 0xFFFF, kind >> 16, place + 4, place + 8
@@ -162,7 +166,7 @@ def _part(content: bytes, place: int, order: str) -> tuple[int, bytes, int]:
 
 
 def _numbers(content: bytes, place: int, order: str) -> tuple[np.ndarray, int]:
-    """Numbers of a sub-element, and the place where the next begins."""
+    """Numbers of a sub-element, and the offset of the next one."""
     kind, stored, place = _part(content, place, order)
     if kind not in _STORED:
         raise ValueError(f"an array of it is stored as type {kind}")
@@ -170,7 +174,7 @@ def _numbers(content: bytes, place: int, order: str) -> tuple[np.ndarray, int]:
 
 
 def _values(variable: _Variable) -> np.ndarray:
-    """The numbers of a variable in its shape; those of a sparse one too."""
+    """The numbers of a variable as an array of its shape; sparse matrices are converted to dense arrays."""
     content, place, order = _unpacked(variable), variable.begin, variable.order
     rows = starts = None
     if variable.kind == _SPARSE:
@@ -189,7 +193,8 @@ def _values(variable: _Variable) -> np.ndarray:
 
 
 def _unpacked(variable: _Variable) -> bytes:
-    """An element without its tag and compression: no larger than it says."""
+    """Content of an element without its tag, decompressed. Raises `ValueError` if it is larger than its shape
+    implies."""
     if not variable.packed:
         return variable.content
     most = variable.size + _BESIDE

@@ -1,9 +1,9 @@
-"""Reader of Carefusion's Goe-MF II recordings (.eit): XML in UTF-16, then segments.
+"""Reader of recordings by Carefusion's Goe-MF II (.eit): XML in UTF-16, followed by binary segments.
 
-`<Header>N bytes</Header>` says where segments begin. Each has six integers of four bytes (little-endian): its type, a
-channel, the number of its frame from 0, the bytes of an item, how many items, and one that is not known; then the
-items. Type 3 holds a frame of 256 numbers of four bytes, of which those from the 48th on are the 208 adjacent voltages;
-type 7 an image of 912; others are waves.
+`<Header>N bytes</Header>` gives the offset of the first segment. A segment begins with six little-endian integers of
+four bytes: its type, a channel, the number of its frame from 0, the bytes per item, the number of items, and one of
+unknown meaning; the items follow. Type 3 is a frame of 256 numbers of four bytes, of which the 208 from the 48th on are
+the adjacent voltages; type 7 is an image of 912 numbers; other types are waveforms.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from jeit.data.measurement import Measurement
 
 DESCRIPTION = "Carefusion Goe-MF II (.eit): 208 adjacent voltages a frame"
 _ORDER, _MARK, _LOOKED_AT = b"\xff\xfe", "<EIT_File>", 512
-# Integers before the items of a segment; types, and how many numbers of four bytes those of fixed length have.
+# Number of integers before the items of a segment; the two segment types of fixed length, and their lengths in numbers
+# of four bytes.
 _HEAD, _VOLTAGES, _IMAGE = 6, 3, 7
 _NUMBERS = {_VOLTAGES: 256, _IMAGE: 912}
 _FIRST = 47
@@ -34,7 +35,7 @@ _NO_RATE = "the file says no rate that is known; give it by [data] frame_rate."
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file that begins as this XML does."""
+    """True for an .eit file that begins with the XML of this format."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
@@ -42,7 +43,8 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read all frames. Raises `ValueError` for a header that does not say its length, and for no whole frame."""
+    """Read all frames. Raises `ValueError` if the header does not state its length, and if there is no complete
+    frame."""
     content = content_of(path)
     found = re.search(r"<Header>\s{0,9}([0-9]{1,9}) bytes</Header>", _text(content[:_LOOKED_AT]))
     if found is None or not _LOOKED_AT // 8 < int(found[1]) < len(content):
@@ -61,7 +63,7 @@ def _text(content: bytes) -> str:
 
 
 def _frames(content: bytes, start: int) -> tuple[list[np.ndarray], int]:
-    """The voltages of every frame, and how many bytes of a last segment are there without its end."""
+    """Voltages of every complete frame, and number of bytes left over by a truncated last segment."""
     frames, place = [], start
     while place + 4 * _HEAD <= len(content):
         kind, _, _, size, number, _ = (int(one) for one in np.frombuffer(content, "<i4", _HEAD, place))

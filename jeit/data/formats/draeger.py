@@ -1,9 +1,10 @@
-"""Reader of Dräger PulmoVista 500 recordings (.eit): a header of text, then frames of equal size.
+"""Reader of recordings by Dräger's PulmoVista 500 (.eit): a text header, followed by frames of equal size.
 
-Bytes 0-3 are the format's version, 4-7 the length of the header's text, after which frames begin at byte 16 + that
-(little-endian). The text says "Framerate [Hz]:". A frame of version 50 and later has 5,495 bytes, of version 32 5,200:
-it begins with 600 numbers of eight bytes, of which the first 208 and those from 322 on are the two parts of the
-adjacent voltages. Their weights are no more than estimated, by users.
+Numbers are little-endian. Bytes 0-3 are the version of the format and bytes 4-7 the length of the header text; frames
+begin at byte 16 + this length. The text states the frame rate as "Framerate [Hz]:". A frame of version 50 and later has
+5,495 bytes, one of version 32 has 5,200. It begins with 600 numbers of eight bytes, of which the first 208 and the 208
+from number 322 on are the two parts of the adjacent voltages. The weights of the two parts are not published, but
+estimates by users.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ from jeit.data.formats.recording import (
 from jeit.data.measurement import Measurement
 
 DESCRIPTION = "Dräger PulmoVista (.eit): 208 adjacent voltages a frame, with their rate"
-# Bytes of a frame by the format's version; those of version 31 are too short for what is known of the others.
+# Bytes per frame for each version of the format. Frames of version 31 are too short for the known layout.
 _FRAME = {0x20: 5200, 0x33: 5495}
 _MARK, _BEFORE = b"---Draeger EIT-Software", 16
-# The first of the second parts, and the weights of both.
+# Index of the first number of the second part, and the weights of both parts.
 _SECOND, _WEIGHTS = 322, (9.8242e-4, 1.9607e-4)
 _NOTES = (
     "the scale of the voltages is an estimate, not published: trust relative changes, not volts.",
@@ -37,7 +38,7 @@ _NOTES = (
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file that names its software in the first bytes."""
+    """True for an .eit file whose first bytes name Dräger's software."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
@@ -45,7 +46,8 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read all frames. Raises `ValueError` for an unknown version, no whole frame, and a header without a rate."""
+    """Read all frames. Raises `ValueError` for an unknown version, a file without a complete frame, and a header
+    without a rate."""
     content = content_of(path)
     version, length = (int(one) for one in np.frombuffer(content[:8].ljust(8, b"\0"), "<i4"))
     if version not in _FRAME:
@@ -64,7 +66,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def _rate(header: bytes, path: Path) -> float:
-    """Frames in a second."""
+    """Frame rate in frames per second."""
     found = re.search(rb"Framerate \[Hz\]:[ \t]{0,40}([0-9]{1,6}(?:[.,][0-9]{1,6})?)", header)
     rate = 0.0 if found is None else float(found[1].replace(b",", b"."))
     if not rate > 0:

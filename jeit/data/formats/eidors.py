@@ -1,8 +1,8 @@
 """Reader of EIDORS-style voltage vectors in a .mat file.
 
-The pattern comes with the file (`stim`, `meas`, `meas_stim`), or from the `[protocol]` of a description. Note
-for the latter: EIDORS drives -I at the first electrode of a pair and +I at the second and measures first
-minus second, so that adjacent data come out positive; say `polarity = "reversed"`.
+The protocol is stored in the file (`stim`, `meas`, `meas_stim`), or given by `[protocol]` of a description. For a
+description, note that EIDORS drives -I at the first electrode of a pair and +I at the second, and measures first minus
+second, so that adjacent data are positive: set `polarity = "reversed"`.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from jeit.protocol import Protocol, from_channels
 
 DESCRIPTION = "EIDORS-style vectors (.mat with stim, meas, meas_stim, or any with a TOML description)"
 PATTERN = ("stim", "meas", "meas_stim")
-# Names under which homogeneous (reference) and inhomogeneous vectors are usually saved.
+# Usual names of the homogeneous (reference) vectors and of the inhomogeneous vectors.
 REFERENCE_NAMES = ("v_h", "vh")
 OBJECT_NAMES = ("v_i", "vi")
 
 
 def recognises(path: Path) -> bool:
-    """True for a .mat file that holds its stimulation and measurement patterns."""
+    """True for a .mat file that holds stimulation and measurement patterns."""
     return path.suffix.lower() == ".mat" and set(PATTERN) <= _matlab.variable_names(path)
 
 
 def find_description(path: Path) -> Path | None:
-    """The description beside a file: of its name, or `description.toml` in its folder unless the file describes itself;
-    None where there is none."""
+    """The description beside a file, or None: a TOML file of the same name, or `description.toml` in the same folder if
+    the file holds no patterns of its own."""
     beside, common = path.with_suffix(".toml"), path.parent / "description.toml"
     if beside.is_file():
         return beside
@@ -42,13 +42,11 @@ def find_description(path: Path) -> Path | None:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read the vectors named by the description's `[data] keys`, or else those named vh, vi, v_h, v_i.
+    """Read the vectors named by `[data] keys` of the description, or by default the variables vh, vi, v_h, v_i.
 
-    A file with `stim` (L, S) amperes, `meas` (M, L) and `meas_stim` (M,), 1-based, describes its own
-    protocol.
+    A file with `stim` (L, S) in amperes, `meas` (M, L) and `meas_stim` (M,), counted from 1, defines its own protocol.
 
-    Raises `ValueError` when neither file nor description says what was driven and measured, or no vector is
-    found.
+    Raises `ValueError` if neither the file nor a description defines the protocol, or if no vector is found.
     """
     which = description if description is not None else find_description(path)
     described = parse_description({}, path.name) if which is None else load_description(which)
@@ -60,7 +58,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
             raise ValueError(f"{path.name}: [data] keys names {len(vectors)} arrays; give one, of all frames.")
         table = frames_of(vectors[0], described.layout.axes, path.name)
     elif len(vectors) == 1:
-        # A vector is one frame however it lies; a matrix holds a frame per column, as EIDORS stores them.
+        # A vector is one frame, whether a row or a column; a matrix holds one frame per column, as in EIDORS.
         table = vectors[0].reshape(1, -1) if 1 in vectors[0].shape else vectors[0].T
     else:
         lengths = {vector.size for vector in vectors}

@@ -1,9 +1,11 @@
-"""Reader of Göttingen's MCEIT recordings (.get; Goe-MF II, Viasys, Carefusion, and Dräger's before 2007).
+"""Reader of Göttingen's MCEIT recordings (.get), written by Goe-MF II, Viasys, Carefusion, and Dräger's systems before
+2007.
 
-Frames of 256 numbers of four bytes (little-endian), without a header, of which 208 are the adjacent voltages, then 16
-currents, 16 voltages of the drives and 16 auxiliary inputs. Dräger's put a text before them, which ends with two empty
-lines. A system that leaves out what reciprocity repeats writes zeros there. The record of a measurement, a text of the
-same name with the ending .prl, says the frame rate, as "Framerate = 13 per second".
+A file consists of frames of 256 little-endian numbers of four bytes, without a header: 208 adjacent voltages, then 16
+currents, 16 voltages of the drives and 16 auxiliary inputs. Dräger's systems write a text before the frames, which ends
+with two empty lines. Systems that do not measure channels which reciprocity makes redundant write zeros there. The
+frame rate is stated in the record of the measurement, a text file of the same name with the suffix .prl, as "Framerate
+= 13 per second".
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from jeit.data.formats.recording import (
 from jeit.data.measurement import Measurement
 
 DESCRIPTION = "Göttingen MCEIT (.get): 208 adjacent voltages a frame"
-# Bytes of a frame; and how Dräger's text begins and ends, within how many bytes.
+# Bytes per frame; the beginning and the end of Dräger's text, and its maximum length in bytes.
 _FRAME, _MARK, _END, _LONGEST = 1024, b"---Draeger EIT-Software", b"\r\n\r\n\r\n", 65536
 _NOTE = "neither unit nor gain of the voltages is known: trust relative changes, not volts."
 _NO_RATE = "the file says no rate, nor a record beside it (.prl); give it by [data] frame_rate."
@@ -38,7 +40,7 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read all frames. Raises `ValueError` for no whole frame, and where nothing in it is a voltage."""
+    """Read all frames. Raises `ValueError` for a file without a complete frame or without any voltage."""
     content, start = content_of(path), 0
     if content.startswith(_MARK):
         end = content.find(_END, 0, _LONGEST)
@@ -54,7 +56,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def _recorded_rate(path: Path) -> float | None:
-    """Frames a second, from the record beside a file; None where there is none, or it does not say."""
+    """Frame rate in frames per second from the record beside a file; None if there is no record, or no rate in it."""
     for ending in (".prl", ".PRL"):
         record = path.with_suffix(ending)
         if record.is_file():

@@ -15,12 +15,12 @@ from jeit.protocol import from_matrices
 DESCRIPTION = "KIT4 tank archive (.mat with Uel, CurrentPattern, MeasPattern)"
 RADIUS = 0.14
 ELECTRODE_WIDTH = 0.025
-# A starting value for calibration, ohm·m: the empty tank fits about 1e-4 m over 1.3 mS.
+# Initial value for calibration, in ohm·m: the empty tank fits about 1e-4 m / 1.3 mS.
 CONTACT_IMPEDANCE = 0.08
 
 
 def recognises(path: Path) -> bool:
-    """True for a .mat file with the archive's three variables."""
+    """True for a .mat file with the three variables of the archive."""
     names = {"Uel", "CurrentPattern", "MeasPattern"}
     return path.suffix.lower() == ".mat" and names <= _matlab.variable_names(path)
 
@@ -28,9 +28,9 @@ def recognises(path: Path) -> bool:
 def read(path: Path) -> Measurement:
     """Read one file of the archive: one frame of 79 drives × 16 cyclic differences = 1,264 channels.
 
-    Channels go drive by drive. The 16 differences of a drive sum to zero, so 15 are independent; all are kept, with
-    those that touch driven electrodes (`Measurement.without_driven_channels` masks these). The tank is 0.14 m in
-    radius, electrode 1 at 12 o'clock, then clockwise.
+    Channels are ordered drive by drive. The 16 differences of a drive sum to zero, so 15 are independent; all are kept,
+    including those on driven electrodes (`Measurement.without_driven_channels` masks these). The tank has a radius of
+    0.14 m; electrode 1 is at 12 o'clock, and the others follow clockwise.
 
     Raises `ValueError` for a file of another shape.
     """

@@ -17,12 +17,12 @@ from jeit.protocol import from_matrices
 DESCRIPTION = "Kuopio Tomography Challenge 2023 (.mat with Mpat, and Inj and Uel or Injref and Uelref)"
 RADIUS = 0.115
 ELECTRODE_ANGLE = np.radians(5.625)
-# A starting value for calibration, ohm·m: the empty tank fits nearly none.
+# Initial value for calibration, in ohm·m. The empty tank fits a contact impedance of nearly zero.
 CONTACT_IMPEDANCE = 0.01
 
 
 def recognises(path: Path) -> bool:
-    """True for a .mat file with the challenge's variables."""
+    """True for a .mat file with the variables of the challenge."""
     if path.suffix.lower() != ".mat":
         return False
     names = _matlab.variable_names(path)
@@ -30,11 +30,11 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path) -> Measurement:
-    """Read one file: one frame of 76 drives × 31 neighbour differences = 2,356 channels, drive by drive.
+    """Read one file: one frame of 76 drives × 31 differences of neighbours = 2,356 channels, ordered drive by drive.
 
-    NaN entries (missing electrodes of the harder levels) become the mask. The tank is 0.115 m in radius, 32
-    electrodes of 5.625°, electrode 1 at 12 o'clock, then counter-clockwise. Currents are the recorded
-    amplitudes, drive by drive.
+    NaN entries (electrodes missing in the harder levels) are masked. The tank has a radius of 0.115 m and 32 electrodes
+    of 5.625°; electrode 1 is at 12 o'clock, and the others follow counter-clockwise. The current of each drive is its
+    recorded amplitude.
 
     Raises `ValueError` for a file of another shape.
     """

@@ -1,9 +1,8 @@
-"""A measurement from an instrument's file and, where there is one, a description of the body.
+"""Conversion of the content of an instrument's file to a measurement, with a description of the body if there is one.
 
-The frame of 16 electrodes that the Göttingen, Dräger and Carefusion systems have: 208 adjacent voltages.
-
-Drive 1-2 is read at 3-4, 4-5, … 15-16; drive 2-3 at 4-5, … 16-1; and so on. Voltages are read in the sense that makes
-them positive on every body: the opposite of `jeit.protocol.adjacent`'s.
+The systems of Göttingen, Dräger and Carefusion share one frame of 16 electrodes: 208 adjacent voltages. Drive 1-2 is
+measured at 3-4, 4-5, … 15-16; drive 2-3 at 4-5, … 16-1; and so on. The sign of the voltages is chosen so that they are
+positive on every body, opposite to that of `jeit.protocol.adjacent`.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from jeit.data.measurement import Measurement
 from jeit.files import check_memory
 from jeit.protocol import Protocol, adjacent
 
-# Bytes in memory for one of the file, at most: numbers of half the length, twice.
+# Maximum bytes of memory per byte of the file: two copies, with numbers twice as long as in the file.
 _IN_MEMORY = 4
 
 
@@ -28,8 +27,9 @@ _IN_MEMORY = 4
 class Recording:
     """Content of an instrument's file.
 
-    - `voltages` (F, M), real or complex; `protocol` of M channels; `usable` (M,), None for all.
-    - `times` (F,) seconds, or None; `frame_names`, empty or one a frame; `notes`: what the format leaves open.
+    - `voltages`: (F, M), real or complex; `protocol`: protocol of the M channels; `usable`: (M,) mask, None if all
+      channels are usable.
+    - `times`: (F,) seconds, or None; `frame_names`: one name per frame, or empty; `notes`: what the format leaves open.
     """
 
     voltages: Inexact[np.ndarray, "F M"]
@@ -41,21 +41,23 @@ class Recording:
 
 
 def content_of(path: Path) -> bytes:
-    """Content of a file whose size fits in memory. Raises `TooLarge`."""
+    """Content of a file. Raises `TooLarge` if it would not fit in memory."""
     check_memory(path.name, _IN_MEMORY * path.stat().st_size)
     return path.read_bytes()
 
 
 def description_of(path: Path, description: str | Path | None) -> Description:
-    """The description given, or the one beside the file, or none. Raises `ValueError`."""
+    """The description given, else the one beside the file, else an empty one. Raises `ValueError` if it is not
+    valid."""
     which = find_description(path) if description is None else description
     return parse_description({}, path.name) if which is None else load_description(which)
 
 
 def measurement_of(path: Path, recording: Recording, described: Description) -> Measurement:
-    """A recording as a measurement of the body described; its protocol, times and names unless those are described.
+    """Convert a recording to a measurement of the body described. Protocol, times and frame names of the description
+    take precedence over those of the recording.
 
-    Raises `ValueError` where protocol and channels, or names and frames, do not fit.
+    Raises `ValueError` if protocol and channels, or names and frames, do not match.
     """
     layout = described.layout
     notes = (*recording.notes, *part_of(recording.voltages, layout))
@@ -63,7 +65,7 @@ def measurement_of(path: Path, recording: Recording, described: Description) -> 
     if recording.frame_names and not layout.frame_names:
         layout = replace(layout, frame_names=recording.frame_names)
     described = replace(described, layout=layout, notes=(*described.notes, *notes))
-    # Currents that lie in the file are those that it is read with.
+    # Current patterns in the file have already been read as part of the recording.
     own = described.protocol_section is None or described.patterns_measured
     frames = frames_from(recording.voltages, layout, path.name)
     mask = None if recording.usable is None or not own else recording.usable
@@ -77,9 +79,9 @@ def measurement_of(path: Path, recording: Recording, described: Description) -> 
 
 
 def frame_at(content: bytes, start: int, size: int, path: Path) -> tuple[int, int]:
-    """Number of whole frames of `size` bytes that follow `start`, and number of bytes left over.
+    """Number of complete frames of `size` bytes after byte `start`, and number of bytes left over.
 
-    Raises `ValueError` where there is none.
+    Raises `ValueError` if there is no complete frame.
     """
     if not 0 <= start <= len(content):
         raise ValueError(f"{path.name}: its header says that frames begin at byte {start}, beyond its end.")
@@ -90,12 +92,12 @@ def frame_at(content: bytes, start: int, size: int, path: Path) -> tuple[int, in
 
 
 def cut_off(left: int) -> tuple[str, ...]:
-    """A note on bytes that are left over after the last frame."""
+    """A note about `left` bytes after the last complete frame; empty for none."""
     return (f"the last frame is cut off, and left out ({left} bytes).",) if left else ()
 
 
 CHANNELS = 208
-# Amperes; what all of these systems are said to drive at most.
+# Amperes: the maximum drive current stated for all of these systems.
 _CURRENT = 5e-3
 _CURRENT_NOTE = "a current of 5 mA is assumed; the file does not say it."
 
@@ -103,10 +105,11 @@ _CURRENT_NOTE = "a current of 5 mA is assumed; the file does not say it."
 def adjacent_recording(
     values: Float[np.ndarray, "F 208"], times: Float[np.ndarray, " F"] | None, notes: tuple[str, ...]
 ) -> Recording:
-    """Recording of positive voltages in that order. Channels that are zero in every frame were not measured."""
+    """Recording of positive adjacent voltages in the channel order of these systems. Channels that are zero in every
+    frame are marked as not measured."""
     usable = (values != 0).any(axis=0)
     if not usable.all() and usable.any():
         notes = (*notes, f"{int((~usable).sum())} of {CHANNELS} channels were not measured (zero in every frame).")
-    with np.errstate(invalid="ignore"):  # a NaN of four bytes may be a signal
+    with np.errstate(invalid="ignore"):  # a signalling NaN of single precision would warn
         voltages = -values.astype(float)
     return Recording(voltages, adjacent(16, current=_CURRENT), usable, times, notes=(*notes, _CURRENT_NOTE))

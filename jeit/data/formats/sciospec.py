@@ -1,11 +1,11 @@
-"""Reader of Sciospec EIT recordings (.eit): text, a file for every frame.
+"""Reader of Sciospec EIT recordings (.eit): text files, one per frame.
 
-The first line says how many lines the header has; then come, a line each, the format's version (where there are 11
-lines or more), the setup's name, date and time, the lowest and the highest frequency (hertz), whether they are spaced
-by logarithms (1) or evenly (0), how many, the current (amperes), and the frame rate. Later lines may list channels,
-"MeasurementChannels: 1,2,3". Then, for every injection, a line with its two electrodes, and a line for each frequency:
-real and imaginary part of the potential at every channel. Whether currents are peak or root mean square the file does
-not say.
+The first line states the number of header lines. The following lines give, one value per line: the version of the
+format (in headers of at least 11 lines), the name of the setup, date and time, the lowest and the highest frequency
+(hertz), their spacing (1: logarithmic, 0: linear), the number of frequencies, the current (amperes), and the frame
+rate. Later lines may list channels, as "MeasurementChannels: 1,2,3". After the header, every injection has a line with
+its two electrodes, and one line per frequency with the real and imaginary part of the potential at every channel. The
+file does not state whether currents are peak or root mean square values.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class _Header:
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file of text that begins with the number of lines of its header."""
+    """True for an .eit text file that begins with the number of its header lines."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
@@ -51,10 +51,10 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read one file: a frame for every frequency, named by it, of potentials less their mean.
+    """Read one file: one frame per frequency, named by the frequency, of potentials minus their mean.
 
-    With `[protocol] kind = "measured"` of a description its `measurement` says what else is read of the potentials:
-    "adjacent" differences, say. Channels that no list names are left out.
+    With `[protocol] kind = "measured"` in a description, its `measurement` selects another reading of the potentials,
+    such as "adjacent" differences. Channels that the header does not list are left out.
 
     Raises `ValueError` with the line at fault.
     """
@@ -72,10 +72,10 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def read_all(paths: Sequence[Path], description: str | Path | None = None) -> Measurement:
-    """Read files of one set-up, one after the other.
+    """Read several files of the same set-up and join their frames in the given order.
 
-    `[data] frame_rate` of a description says when, where each holds one frame; else their dates do. Raises as `read`
-    and `jeit.data.gesture_set.join`.
+    If each file holds one frame, `[data] frame_rate` of a description sets the times; otherwise the dates in the files
+    do. Raises as `read` and `jeit.data.gesture_set.join`.
     """
     joined = join([read(path, description) for path in paths])
     rate = description_of(paths[0], description).layout.frame_rate
@@ -86,7 +86,7 @@ def _header(lines: list[str], path: Path) -> _Header:
     count = int(_number(lines, 0, path, whole=True))
     if not _FEWEST <= count <= _MOST or count >= len(lines):
         raise ValueError(f"{path.name}, line 1: a header of {count} lines, and the file has {len(lines)}.")
-    at = 1 if count < 11 else 2  # the setup's name
+    at = 1 if count < 11 else 2  # line of the name of the setup
     low, high = (_number(lines, at + one, path) for one in (2, 3))
     number = int(_number(lines, at + 5, path, whole=True))
     if not (0 < low <= high and 1 <= number <= len(lines)):
@@ -108,15 +108,16 @@ def _number(lines: list[str], at: int, path: Path, *, whole: bool = False) -> fl
 
 
 def _list(line: str, name: str) -> list[int]:
-    """Channels, counted from 1."""
+    """Channel numbers, counted from 1."""
     parts = line.removeprefix(name).replace(",", " ").split()
     return [int(one) for one in parts if one.isdecimal() and len(one) < 6]
 
 
 def _injections(lines: list[str], header: _Header, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs (S, 2), from 1, and potentials (S, frequencies, columns), complex, as they stand."""
+    """Electrode pairs (S, 2), counted from 1, and complex potentials (S, frequencies, columns) as stored in the
+    file."""
     pairs, rows, frequencies = [], [], len(header.frequencies)
-    for at, line in _numbered(lines, header.lines):
+    for at, line in _nonempty_lines(lines, header.lines):
         values = _values(line, at, path)
         if len(rows) == frequencies * len(pairs):
             if len(values) != 2 or (values != values.round()).any() or not (values > 0).all() or values.max() > 1e5:
@@ -139,7 +140,7 @@ def _injections(lines: list[str], header: _Header, path: Path) -> tuple[np.ndarr
     return np.array(pairs), np.array(rows).reshape(len(pairs), frequencies, -1)
 
 
-def _numbered(lines: list[str], start: int) -> Iterator[tuple[int, str]]:
+def _nonempty_lines(lines: list[str], start: int) -> Iterator[tuple[int, str]]:
     return ((at, lines[at]) for at in range(start, len(lines)) if lines[at].strip())
 
 
@@ -151,7 +152,7 @@ def _values(line: str, at: int, path: Path) -> np.ndarray:
 
 
 def _channels(header: _Header, columns: int, path: Path) -> tuple[list[int], list[int]]:
-    """Numbers of the electrodes, and the columns that hold their potentials."""
+    """Numbers of the electrodes, and indices of the columns that hold their potentials."""
     wide, measured = (header.channels.get(name, []) for name in _LISTS)
     held = next((one for one in (measured, wide) if len(one) == columns), list(range(1, columns + 1)))
     numbers = measured if set(measured) <= set(held) and len(measured) > 1 else held
@@ -171,7 +172,7 @@ def _recording(
         raise ValueError(f"{path.name}: its current is {header.current:g} A; it must be positive, and at most 1.")
     drive, every = np.zeros((len(index), len(numbers))), np.arange(len(index))
     drive[every, index[:, 0]], drive[every, index[:, 1]] = header.current, -header.current
-    # The electrode that the current enters follows from the sign of the power, which the body takes up.
+    # The sign of the power, which the body dissipates, shows at which electrode of a pair the current enters.
     notes: list[str] = [*_NOTES]
     if np.median(np.einsum("sl,sfl->sf", drive, np.nan_to_num(np.real(potentials)))) < 0:
         drive = -drive
@@ -192,7 +193,7 @@ def _recording(
 
 
 def _times(date: str) -> np.ndarray | None:
-    """When the frame was measured, seconds since 1970, as if in Greenwich; None where it is not said so."""
+    """Time of the measurement in seconds since 1970, taking the date as UTC; None if the date has another form."""
     for form in ("%Y.%m.%d. %H:%M:%S.%f", "%Y.%m.%d. %H:%M:%S"):
         with suppress(ValueError):
             return np.array([datetime.strptime(date.strip(), form).replace(tzinfo=UTC).timestamp()])

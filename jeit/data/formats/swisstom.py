@@ -1,9 +1,10 @@
-"""Reader of Swisstom BB2 and Pioneer recordings (.eit, format 4): 32 electrodes, four left out between those of a pair.
+"""Reader of Swisstom BB2 and Pioneer recordings (.eit, format 4): 32 electrodes, pairs that skip four electrodes.
 
-Little-endian: bytes 0-3 the format, 4-7 where frames begin. Each begins with its time in milliseconds (eight bytes),
-its kind and its length (four each); kind 0 then holds 15 integers of four bytes, of which the fifth is a time in
-microseconds, 12 bytes, 64 integers of the electrodes' impedances, and 2,048: real and imaginary parts of 32 × 32
-voltages, drive by drive. Other kinds are events. Formats 1 to 3 differ, and are not known well enough.
+All numbers are little-endian. Bytes 0-3 are the number of the format, bytes 4-7 the offset of the first frame. A frame
+begins with its time in milliseconds (eight bytes), its kind and its length (four bytes each). Kind 0 continues with 15
+integers of four bytes, of which the fifth is a time in microseconds, 12 further bytes, 64 integers with impedances of
+the electrodes, and 2,048 integers with real and imaginary parts of 32 × 32 voltages, drive by drive. Other kinds are
+events. Formats 1 to 3 are not supported, as too little is known about them.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ from jeit.protocol import skip
 
 DESCRIPTION = "Swisstom BB2, Pioneer (.eit, format 4): 32 electrodes, skip 4, complex"
 _ELECTRODES, _SKIPPED, _FORMAT = 32, 4, 4
-# Bytes before a frame's content, and in it before the voltages; numbers of these; where the time is.
+# Bytes before the content of a frame, and in the content before the voltages; number of integers of the voltages;
+# offset of the time in the content.
 _HEAD, _BEFORE, _NUMBERS, _TIME = 16, 60 + 12 + 256, 2 * _ELECTRODES**2, 16
-# Range of a counter of microseconds of four bytes.
+# Range of the four-byte counter of microseconds.
 _ROUND = 2**32
-# Volts for the number 1, by those who have read these files: a guess.
+# Volts per unit of the stored numbers: an estimate by users of these files.
 _SCALE = 2.048 / (2**20 * 360 * 1000)
 _NOTES = (
     "neither the scale of the voltages nor the current is published (5 mA is assumed): trust relative changes alone.",
@@ -32,7 +34,7 @@ _NOTES = (
 
 
 def recognises(path: Path) -> bool:
-    """True for an .eit file that begins with the number of its format."""
+    """True for an .eit file that begins with the number of a Swisstom format."""
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
@@ -41,7 +43,8 @@ def recognises(path: Path) -> bool:
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read all frames. Raises `ValueError` for other formats, for no whole frame, and for a damaged one."""
+    """Read all frames. Raises `ValueError` for other formats, for a file without a complete frame, and for damaged
+    frames."""
     content = content_of(path)
     if content[:4] != bytes([_FORMAT, 0, 0, 0]):
         raise ValueError(f"{path.name} is of a Swisstom format that is not known; format 4 is. Export it as a table.")
@@ -64,7 +67,8 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
 
 
 def _frames(content: bytes, start: int, path: Path) -> tuple[list[np.ndarray], np.ndarray, int]:
-    """The numbers and the times (microseconds) of every frame, and how many bytes a last one has without its end."""
+    """Stored numbers and times (microseconds) of every complete frame, and number of bytes left over by a truncated
+    last frame."""
     values, times, place = [], [], start
     while place + _HEAD <= len(content):
         kind, length = (int(one) for one in np.frombuffer(content, "<i4", 2, place + 8))

@@ -1,4 +1,4 @@
-"""Reader of plain tables: CSV, text, NPY and NPZ with a TOML description."""
+"""Reader of plain tables in CSV, text, NPY and NPZ files, with a TOML description."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from jeit.protocol import Protocol
 
 DESCRIPTION = "table (.csv, .txt, .npy, .npz) with a TOML description beside it"
 SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
-# Arrays that `write_table` adds to the voltages and the protocol.
+# Arrays that `write_table` stores in addition to the voltages and the protocol.
 _WORDS = ("mask", "protocol_name", "frame_names", "notes", "times")
-# Bytes in memory of a number of two letters, twice: as rows, and as the table that they make.
+# Bytes of memory per byte of text: a number may take two characters, and is held twice, as rows and as the table.
 _IN_MEMORY = 8
 _SET = "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
 
 
 def recognises(path: Path) -> bool:
-    """True for a table's suffix."""
+    """True for the suffix of a table."""
     return path.suffix.lower() in SUFFIXES
 
 
 def find_description(path: Path) -> str | Path | None:
-    """The description that belongs to a file: same name with .toml, else `description.toml` in its folder.
+    """The description that belongs to a file: a TOML file of the same name, else `description.toml` in the same folder.
 
-    A table of 208 × 4 numbers whose name holds current and frequency as the 6 cm tank's files do
-    (`…_55uA_1000Hz.csv`) is described by the bundled "tank6cm". None when nothing is found.
+    A CSV table named like the files of the 6 cm tank, with current and frequency (`…_55uA_1000Hz.csv`), is described by
+    the bundled "tank6cm" if neither exists. None if there is no description.
     """
     for candidate in (path.with_suffix(".toml"), path.parent / "description.toml"):
         if candidate.is_file():
@@ -48,17 +48,18 @@ def find_description(path: Path) -> str | Path | None:
 
 
 def read(path: Path, description: str | Path | None = None, like: Measurement | None = None) -> Measurement:
-    """Read a table with the `description` given (path or bundled name), or the one found beside it, or that of `like`.
+    """Read a table with the given `description` (path or bundled name), else with the one found beside it, else with
+    that of `like`.
 
-    `like`: a measurement of the same sensor, whose protocol, electrodes and outline hold for a table that nothing else
-    describes; and so does what its description says of units and columns, if it is a table itself. Raises `ValueError`
-    when there is no description, or when file and description disagree.
+    `like`: a measurement of the same sensor. For a table without a description, its protocol, electrodes and outline
+    are used, and, if it was read from a table, the units and columns in its description. Raises `ValueError` if there
+    is no description, or if file and description disagree.
     """
     which = find_description(path) if description is None else description
     if which is not None:
         described = load_description(which)
     elif like is not None:
-        described = _borrowed(like)
+        described = _description_like(like)
     else:
         raise ValueError(
             f"description: {path.name} is a table of numbers, and nothing says what they mean. Put a description "
@@ -84,8 +85,9 @@ def read(path: Path, description: str | Path | None = None, like: Measurement | 
     return replace(measurement, times=times)
 
 
-def _borrowed(like: Measurement) -> Description:
-    """Description of another measurement of the same sensor, without its protocol and the names of its frames."""
+def _description_like(like: Measurement) -> Description:
+    """Description that consists of the properties of another measurement of the same sensor, without its protocol and
+    frame names."""
     beside = find_description(Path(like.source)) if like.source and recognises(Path(like.source)) else None
     layout = TableLayout() if beside is None else replace(load_description(beside).layout, frame_names=(), keys=())
     return Description(
@@ -102,9 +104,11 @@ def _borrowed(like: Measurement) -> Description:
 def measurement_from(
     path: Path, described: Description, frames: np.ndarray, protocol: Protocol | None, mask: np.ndarray | None
 ) -> Measurement:
-    """Screen frames (F, M) in file units under a description. `protocol` is the file's own, if it has one.
+    """Screen frames (F, M), in the unit of the file, and scale them as the description states. `protocol`: the one
+    stored in the file, or None.
 
-    Raises `ValueError` where no protocol is said, frames have too many or too few names, and as `screen`.
+    Raises `ValueError` if there is no protocol, if the number of frame names differs from that of the frames, and as
+    `screen`.
     """
     protocol = protocol or described.protocol(path)
     if protocol is None:
@@ -142,14 +146,16 @@ def measurement_from(
 
 
 def numbers(path: Path, layout: TableLayout) -> np.ndarray:
-    """The numbers of a text or NPY file, as they lie in it. Raises `ValueError` for what is not numbers."""
+    """The numbers of a text or NPY file, arranged as in the file. Raises `ValueError` if it holds anything but
+    numbers."""
     if path.suffix.lower() == ".npy":
         return _voltages(_from_numpy(path, ()), layout, path)
     return _from_text(path, layout)
 
 
 def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
-    """Frames (F, M), in file units, of a table laid out as described; `ValueError` for an odd half of complex pairs."""
+    """Frames (F, M), in the unit of the file, of a table laid out as described. Raises `ValueError` for an odd number
+    of rows in complex pairs."""
     frames = table.T if table.ndim == 2 and layout.frames_in == "columns" else np.atleast_2d(table)
     if layout.complex_pairs:
         if len(frames) % 2:
@@ -163,13 +169,13 @@ def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray
     if layout.component == "imaginary":
         return np.imag(frames)
     if layout.component == "magnitude":
-        # With the sign of the real part: a magnitude alone has lost the direction of the voltage.
+        # With the sign of the real part, because a magnitude alone has no direction.
         return np.abs(frames) * np.where(np.real(frames) < 0, -1.0, 1.0)
     return frames if layout.component == "complex" else np.real(frames)
 
 
 def part_of(values: np.ndarray, layout: TableLayout) -> tuple[str, ...]:
-    """A note of which part of complex voltages is read."""
+    """A note that states which part of complex voltages is read."""
     if not np.iscomplexobj(values) or layout.component == "complex":
         return ()
     return (f"of complex voltages this is the {layout.component} part; see [data] component.",)
@@ -199,13 +205,13 @@ def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
 
 
 def _no_number(cells: list[str], delimiter: str | None, *, first: bool) -> str:
-    """Message about a line, the `first` of the file or a later one, whose cells are not all numbers."""
+    """Error message for a line whose cells are not all numbers. `first`: whether no line of numbers precedes it."""
     wrong = [k for k, cell in enumerate(cells) if not _is_number(cell)]
     cell = cells[wrong[0]].strip()
     said = f"{cell[:40]!r} is no number" if cell else "nothing stands there"
     if len(cells) == 1:
         return f": {said}, nor numbers separated by {delimiter or 'spaces'!r}. {_SET}"
-    # A heading is words for the most part.
+    # A heading consists mostly of words.
     other = f" {_SET}" if first and 2 * len(wrong) > len(cells) else ""
     return f", column {wrong[0] + 1}: {said}; where a value is missing write nan.{other}"
 
@@ -219,7 +225,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Lines of a text file, one after the other."""
+    """Lines of a text file."""
     try:
         with path.open(encoding="utf-8") as file:
             yield from file
@@ -228,7 +234,7 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def _from_numpy(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Arrays of a file that are asked for by name; the one of an NPY file is its voltages."""
+    """The needed arrays of an NPZ file by name, or the array of an NPY file as "voltages"."""
     try:
         if path.suffix.lower() == ".npy":
             return {"voltages": npy_array(path)}
@@ -253,7 +259,7 @@ def _voltages(arrays: dict[str, np.ndarray], layout: TableLayout, path: Path) ->
 
 
 def _own_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
-    """The protocol in a file of `write_table`; None where there is none."""
+    """The protocol in a file written by `write_table`; None if the file holds no protocol."""
     if not all(part in arrays for part in PROTOCOL_ARRAYS):
         return None
     name = str(arrays.get("protocol_name", "custom"))
@@ -261,14 +267,14 @@ def _own_protocol(arrays: dict[str, np.ndarray]) -> Protocol | None:
 
 
 def _with_words(described: Description, arrays: dict[str, np.ndarray]) -> Description:
-    """The description with the frames' names, where it has none, and the notes of a file of `write_table`."""
+    """The description, completed by frame names (if it has none) and notes from a file written by `write_table`."""
     names = described.layout.frame_names or _texts(arrays, "frame_names")
     notes = (*described.notes, *_texts(arrays, "notes"))
     return replace(described, layout=replace(described.layout, frame_names=names), notes=notes)
 
 
 def _times(arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
-    """Times of a file of `write_table`, if it has them."""
+    """Times from a file written by `write_table`, or None."""
     times = arrays.get("times")
     if times is not None and times.dtype.kind not in "iuf":
         raise ValueError(f"{name}: 'times' holds {times.dtype}; give seconds.")

@@ -1,3 +1,3 @@
-"""Commands of electrode layouts and their studies."""
+"""Commands for electrode layouts and studies of layouts."""
 
 from __future__ import annotations

@@ -20,9 +20,9 @@ layout = typer.Typer(name="layout", help="Compare and optimise layouts of electr
 layout.command()(optimise)
 
 _FILES = ("report.json", "comparison.png")
-# Along a side: 65,536 touches in all.
+# Maximum number of touched positions along a side: 65,536 touches in total.
 _MOST_PLACES = 256
-# Option names by the names of their values further down.
+# Option name for each argument name that error messages of the called functions mention.
 _OPTIONS = {
     "thickness": "--thickness-mm",
     "cell_size": "--cell-mm",
@@ -31,8 +31,8 @@ _OPTIONS = {
     "margin": "--margin-mm",
     "outline": "--width-mm and --height-mm",
 }
-# Printed quantities: name and unit, key in the report, and factor.
-_TOLD = (
+# Printed quantities: name and unit, key in the report, and factor that converts the reported value to that unit.
+_QUANTITIES = (
     ("electrodes", "electrodes", 1.0),
     ("measurements", "measurements", 1.0),
     ("least sensitivity / mV", "sensitivity_min_V", 1e3),
@@ -134,7 +134,7 @@ def _show(console, result: "LayoutComparison") -> None:
     table = Table("", *distinct_names([one["layout"] for one in figures]), box=None, padding=(0, 2, 0, 0))
     for column in table.columns[1:]:
         column.justify = "right"
-    for name, key, factor in _TOLD:
+    for name, key, factor in _QUANTITIES:
         table.add_row(name, *(f"{factor * one[key]:.3g}" for one in figures))
         if key == "taxel_count":
             for part in ("mean", "std", "max"):

@@ -16,10 +16,11 @@ if TYPE_CHECKING:
     from jeit.mesh import Disk, Domain, Rectangle
 
 RESULTS = ("layout.csv", "layout.svg", "travel.png", "report.json")
-# Nodes of the mesh to optimise on: fewest that make cells, and most that can be multiplied by four.
+# Minimum and maximum number of nodes of the mesh used in the optimisation: enough to form cells, and few enough for the
+# final mesh, which has four times as many.
 _LEAST_NODES, _MOST_NODES = 4, 250_000
-# Printed quantities: key in the report, name and unit, and factor.
-_TOLD = (
+# Printed quantities: key in the report, name and unit, and factor that converts the reported value to that unit.
+_QUANTITIES = (
     ("worst_sensitivity_V", "least sensitivity / mV", 1e3),
     ("mean_sensitivity_V", "mean sensitivity / mV", 1e3),
     ("uniformity", "uniformity", 1.0),
@@ -106,7 +107,7 @@ def _show(console, result: "ImprovedLayout") -> None:
     from jeit.design.reports import report_improved_layout
 
     report = report_improved_layout(result)
-    both = [(name, factor, report["start"][key], report["optimised"][key]) for key, name, factor in _TOLD]
+    both = [(name, factor, report["start"][key], report["optimised"][key]) for key, name, factor in _QUANTITIES]
     rows = [
         (name, f"{factor * before:.3g} → {factor * after:.3g}")
         for name, factor, before, after in both

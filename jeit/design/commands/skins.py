@@ -1,4 +1,4 @@
-"""Options that describe flat skins on the command line, and a layout of electrodes with its skin."""
+"""Command-line options that describe a flat skin, and reading of a layout together with the outline of its skin."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`jeit study`: run a sweep over layouts from a TOML file; it can be stopped at any moment and resumed."""
+"""`jeit study`: run a sweep over layouts from a TOML file; the run can be stopped at any moment and resumed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def run(
     if store.exists() and not (store / "zarr.json").is_file():
         raise ValueError(f"--output {store}: there is something else already; choose another name.")
     if store.exists():
-        with locked(store, "study"):  # a process that still writes it is reported, before anybody deletes it
+        with locked(store, "study"):  # reports a process that is still writing, before the user deletes the store
             pass
         raise ValueError(f"{store} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
     _run(sweep, file, store, page, scheduler, quiet)
@@ -58,7 +58,7 @@ def resume(
     sweep, store = _read(file, output)
     if not store.exists():
         raise ValueError(f"there is no {store} to go on with: begin with 'jeit study run {file}'.")
-    Store(sweep, store, create=False)  # whether it is a store, and of this study
+    Store(sweep, store, create=False)  # checks that the path is a store of this study
     _run(sweep, file, store, page, scheduler, quiet)
 
 

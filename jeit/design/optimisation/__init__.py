@@ -1,1 +1,1 @@
-"""Layout optimisation: electrodes moved by gradients within constraints."""
+"""Layout optimisation: electrodes are moved along gradients of a score, within constraints."""

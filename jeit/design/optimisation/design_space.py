@@ -1,4 +1,4 @@
-"""The space of layouts that are searched: variables between bounds, constraints, and starting points."""
+"""The design space of a layout optimisation, its constraints, and bounded minimisation from several starts."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from jeit_solvers import Status, scipy_lbfgsb
 
 
 class Constraints(eqx.Module):
-    """Discs wholly inside `outline` and wholly outside every domain of `keep_out`, their centres `minimum_spacing`
-    metres apart or more, and no two of them overlapping.
+    """Constraints on disc electrodes: each disc lies wholly inside `outline` and wholly outside every domain of
+    `keep_out`, the centres are at least `minimum_spacing` metres apart, and no two discs overlap.
 
-    Raises `ValueError` for a spacing below zero.
+    Raises `ValueError` for a negative spacing.
     """
 
     outline: Domain
@@ -33,11 +33,12 @@ class Constraints(eqx.Module):
             raise ValueError(f"minimum_spacing must be in metres, not negative; it is {self.minimum_spacing!r}.")
 
     def check_room(self, radii) -> None:
-        """Raise `ValueError` for more discs of `radii` (L,), metres, than the densest packing of circles allows."""
+        """Raise `ValueError` if discs of `radii` (L,), metres, are more than the densest packing of circles allows."""
         x_min, x_max, y_min, y_max = self.outline.extent
         least = float(np.min(radii))
         apart = max(self.minimum_spacing, 2 * least)
-        # Circles of half that distance lie apart, and reach beyond where centres may be by their radius.
+        # Circles of radius apart / 2 around the centres do not overlap, and extend beyond the region of the centres by
+        # that radius.
         room = (x_max - x_min - 2 * least + apart) * (y_max - y_min - 2 * least + apart)
         if len(radii) * apart**2 > 2 / np.sqrt(3) * room:
             raise ValueError(
@@ -46,11 +47,12 @@ class Constraints(eqx.Module):
             )
 
     def shortfall(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> Float[Array, " q"]:
-        """Violation of each constraint, metres: positive where it is violated. Differentiable almost everywhere."""
+        """Violation of each constraint, metres: positive if it is violated, otherwise zero or negative. Differentiable
+        almost everywhere."""
         return jnp.concatenate(list(self.shortfalls(centres, radii).values()))
 
     def shortfalls(self, centres: Float[Array, "L 2"], radii: Float[Array, " L"]) -> dict[str, Float[Array, " q"]]:
-        """Violations by the names of the constraints: "minimum_spacing", "outline" and "keep_out"."""
+        """Violations, metres, by the name of the constraint: "minimum_spacing", "outline" and "keep_out"."""
         first, second = np.triu_indices(len(radii), 1)
         distance = jnp.sqrt(jnp.sum((centres[first] - centres[second]) ** 2, axis=1) + 1e-24)
         outside = [radii + domain.signed_distance(centres) for domain in self.keep_out]
@@ -62,19 +64,20 @@ class Constraints(eqx.Module):
 
 
 class DesignSpace(eqx.Module):
-    """The layouts of a skin allowed in an optimisation.
+    """The layouts allowed in an optimisation, and the quantities that are varied.
 
     **Fields**
 
-    - `outline`: contains all electrodes; the skin's unless given. `minimum_spacing`: of centres, metres; electrodes
-      never overlap. `keep_out`: domains that no electrode may overlap.
-    - `symmetry`: about the middle of the outline's box. The layout must have an equal share of its electrodes in every
-      half (x or y below the middle) or quarter; those of the first are kept, and the others become their images. Take
-      several starts: there are fewer ways out of a poor layout.
-    - `sizes`: whether to vary the electrodes' sizes too, between half and twice their own, or between two diameters,
-      metres.
-    - `contact_impedance`: electrodes' are varied too, between two values, ohm·m². `thickness`: that of the sheet is
-      varied too, between two values, metres, from the skin's on; its conductance grows with it.
+    - `outline`: domain that contains all electrodes, by default the outline of the skin.
+    - `minimum_spacing`: minimum distance between centres, metres; electrodes never overlap, even if it is 0.
+    - `keep_out`: domains that no electrode may overlap.
+    - `symmetry`: symmetry of the layout about the middle of the outline's bounding box. Every half (x or y below or
+      above the middle) or quarter must contain the same number of electrodes. Those of the first part are kept, and the
+      others are replaced by their images. Use several starts, since a symmetric layout has fewer ways to improve.
+    - `sizes`: whether the diameters are varied too: True for half to twice the given ones, or two limits, metres.
+    - `contact_impedance`: two limits, ohm·m², between which the contact impedances are varied; None to keep them.
+    - `thickness`: two limits, metres, between which the thickness of the sheet is varied, starting from that of the
+      skin; its sheet conductivity is proportional to it. None to keep it.
     """
 
     outline: Domain | None
@@ -96,7 +99,8 @@ class DesignSpace(eqx.Module):
         contact_impedance: tuple[float, float] | None = None,
         thickness: tuple[float, float] | None = None,
     ):
-        """Raises `ValueError` for an outline, spacing or regions of the wrong type; other checks need a skin."""
+        """Raises `ValueError` for an outline, spacing or regions of the wrong type. Other arguments are checked when
+        the design space is used for a skin."""
         if outline is not None:
             check_kind("outline", outline, Domain, "an outline, such as Rectangle(0.2, 0.2)")
         if not is_number(minimum_spacing):
@@ -110,8 +114,8 @@ class DesignSpace(eqx.Module):
         self.contact_impedance, self.thickness = contact_impedance, thickness
 
     def constraints(self, skin: Skin) -> Constraints:
-        """Constraints on the layouts of a `skin`. Raises `ValueError` where neither has an outline, and for an invalid
-        spacing."""
+        """Constraints on the layouts of a `skin`. Raises `ValueError` if neither the design space nor the skin has an
+        outline, for a curved skin, and for an invalid spacing."""
         if isinstance(skin.layout, SurfaceLayout):
             raise ValueError("skin is curved; move its electrodes with jeit.design.optimise_surface_layout.")
         outline = skin.layout.outline if self.outline is None else self.outline
@@ -122,8 +126,8 @@ class DesignSpace(eqx.Module):
         return Constraints(outline, self.minimum_spacing, self.keep_out)
 
     def variables(self, skin: Skin, constraints: Constraints, depth: float) -> Variables:
-        """Variables of the layouts, starting from that of a `skin`, whose touches are `depth` metres deep. Raises
-        `ValueError` for impossible settings."""
+        """Design variables of the layouts, starting from the layout of a `skin` whose touches are `depth` metres deep.
+        Raises `ValueError` for settings that no layout can satisfy."""
         options = {"sizes": self.sizes, "contacts": self.contact_impedance, "thickness": self.thickness}
         outline = constraints.outline
         variables = Variables.create(outline, varied_of(skin), symmetry=self.symmetry, **options)
@@ -134,7 +138,7 @@ class DesignSpace(eqx.Module):
 
 
 def varied_of(skin: Skin) -> Varied:
-    """The parameters of a sheet that an optimisation may vary, with their present values."""
+    """The parameters of a sheet that an optimisation may vary, with their current values."""
     discs = skin.model.electrodes
     contact_impedance = discs.contact_impedance  # pyright: ignore[reportAttributeAccessIssue]
     return Varied(skin.layout.centres, skin.layout.diameters / 2, contact_impedance, jnp.asarray(skin.thickness, float))
@@ -146,12 +150,13 @@ def _check_thickness(thickness: tuple[float, float], depth: float, outline: Doma
     check_metres("thickness", np.max(thickness), longer_side(outline), "the skin is wide")
 
 
-# Relative decrease of the cost in a step below which it has converged.
+# The minimisation has converged if the relative decrease of the cost in a step is below this.
 _TOLERANCE = 1e-5
 
 
 class Record:
-    """History of S starts: variables (S, v) and scores (S,) after every step."""
+    """History of an optimisation from S starts: variables (S, v) and scores (S,) after every step. `callback` is called
+    after each step with its number and the scores."""
 
     def __init__(self, callback: Callable[[int, Float[np.ndarray, " S"]], None] | None = None):
         self.variables: list[np.ndarray] = []
@@ -159,7 +164,7 @@ class Record:
         self._callback = callback
 
     def add(self, variables, values) -> None:
-        """Add a step."""
+        """Add the variables and the scores after a step."""
         self.variables.append(np.array(variables))
         self.values.append(np.array(values))
         if self._callback is not None:
@@ -169,10 +174,11 @@ class Record:
 def descend(
     cost, variables: Float[Array, "S v"], steps: int, record: Record, *, tolerance: float = _TOLERANCE
 ) -> tuple[Float[Array, "S v"], Status]:
-    """Minimise the sum of the starts' costs over variables between 0 and 1 by L-BFGS. Returns the final variables and
-    the termination: converged, step limit, or stalled where no step along the gradient lowers the cost.
+    """Minimise the sum of the costs of S starts over variables between 0 and 1 by L-BFGS. Returns the final variables
+    and the status: converged, step limit, or stalled if no step along the gradient lowers the cost.
 
-    `cost`: of variables (S, v) to costs (S,), scores (S,) for the record, and the gradient (S, v) of the costs.
+    `cost`: function of the variables (S, v) that returns the costs (S,), the scores (S,) for the `record`, and the
+    gradient (S, v) of the costs.
     """
     last = {}
 

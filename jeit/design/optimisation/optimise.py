@@ -1,8 +1,8 @@
 """Layout optimisation: a score is maximised over electrode positions by gradients through the forward model.
 
-Bounded L-BFGS minimises -score + w Σ (shortfall / pitch)² over positions in the outline's box, with w growing from
-stage to stage (the quadratic penalty method: Nocedal and Wright, Numerical Optimization, 2006, chapter 17); remaining
-violations of the constraints are then removed by descent of the penalty alone.
+Bounded L-BFGS minimises -score + w Σ (violation / pitch)² over positions in the bounding box of the outline, where the
+weight w grows from stage to stage (the quadratic penalty method: Nocedal and Wright, Numerical Optimization, 2006,
+chapter 17). Remaining violations of the constraints are then removed by minimising the penalty alone.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from jeit.design.skin.skin import Skin, check_skin
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Domain
 
-# Weights of the penalty, and the share of the steps after which each ends.
+# Stages of the optimisation: weight of the penalty, and fraction of all steps after which the stage ends.
 _STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
-# Constraints are met with so much to spare, metres, that rounding a layout to whole nanometres breaks none.
+# Safety margin of the constraints, metres, so that a layout rounded to whole nanometres still satisfies them.
 _SPARE = 2e-7
-# Fraction of a skin's size that its mesh may lack.
+# Maximum distance by which the outline may extend beyond the mesh, relative to the size of the skin.
 _OFF = 0.01
-# Least improvement of a score.
+# Minimum relative improvement of the score for a layout to count as better.
 _ROUNDING = 1e-9
-# Random places from which those inside the outline are taken.
+# Number of random positions drawn for a start; the first ones inside the allowed region are used.
 _DRAWS = 20_000
 
 
@@ -42,15 +42,16 @@ class Optimisation(eqx.Module):
 
     **Fields**
 
-    - `layout`: the best that satisfies all constraints; the one given, if none is better.
-    - `scores`: all scores of `layout`; `value`, its score; `start_value`, that of the layout given.
-    - `centres` (S, L, 2), `radii` (S, L), metres, `contact_impedance` (S, L), ohm·m², `thickness` (S,) of the sheet,
-      metres, and `values` (S,): the result of each start, and its score.
-    - `shortfall` (S,): largest violation of a constraint there, metres; 0 where all are satisfied.
-    - `history` (S, T): score of each start after each step, without penalties; `snapshots` (S, T, L, 2), metres, and
-      the first is the start itself.
-    - `best`: the start that `layout` comes from; None if it is the one given.
-    - `status`: "converged", "step limit", "stalled" (no shorter step improved) or "infeasible", and the `reason`.
+    - `layout`: the best layout that satisfies all constraints, or the given layout if none is better.
+    - `scores`: all scores of `layout`; `value`: its score; `start_value`: score of the given layout.
+    - `centres` (S, L, 2) and `radii` (S, L), metres, `contact_impedance` (S, L), ohm·m², `thickness` (S,) of the sheet,
+      metres: final values of each start; `values` (S,): their scores.
+    - `shortfall` (S,): largest violation of a constraint at the end of each start, metres; 0 if all are satisfied.
+    - `history` (S, T): score of each start after each step, without penalties.
+    - `snapshots` (S, T, L, 2): centres after each step, metres; the first are those of the start.
+    - `best`: index of the start that `layout` results from; None if `layout` is the given one.
+    - `status`: "converged", "step limit", "stalled" (no shorter step improved the cost) or "infeasible"; `reason`: an
+      explanation in words.
     """
 
     layout: Layout | SurfaceLayout
@@ -82,27 +83,27 @@ def optimise_layout(
 ) -> Optimisation:
     """Maximise the `objective` of a sheet over the positions of its electrodes.
 
-    Take a protocol that does not depend on the order of electrodes, such as that of all two-terminal pairs, and confirm
-    what comes out on a finer mesh. Same arguments, same result.
+    Use a protocol that does not depend on the order of the electrodes, such as all two-terminal pairs, and confirm the
+    result on a finer mesh. The result is deterministic.
 
     **Arguments:**
 
-    - `skin`: a sheet, of the layout to begin with. `objective`: of its touches.
-    - `space`: the layouts allowed; all on the skin unless given.
-    - `steps`: of L-BFGS, at most, for all starts at once. `starts`: how many: the layout, and random ones, drawn with
-      `key` and moved apart.
+    - `skin`: a sheet with the initial layout; `objective`: an objective for touches of this sheet.
+    - `space`: the allowed layouts; by default all layouts on the skin.
+    - `steps`: maximum number of L-BFGS steps; all starts are optimised together.
+    - `starts`: number of starts: the given layout, and random layouts drawn with `key` and moved apart.
     - `callback`: called after each step with its number and the scores (S,).
 
-    Raises `ValueError` for a layer, for arguments that `layout_scores` rejects, for touches of another thickness, and
-    for constraints that cannot be satisfied.
+    Raises `ValueError` for a layer, for arguments that `layout_scores` rejects, if the touches are for another
+    thickness, and for constraints that cannot be satisfied.
     """
     space = DesignSpace() if space is None else space
     _check(skin, objective, space, steps, starts, key)
     constraints = space.constraints(skin)
     variables = space.variables(skin, constraints, objective.touches.depth)
     _check_outline(constraints.outline, skin)
-    begin = np.stack([variables.start, *_random(variables, constraints, starts - 1, key)])
-    # A layout given is taken as it is, unless symmetry or the constraints forbid.
+    begin = np.stack([variables.start, *_random_starts(variables, constraints, starts - 1, key)])
+    # The given layout is used unchanged, unless it violates the symmetry or the constraints.
     begin = _feasible(variables, constraints, jnp.asarray(np.array(begin)))
     given = objective.scores_of_varied(skin, varied_of(skin))
     start_value = float(objective.score(given))
@@ -112,7 +113,7 @@ def optimise_layout(
     ended, record, status = search.run(jnp.asarray(np.array(begin)), steps, callback)
     ends = jax.tree.map(np.asarray, _varied(variables, ended))
     values = np.asarray(search.cost(ended, 0.0)[1])
-    lacking = np.array([_lacking(constraints, *one) for one in zip(ends.centres, ends.radii, strict=True)])
+    lacking = np.array([_largest_violation(constraints, *one) for one in zip(ends.centres, ends.radii, strict=True)])
     best, status, reason = search.judge(ends, values, lacking, start_value, status)
     found, scores = skin.layout, given
     if best is not None:
@@ -147,7 +148,8 @@ class _Search(eqx.Module):
         return _cost(values, jnp.asarray(weight), self)
 
     def run(self, begin: Float[Array, "S v"], steps: int, callback) -> tuple[Float[Array, "S v"], Record, str]:
-        """Run the optimisation: final variables of the starts, their history, and the termination of the last stage."""
+        """Run the optimisation. Returns the final variables of the starts, their history, and the status of the last
+        stage."""
         record = Record(callback)
         values, status, done = begin, "step limit", 0
         record.add(values, self.cost(values, _STAGES[0][0])[1])
@@ -159,11 +161,12 @@ class _Search(eqx.Module):
         return _feasible(self.variables, self.constraints, values), record, status
 
     def judge(self, ends: Varied, values, lacking, start_value: float, status: str) -> tuple[int | None, str, str]:
-        """Index of the best start, None if none improves on the given layout, with the status and its reason."""
+        """Choose the best start. Returns its index, or None if none is better than the given layout, the status, and
+        the reason."""
         layout = self.skin.layout
         good = (lacking <= 0) & np.isfinite(values)
         fits = self.variables.holds(varied_of(self.skin))
-        fits = fits and _lacking(self.constraints, layout.centres, layout.diameters / 2) <= 1e-9
+        fits = fits and _largest_violation(self.constraints, layout.centres, layout.diameters / 2) <= 1e-9
         if not good.any():
             nearest = int(lacking.argmin())
             parts = self.constraints.shortfalls(jnp.asarray(ends.centres[nearest]), jnp.asarray(ends.radii[nearest]))
@@ -182,7 +185,8 @@ class _Search(eqx.Module):
         return best, status, reason
 
     def named(self, end: Varied, contacts: bool) -> Layout:
-        """The layout that ended so; with its contact impedances, if those were varied."""
+        """The layout with the final parameters `end`. If `contacts`, the contact impedances were varied and are taken
+        from `end` too."""
         layout = self.skin.layout
         return Layout(
             end.centres,
@@ -194,8 +198,9 @@ class _Search(eqx.Module):
         )
 
 
-def _random(variables: Variables, constraints: Constraints, count: int, key) -> list[np.ndarray]:
-    """Variables of `count` layouts of places drawn evenly from the outline without what is to be kept free."""
+def _random_starts(variables: Variables, constraints: Constraints, count: int, key) -> list[np.ndarray]:
+    """Draw the variables of `count` random layouts, with positions uniform in the outline and outside the keep-out
+    domains."""
     starts, number = [], variables.num_generators
     for one in jax.random.split(key, count) if count else ():
         drawn = jax.random.uniform(one, (_DRAWS, 2))
@@ -216,24 +221,25 @@ def _penalty(variables: Variables, constraints: Constraints, values, spare=0.0) 
     return jnp.sum((jnp.maximum(shortfall, 0) / variables.pitch) ** 2)
 
 
-def _lacking(constraints: Constraints, centres, radii) -> float:
-    """Largest violation of a constraint, metres; 0 where it is within rounding."""
+def _largest_violation(constraints: Constraints, centres, radii) -> float:
+    """Largest violation of a constraint, metres; zero or negative if all constraints are satisfied."""
     return float(jnp.max(constraints.shortfall(jnp.asarray(centres), jnp.asarray(radii))))
 
 
 def _feasible(variables: Variables, constraints: Constraints, values):
-    """The starts (S, v) moved until they satisfy the constraints, as far as descent of the penalty leads."""
+    """Move the starts (S, v) until they satisfy the constraints, as far as minimisation of the penalty succeeds."""
 
     def cost(values):
-        value, slope = _missing(values, variables, constraints)
+        value, slope = _penalty_and_gradient(values, variables, constraints)
         return value, -value, slope
 
     return descend(cost, values, 500, Record(), tolerance=0.0)[0]
 
 
 @eqx.filter_jit
-def _missing(values, variables: Variables, constraints: Constraints):
-    """Penalty of each start (S,) and its gradient (S, v); steep, so that the descent ends at zero, not near it."""
+def _penalty_and_gradient(values, variables: Variables, constraints: Constraints):
+    """Penalty of each start (S,) and its gradient (S, v), scaled by a large factor so that the minimisation ends at
+    zero and not near it."""
     return jax.vmap(jax.value_and_grad(lambda own: 1e6 * _penalty(variables, constraints, own, _SPARE)))(values)
 
 
@@ -243,12 +249,12 @@ def _cost(values, weight, search: _Search):
 
     def one(own):
         end = variables.varied(own)
-        # An electrode off the skin has no score: a step that goes too far is judged by how it is at the edge.
+        # The score is undefined for an electrode outside the skin, so it is evaluated at the nearest point of the skin.
         end_inside = end._replace(centres=constraints.outline.nearest(end.centres))
         value = objective.score(objective.scores_of_varied(search.skin, end_inside))
         return weight * _penalty(variables, constraints, own) - value, value
 
-    # One start after the other: the Jacobian of one fills the cache.
+    # Starts are evaluated one after the other, since the Jacobian of a single start fills the cache.
     (cost, value), slope = jax.lax.map(jax.value_and_grad(one, has_aux=True), values)
     return cost, value, slope
 

@@ -1,8 +1,8 @@
-"""Layout optimisation of curved sheets: electrodes moved along the surface by gradients through the forward model.
+"""Layout optimisation of curved sheets: electrodes are moved along the surface by gradients through the forward model.
 
-Gradient ascent with a line search: every step is in the tangent planes of the electrodes, its end is moved to the
-nearest point of the surface, which is where the way along it leads, to second order; a step that lowers the score, or
-brings electrodes too close to each other or to the edge, is halved.
+Gradient ascent with a line search: electrodes move in their tangent planes and are then projected to the nearest point
+of the surface, which agrees with a step along the surface to second order. A step that does not raise the score, or
+that brings electrodes too close to each other or to the edge, is halved.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from jeit.layout import SurfaceLayout
 from jeit.mesh.geodesic import Triangles
 from jeit_solvers.engines import as_array
 
-# Longest first step and shortest step, as fractions of the pitch.
+# Maximum and minimum step length, as fractions of the mean spacing of the electrodes.
 _LONGEST, _SHORTEST = 0.3, 1e-3
 
 
 class SurfaceOptimisation(eqx.Module):
     """Result of `optimise_surface_layout`.
 
-    **Fields**: `layout`, the best; its `value` and `start_value`, that of the layout given; `history` (T,) of the score
-    after every step, which never falls, and `snapshots` (T, L, 3), metres.
+    **Fields**: `layout`: the best layout; `value`: its score; `start_value`: score of the given layout; `history` (T,):
+    score after every step, non-decreasing; `snapshots` (T, L, 3): centres after every step, metres.
     """
 
     layout: SurfaceLayout
@@ -53,9 +53,15 @@ def optimise_surface_layout(
     """Maximise the `objective` of a curved sheet over the positions of its electrodes, by gradient ascent along the
     surface.
 
-    `objective`: of touches of the sheet, as for `optimise_layout`. `minimum_spacing` between centres, metres, and
-    electrodes never overlap; `margin` from the edge, metres, besides their own radius. `callback`: called with each
-    step's number and score. Raises `ValueError` for flat skins and layers, and for numbers that make no sense.
+    **Arguments:**
+
+    - `skin`: a curved sheet with the initial layout; `objective`: as for `optimise_layout`.
+    - `steps`: maximum number of steps.
+    - `minimum_spacing`: minimum distance between centres, metres; electrodes never overlap, even if it is 0.
+    - `margin`: minimum distance of an electrode's rim from the edge, metres.
+    - `callback`: called after each step with its number and the score.
+
+    Raises `ValueError` for flat skins and layers, if `steps` is not a positive whole number, and for negative lengths.
     """
     check_skin("skin", skin)
     check_kind("objective", objective, Objective, "an Objective, as of Objective.create(skin, places)")
@@ -102,7 +108,8 @@ def optimise_surface_layout(
 
 
 def surface_scores(skin: Skin, objective: Objective, position: Float[Array, "L 3"]) -> Scores:
-    """Compute all scores of a curved sheet with electrodes at other positions; differentiable in them."""
+    """Compute all scores of a curved sheet with its electrodes moved to `position` (L, 3), metres; differentiable with
+    respect to the positions."""
     discs = skin.model.electrodes
     assert isinstance(discs, SurfaceDiscs)
     model = skin.model.with_electrodes(SurfaceDiscs(position, discs.radius, discs.contact_impedance))
@@ -120,6 +127,7 @@ def _cost(skin: Skin, objective: Objective):
 
 
 def _fits(position, apart, surface: Triangles, room) -> bool:
-    """Whether electrodes are as far apart, straight through space, and from the edge as they must be."""
+    """Whether the centres are at least `apart` metres from each other, in a straight line, and at least `room` metres
+    from the edge."""
     distance = np.linalg.norm(position[:, None] - position, axis=-1)
     return bool((distance >= apart).all() and (surface.distance_to_border(position) >= room).all())

@@ -1,4 +1,4 @@
-"""Design variables of a layout, and the objective as their function."""
+"""Design variables of a layout, and the objective of a layout optimisation."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ _IMAGES = {
 
 
 class Varied(NamedTuple):
-    """Electrodes on a sheet: `centres` (L, 2) and `radii` (L,) in metres, `contact_impedance` (L,) in ohm·m², and the
-    sheet's `thickness` in metres."""
+    """The parameters that an optimisation may vary: `centres` (L, 2) and `radii` (L,) of the electrodes in metres,
+    their `contact_impedance` (L,) in ohm·m², and the `thickness` of the sheet in metres."""
 
     centres: Float[Array, "L 2"]
     radii: Float[Array, " L"]
@@ -41,21 +41,22 @@ class Varied(NamedTuple):
 
 
 class Range(eqx.Module):
-    """Range of positive values between `least` (k,) and `least` · exp(`span`), linear in the logarithm."""
+    """Logarithmic scale for k positive values between `least` (k,) and `least` · exp(`span`)."""
 
     least: Float[np.ndarray, " k"]
     span: Float[np.ndarray, " k"]
 
     @classmethod
     def create(cls, name: str, ends, start, unit: str) -> "Range":
-        """Create from two `ends`, for all of `start` (k,). Raises `ValueError` for invalid ends."""
+        """Create the range from its two `ends`, the same for all k values of `start` (k,). Raises `ValueError` for
+        invalid ends."""
         least, most = ends if np.shape(ends) == (2,) else (0.0, 0.0)
         if not 0 < least < most < np.inf:
             raise ValueError(f"{name} must be two values in {unit}, the smaller one first; it is {ends!r}.")
         return cls(np.full(np.shape(start), least), np.full(np.shape(start), np.log(most / least)))
 
     def variables(self, values) -> Float[np.ndarray, " k"]:
-        """Variables between 0 and 1 that correspond to `values`, or to the nearest end."""
+        """Variables between 0 and 1 that correspond to `values`; values outside the range are clipped to it."""
         return np.minimum(np.maximum(np.log(np.asarray(values) / self.least) / self.span, 0), 1)
 
     def values(self, variables) -> Float[Array, " k"]:
@@ -64,12 +65,17 @@ class Range(eqx.Module):
 
 
 class Variables(eqx.Module):
-    """Mapping from variables between 0 and 1 to a `Varied`: G generators, of which the other electrodes are images.
+    """Mapping from variables between 0 and 1 to the parameters `Varied`. The variables describe G generators; the other
+    electrodes are their images under the symmetry.
 
-    **Fields**: `low`, `size` (2,) of the box of centres, metres; `images` (k, 2, 2); `order` (L,) of the images in the
-    layout; `given`, what to start from; `sizes` (G), `contacts` (G) and `thickness` (1), the ranges of what is
-    varied besides the places; `start`, its variables; `pitch`, side of the square that each electrode would have to
-    itself, metres.
+    **Fields**
+
+    - `low`, `size` (2,): lower left corner and side lengths of the bounding box of the centres, metres.
+    - `images` (k, 2, 2): matrices of the symmetry; `order` (L,): index of the image that each electrode is.
+    - `given`: the initial parameters; `start`: the variables that correspond to them.
+    - `sizes` (G), `contacts` (G), `thickness` (1): ranges of the radii, contact impedances and thickness; None if these
+      are not varied.
+    - `pitch`: mean spacing of the electrodes, metres: the side of a square with the area available to each.
     """
 
     low: np.ndarray
@@ -87,7 +93,7 @@ class Variables(eqx.Module):
     def create(
         cls, outline: Domain, given: Varied, *, symmetry=None, sizes=False, contacts=None, thickness=None
     ) -> "Variables":
-        """Create the variables from the `given` electrodes. Raises `ValueError` for impossible settings."""
+        """Create the variables from the `given` parameters. Raises `ValueError` for settings that contradict them."""
         if symmetry is not None:
             check_name("symmetry", symmetry, filter(None, _IMAGES), ", or None")
         centres, radii = np.asarray(given.centres), np.asarray(given.radii)
@@ -113,7 +119,7 @@ class Variables(eqx.Module):
             name = "outline: it" if size_range is None else "sizes: the outline"
             raise ValueError(f"{name} is smaller than an electrode; give millimetres divided by 1000.")
         every = (np.einsum("kij,gj->kgi", images, centres[first] - middle) + middle).reshape(-1, 2)
-        # Which image is which electrode: the nearest, all in all.
+        # Images are assigned to electrodes such that the sum of their distances is minimal.
         order = scipy.optimize.linear_sum_assignment(np.linalg.norm(centres[:, None] - every, axis=-1))[1]
         start = [np.clip((centres[first] - low) / size, 0, 1).ravel()]
         if size_range is not None:
@@ -131,7 +137,7 @@ class Variables(eqx.Module):
         return cls(low, size, images, order, repeated, *ranges, np.concatenate(start), pitch)
 
     def holds(self, varied: Varied) -> bool:
-        """Whether the variables can stand for `varied`: it is symmetric as asked, and within the ranges."""
+        """Whether the start represents `varied` exactly: True if `varied` has the symmetry and lies in the ranges."""
         found = self.varied(jnp.asarray(self.start))
         same = (np.allclose(one, other, rtol=1e-6, atol=0) for one, other in zip(found[1:], varied[1:], strict=True))
         return bool(np.allclose(found.centres, varied.centres, atol=1e-6)) and all(same)
@@ -143,13 +149,13 @@ class Variables(eqx.Module):
 
     @property
     def smallest(self) -> Float[np.ndarray, " L"]:
-        """Least radii (L,) of the electrodes, metres."""
+        """Minimum radii (L,) of the electrodes, metres."""
         if self.sizes is None:
             return np.asarray(self.given.radii)
         return np.tile(self.sizes.least, len(self.images))[self.order]
 
     def varied(self, variables: Float[Array, " v"]) -> Varied:
-        """The `Varied` that corresponds to the variables."""
+        """Parameters that correspond to the variables."""
         number = self.num_generators
         place, rest = variables[: 2 * number].reshape(number, 2) * self.size - self.size / 2, variables[2 * number :]
         centres = jnp.einsum("kij,gj->kgi", self.images, place).reshape(-1, 2) + self.low + self.size / 2
@@ -192,16 +198,18 @@ def _check_shares(number: int, parts: int, total: int, symmetry: str | None) -> 
 
 
 def balanced(scores: Scores) -> Float[Array, ""]:
-    """log of the soft-worst sensitivity minus that of the mean variance: a per cent of either counts alike."""
+    """Default score of an `Objective`: log of the soft-worst sensitivity minus log of the mean variance, so that a
+    change of either by one per cent counts the same."""
     return jnp.log(scores.soft_worst) - jnp.log(scores.mean_variance)
 
 
 class Objective(eqx.Module):
-    """The `score`, a function of the `Scores` of a layout, to be maximised.
+    """Objective of a layout optimisation: a function of the `Scores` of a layout, which is maximised.
 
-    **Fields**: `touches`, of the skin, as of `Skin.sheet_touches`; `prior`, `noise` (volts) and `temperature` as in
-    `layout_scores`; `score`, a function of `Scores` with differences of order 1, as logarithms have. Raises
-    `ValueError` for a score that is no function, and for touches or a prior of another kind.
+    **Fields**: `touches`: touches of the skin, as from `Skin.sheet_touches`; `prior`, `noise` (volts) and
+    `temperature`: as in `layout_scores`; `score`: function of `Scores` whose values differ by the order of 1 between
+    layouts, such as a logarithm. Raises `ValueError` if `score` is not a function, and for touches or a prior of
+    another type.
     """
 
     touches: SheetTouches
@@ -227,9 +235,11 @@ class Objective(eqx.Module):
         correlation: float = CORRELATION,
         **options: Any,
     ) -> "Objective":
-        """Of touches of a `skin` at `places` (n, 2), metres, as in `Skin.sheet_touches`, whose amplitudes are
-        correlated over `correlation` metres; `options`: `noise`, `score`, `temperature`. Raises `ValueError` as
-        `Skin.sheet_touches` and `TouchPrior.create` do."""
+        """Create the objective for touches of a `skin` at `places` (n, 2), metres, as in `Skin.sheet_touches`.
+
+        `correlation`: correlation length of the touch amplitudes under the prior, metres; `options`: `noise`, `score`
+        and `temperature`. Raises `ValueError` as `Skin.sheet_touches` and `TouchPrior.create` do.
+        """
         check_skin("skin", skin)
         touches = skin.sheet_touches(places, indentation, contrast=contrast)
         return cls(touches, TouchPrior.create(places, correlation=correlation), **options)
@@ -240,7 +250,8 @@ class Objective(eqx.Module):
         return layout_scores(skin.model, skin.model_conductivity, self.touches, **options)
 
     def scores_of_varied(self, skin: Skin, varied: Varied) -> Scores:
-        """Compute the scores with other electrodes and another thickness; differentiable in them."""
+        """Compute the scores of a skin with its electrodes and thickness replaced by those of `varied`; differentiable
+        with respect to these."""
         model = skin.model.with_electrodes(SheetDiscs(varied.centres, varied.radii, varied.contact_impedance))
         conductance = skin.model_conductivity * (varied.thickness / skin.thickness)
         touches = self.touches.at_thickness(varied.thickness)

@@ -1,4 +1,4 @@
-"""Plots of electrode layouts and their studies."""
+"""Plots of electrode layouts: sensitivity maps, virtual taxels, paths of electrodes, and unrolled skins."""
 
 from __future__ import annotations
 

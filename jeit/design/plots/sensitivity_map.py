@@ -1,4 +1,4 @@
-"""Plots of sensitivity maps, and of histograms of several."""
+"""Plots of sensitivity maps and their histograms."""
 
 from __future__ import annotations
 
@@ -33,9 +33,10 @@ def plot_sensitivity_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot Θ in millivolts over the skin. `electrodes`: positions (L, 2), metres; `limit`: volts at the bar's end.
+    """Plot the sensitivity Θ over the skin, in millivolts.
 
-    Raises `ValueError` for what is no sensitivity map.
+    `electrodes`: positions (L, 2) to be marked, metres; `limit`: upper end of the colour bar, volts, by default the
+    maximum of Θ. Raises `ValueError` if `theta` is not a `SensitivityMap`.
     """
     _check_map("theta", theta)
     ax = axes_or_new(ax)
@@ -62,9 +63,10 @@ def plot_sensitivity_map(
 def plot_sensitivity_histograms(
     maps: Mapping[str, SensitivityMap], *, bins: int = 40, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Plot the share of the area at each sensitivity, for maps {name: map}; the minimum of the first is marked.
+    """Plot histograms of the sensitivity, as shares of the area, of several maps {name: map}. A dashed line marks the
+    minimum of the first map.
 
-    Raises `ValueError` for what are none.
+    Raises `ValueError` if `maps` is not a mapping to sensitivity maps.
     """
     check_kind("maps", maps, Mapping, "{name: map}")
     for name, theta in maps.items():

@@ -42,10 +42,13 @@ def plot_taxels(
 ) -> Axes:
     """Plot the map of the taxels of one layout.
 
-    `colour`: "area", of the taxel whose cluster the position is in; "coverage", the number of taxels that cover the
-    position; "label", a colour for each cluster. `outlines`: draw where the similarity to each taxel falls below the
-    threshold. `electrodes`: positions (L, 2) or (L, 3), metres. `limit`: value at the end of the colour bar, in m² for
-    "area". Raises `ValueError` for other colours, and batches.
+    - `colour`: quantity shown by colours: "area", the area of the taxel whose cluster contains the position;
+      "coverage", the number of taxels that cover the position; "label", a colour for each cluster.
+    - `outlines`: whether to draw the outline of each taxel, where the similarity falls below the threshold.
+    - `electrodes`: positions (L, 2) or (L, 3) to be marked, metres.
+    - `limit`: value at the upper end of the colour bar, in m² for "area".
+
+    Raises `ValueError` for other values of `colour`, and for batches of layouts.
     """
     check_name("colour", colour, _QUANTITIES)
     _check_single(taxels)
@@ -69,10 +72,10 @@ def plot_taxels(
 def plot_taxel_areas(
     taxels: Taxels | Mapping[str, Taxels], *, bins: int = 20, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Plot the histogram of the taxels' areas of one layout, or of several: {name: taxels}.
+    """Plot the histogram of the taxel areas of one layout, or of several layouts {name: taxels}.
 
-    `bins`: number of bins, of the same width for all, from 0 to the largest area. The legend gives mean ± standard
-    deviation. Raises `ValueError` for batches, no layouts and more than six.
+    `bins`: number of bins of equal width from 0 to the largest area, the same for all layouts. The legend gives the
+    mean ± standard deviation of each layout. Raises `ValueError` for batches, and unless there are one to six layouts.
     """
     layouts = dict(taxels) if isinstance(taxels, Mapping) else {"taxels": taxels}
     if not 1 <= len(layouts) <= len(_COLOURS):
@@ -107,7 +110,8 @@ def plot_similarity(
     """Plot the similarity of each position's voltage change to the mean change of taxel `index`, and the taxel's
     outline.
 
-    `electrodes`: positions (L, 2) or (L, 3), metres. Raises `ValueError` for a taxel that is not there, and batches.
+    `electrodes`: positions (L, 2) or (L, 3) to be marked, metres. Raises `ValueError` for an index of no taxel, and for
+    batches of layouts.
     """
     _check_single(taxels)
     number = len(taxels.similarity)
@@ -134,7 +138,8 @@ def _check_single(taxels: Taxels) -> None:
 
 
 def _sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
-    """Width and height (n,) of the cells: of a grid its spacings, otherwise of squares of their area."""
+    """Width and height (n,) of the drawn cells, metres: the spacings of the grid, or squares of the given area if the
+    positions form no grid."""
     gaps = [np.diff(np.unique(axis.round(9))) for axis in np.asarray(taxels.places).T]
     square = np.sqrt(np.asarray(taxels.cell_area))
     if all(len(gap) and np.allclose(gap, gap[0], rtol=1e-3) for gap in gaps):
@@ -145,14 +150,14 @@ def _sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
 def _draw_cells(ax: Axes, taxels: Taxels, values: np.ndarray, *, colour_map: str) -> PolyCollection:
     half = np.stack(_sides(taxels), axis=1)[:, None] / 2
     corners = np.asarray(taxels.places)[:, None] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-    # Edges in the cells' own colour hide the seams between cells.
+    # Edges in the colour of the cell hide the gaps between cells.
     cells = PolyCollection(list(corners), array=values, cmap=colormaps[colour_map], edgecolors="face", linewidth=0.4)
     ax.add_collection(cells)
     return cells
 
 
 def _map_colours(taxels: Taxels) -> np.ndarray:
-    """Colour (k,) of each cluster: the first of the palette that none of its neighbours has."""
+    """Index of the colour (k,) of each cluster: the first colour of the palette that none of its neighbours has."""
     labels, count = np.asarray(taxels.labels), len(taxels.similarity)
     first, second = labels[_triangles(taxels).edges].T
     neighbours = np.zeros((count, count), bool)

@@ -1,4 +1,4 @@
-"""Plot of the electrodes' paths in a layout optimisation."""
+"""Plot of the paths of the electrodes in a layout optimisation."""
 
 from __future__ import annotations
 
@@ -28,10 +28,12 @@ def plot_travel(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot the path of every electrode for one of the starts, with a hollow start, a filled end, and a legend.
+    """Plot the path of every electrode for one start of an optimisation. Hollow discs mark the initial positions,
+    filled discs the final ones.
 
-    `start`: which, from 0; `keep_out`: regions to be hatched. The default title gives the mean path length in
-    millimetres. Raises `ValueError` for a start that does not exist, and for what is no `Optimisation`.
+    `start`: index of the start, from 0; `keep_out`: regions to be hatched. The default title gives the mean distance
+    between initial and final positions in millimetres. Raises `ValueError` for a start that does not exist, and if
+    `optimisation` is not an `Optimisation`.
     """
     check_kind("optimisation", optimisation, Optimisation, "an Optimisation, as of optimise_layout")
     number = len(optimisation.centres)
@@ -74,6 +76,6 @@ def _explain(ax: Axes, *, kept_free: bool) -> None:
 
 
 def outline_path(domain: Domain) -> Path:
-    """The edge of a domain and of its holes, closed, in metres."""
+    """Boundary of a domain and of its holes as closed loops of a matplotlib path, in metres."""
     loops = [np.asarray(loop) for loop in domain.loops()]
     return Path.make_compound_path(*(Path(np.concatenate([loop, loop[:1]]), closed=True) for loop in loops))

@@ -1,4 +1,4 @@
-"""Plots of curved skins unrolled to a plane, as seen from outside, to scale."""
+"""Plots of curved skins, unrolled to a plane, seen from outside and drawn to scale."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from jeit.plot.axes import (
     extent_of,
 )
 
-# Relative distortion of lengths from which on the plot states it.
-_TOLD = 0.005
+# The plot states the distortion of lengths if its mean exceeds this relative value.
+_STATED_FROM = 0.005
 
 
 def plot_unrolled(
@@ -45,11 +45,13 @@ def plot_unrolled(
 ) -> Axes:
     """Plot an unrolled surface, as from `jeit.mesh.geodesic.unroll(skin.model.mesh)`, with dashed lines along the cut.
 
-    `values`: one for each triangle of the surface, flat, or for each node, shaded. `electrodes` are discs, numbered.
-    `marks`: places (p, 3), metres, on the surface, by what the legend calls them. `scale`: how values become colours;
-    changes of sheet conductivity in S unless it says otherwise. Where unrolling stretches or shrinks the surface by
-    half a per cent or more, the plot states the distortion. Raises `ValueError` for values of another shape, complex or
-    not finite, and for arguments of the wrong type.
+    - `values`: one value for each triangle of the surface, drawn in uniform colours, or for each node, interpolated.
+    - `electrodes`: disc electrodes, drawn as circles with their numbers or labels.
+    - `marks`: positions (p, 3) on the surface to be marked, metres, by their names in the legend.
+    - `scale`: mapping from values to colours; by default for changes of sheet conductivity in S.
+
+    If unrolling changes lengths by more than half a per cent on average, the plot states the distortion. Raises
+    `ValueError` for values of another shape, complex or not finite, and for arguments of the wrong type.
     """
     check_kind("unrolled", unrolled, Unrolled, "a surface laid flat, as of unroll(skin.model.mesh)")
     check_scale(scale)
@@ -57,7 +59,7 @@ def plot_unrolled(
     points = unrolled.points
     flat = Triangulation(points[:, 0], points[:, 1], unrolled.cells)
     if values is not None:
-        image = _checked(unrolled, values)
+        image = _check_values(unrolled, values)
         colours = scale.of(image, "S")
         per_cell = len(image) == len(unrolled.cells)
         style: dict[str, Any] = {"shading": "gouraud"}
@@ -78,7 +80,7 @@ def plot_unrolled(
     draw_scale_bar(ax, extent)
     if marks:
         ax.legend(loc="lower right", frameon=False, labelcolor=INK, ncols=len(marks), borderaxespad=0)
-    if unrolled.mean_distortion > _TOLD:
+    if unrolled.mean_distortion > _STATED_FROM:
         mean, most = 100 * unrolled.mean_distortion, 100 * unrolled.distortion
         text = f"lengths off by {mean:.2g} % on average, {most:.2g} % at most"
         ax.text(0.5, 0.02, text, transform=ax.transAxes, ha="center", color=SOFT, fontsize=8)
@@ -87,7 +89,7 @@ def plot_unrolled(
     return ax
 
 
-def _checked(unrolled: Unrolled, values: ArrayLike) -> np.ndarray:
+def _check_values(unrolled: Unrolled, values: ArrayLike) -> np.ndarray:
     image, sizes = np.asarray(values), (len(unrolled.cells), len(unrolled.surface.points))
     if image.shape not in ((sizes[0],), (sizes[1],)):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Reports, tables and plots of electrode layouts and their studies, written to a folder."""
+"""Reports, tables and plots of electrode layouts and studies of layouts, written to a folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reports of layouts: two compared, and one improved."""
+"""Reports on the comparison of two layouts and on the optimisation of a layout."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from jeit.layout import write_layout
 from jeit.mesh import Disk, Domain, Rectangle
 from jeit.report.folder import describe_domain, plain, results, write_json
 
-# Most letters of a name in the plot.
+# Maximum number of characters of a layout's name in a plot.
 _LONGEST = 32
 
 
 def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> None:
-    """Write `comparison.png` and `report.json` into `folder`, created if needed.
+    """Write `comparison.png` and `report.json` into `folder`, which is created if needed.
 
-    Raises `ValueError` for what cannot be one.
+    Raises `ValueError` if the folder cannot be created or written.
     """
     with results(folder, ("comparison.png", "report.json")) as made:
         write_json(report_layout_comparison(result), made / "report.json")
@@ -27,7 +27,8 @@ def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> Non
 
 
 def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
-    """Report of both "layouts", and the "options" of skins and touches, as plain numbers and strings."""
+    """Scores of both layouts ("layouts") and parameters of the skins and touches ("options"), as plain numbers and
+    strings."""
     skin, response = result.skins[0], result.responses[0]
     options = {
         "thickness_mm": 1e3 * skin.thickness,
@@ -44,8 +45,8 @@ def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
 
 
 def draw_layout_comparison(result: LayoutComparison):
-    """Plot the sensitivity and taxel maps of both layouts on one scale, and their histograms, as a matplotlib
-    `Figure`."""
+    """Plot the sensitivity and taxel maps of both layouts with the same colour scales, and their histograms, as a
+    matplotlib `Figure`."""
     from matplotlib.artist import Artist
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
@@ -62,14 +63,15 @@ def draw_layout_comparison(result: LayoutComparison):
     both = result.responses
     highest = max(float(one.sensitivity.values.max()) for one in both)
     largest = max(float(one.taxels.max_area) for one in both)
-    names = distinct_names([_shortened(one.layout.name) for one in both])
+    names = distinct_names([_shorten_name(one.layout.name) for one in both])
     for row, name, one in zip(axes, names, both, strict=True):
         centres, outline = one.layout.centres, flat_layout(one.layout).known_outline
         plot_sensitivity_map(
             one.sensitivity, electrodes=centres, limit=highest, title=f"{name}: sensitivity", ax=row[0]
         )
         plot_taxels(one.taxels, electrodes=centres, limit=largest, title=f"{name}: taxels", ax=row[1])
-        # The colour bar, drawn last, is placed by the touched part; both maps show the whole skin.
+        # The taxel map places its scale bar for the touched part only; replace it by one for the whole skin, which both
+        # maps show.
         for bar in (row[1].lines[-1], row[1].texts[-1]):
             bar.remove()
         draw_scale_bar(row[1], outline.extent)
@@ -88,19 +90,19 @@ def draw_layout_comparison(result: LayoutComparison):
 
 
 def distinct_names(names: list[str]) -> list[str]:
-    """Two names, numbered if they are the same."""
+    """Two names, with numbers appended if they are equal."""
     return names if names[0] != names[1] else [f"{name} ({k})" for k, name in enumerate(names, 1)]
 
 
-def _shortened(name: str) -> str:
+def _shorten_name(name: str) -> str:
     """A layout's name, shortened to fit above a map."""
     return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"
 
 
 def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
-    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into `folder`, created if needed.
+    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into `folder`, which is created if needed.
 
-    Raises `ValueError` for what cannot be one.
+    Raises `ValueError` if the folder cannot be created or written.
     """
     with results(folder, ("layout.csv", "layout.svg", "travel.png", "report.json")) as made:
         write_layout(result.layout, made / "layout.csv")
@@ -110,7 +112,7 @@ def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
 
 
 def draw_improved_layout(result: ImprovedLayout):
-    """Plot the electrodes' paths, as a matplotlib `Figure`."""
+    """Plot the paths of the electrodes in the optimisation, as a matplotlib `Figure`."""
     from matplotlib.figure import Figure
 
     from jeit.design.plots import plot_travel
@@ -122,8 +124,8 @@ def draw_improved_layout(result: ImprovedLayout):
 
 
 def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
-    """Report of the optimisation, figures of the given layout ("start") and of the better one ("optimised"), both on
-    the finer mesh, and the options, as plain numbers and strings; None where there is no finite value."""
+    """Result of the optimisation, scores of the given ("start") and the optimised layout ("optimised") on the finer
+    mesh, and the options, as plain numbers and strings; None for values that are not finite."""
     found, skin, space = result.optimisation, result.skin, result.space
     content = {
         "layout": result.start.name,
@@ -161,8 +163,8 @@ def _figures(scores: Scores) -> dict[str, Any]:
 
 
 def _region(domain: Domain) -> str | dict[str, Any]:
-    """Region in the format of the command: a disc "x,y,radius" or rectangle "x1,y1,x2,y2", millimetres; others in
-    words."""
+    """Region in the format of the option --keep-out, a disc "x,y,radius" or a rectangle "x1,y1,x2,y2" in millimetres; a
+    description for other regions."""
     if isinstance(domain, Disk):
         numbers = (*domain.centre, domain.radius)
     elif isinstance(domain, Rectangle):

@@ -1,4 +1,4 @@
-"""Report of a study: its table, and its pictures."""
+"""HTML report of a study: table of its points, and plots of their scores and sensitivity maps."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from jeit.design.study.store import Store, open_results
 from jeit.mesh import Rectangle
 from jeit.mesh.geodesic import Geodesics, Triangles, unroll
 
-# Most maps in a report.
+# Maximum number of maps in a report, and of plots side by side.
 _MAPS, _COLUMNS = 24, 4
-# Number of nodes of an unrolled map above which they are not distinguishable.
+# The mesh of an unrolled map is refined until it has this many nodes, so that they cannot be distinguished.
 _NODES = 3000
-# Text of swept values above a map; the electrodes are given by the layout's name.
+# Text that gives the value of a swept parameter above a map; the layout is given by its name.
 _LABELS = {
     "diameter_mm": "⌀ {:g} mm",
     "contact_impedance_ohm_m2": "{:g} Ω m²",
@@ -37,14 +37,14 @@ _LABELS = {
     "noise_V": "noise {:g} V",
     "cell_mm": "cells {:g} mm",
 }
-# Titles of scores whose name in the store needs another word.
+# Titles of scores that differ from the names in the store.
 _TITLES = {"mean": "mean sensitivity", "minimum": "least sensitivity"}
-# Ticks of a logarithmic scale, times powers of ten, and their format.
+# Ticks of a logarithmic scale, as multiples of powers of ten, and the format of their labels.
 _TICKS, _PLAIN_NUMBER = (1.0, 2.0, 5.0), "{x:g}"
 
 
 def draw_scatter(data):
-    """Plot mean against least sensitivity, with a colour for each layout."""
+    """Plot the mean against the minimum sensitivity of every point, with a colour for each layout."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -65,18 +65,19 @@ def draw_scatter(data):
 
 
 def scores_of(data) -> list[str]:
-    """Names of the scores, the arrays with one value for each point."""
+    """Names of the scores, that is of the arrays with one value for each point."""
     return [name for name in data.data_vars if data[name].dims == ("point",)]
 
 
 def values_and_unit(data, name: str) -> tuple[np.ndarray, str]:
-    """Values of a score at every point, and their unit: as in the store, but millivolts for volts."""
+    """Values of a score at every point, and their unit. Volts are converted to millivolts."""
     values, unit = data[name].values, data[name].attrs.get("units", "1")
     return (1e3 * values, "mV") if unit == "V" else (values, unit)
 
 
 def draw_scores(data):
-    """Plot every score, point by point, with a colour for each layout."""
+    """Plot every score against the number of the point, with a colour for each layout. Infinite values are drawn as
+    triangles at the top."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -107,14 +108,15 @@ def draw_scores(data):
 
 
 def shown(data) -> np.ndarray:
-    """Indices of the finished points whose maps are drawn: all, or the largest number allowed, evenly spaced."""
+    """Indices of the finished points whose maps are drawn: all of them, or an evenly spaced selection if there are too
+    many."""
     finished = np.flatnonzero(data.finished.values)
     chosen = np.linspace(0, len(finished) - 1, min(len(finished), _MAPS)).round().astype(int)
     return finished[chosen]
 
 
 def draw_maps(study: Study, data):
-    """Plot the sensitivity maps of the points in `shown`, on one scale, with their electrodes."""
+    """Plot the sensitivity maps of the points chosen by `shown`, with the same colour scale and the electrodes."""
     from matplotlib.collections import EllipseCollection
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
@@ -165,7 +167,7 @@ def draw_maps(study: Study, data):
 
 
 class _Flat:
-    """Maps of flat skins, in millimetres."""
+    """Drawing of maps of flat skins, in millimetres."""
 
     def __init__(self, outline: Rectangle, grid: TouchGrid):
         self.extent, self.grid = tuple(1e3 * length for length in outline.extent), grid
@@ -178,8 +180,8 @@ class _Flat:
 
 
 class _Unrolled:
-    """Maps of curved skins, unrolled, in millimetres; every position has the value of the nearest touch along the
-    surface."""
+    """Drawing of maps of curved skins, unrolled, in millimetres. Every node has the value of the touched position that
+    is nearest along the surface."""
 
     def __init__(self, outline: Triangles, grid: TouchGrid):
         fine = outline
@@ -198,7 +200,7 @@ class _Unrolled:
 
 
 def titles_of(study: Study) -> list[str]:
-    """Title of every point: number and layout, and below them the other values that differ between points, two per
+    """Title of every point: its number and layout, followed by the other parameters that differ between points, two per
     line."""
     coordinates = [point.coordinates for point in study.points]
     varying = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
@@ -215,7 +217,8 @@ def _label(name: str, value) -> str:
 
 
 def _plain(text: str) -> str:
-    """Text that matplotlib shows unchanged: formulas are escaped, and labels that begin with an underscore are kept."""
+    """Escape a text so that matplotlib shows it unchanged: dollar signs start no formula, and a leading underscore does
+    not hide a label."""
     return " " * text.startswith("_") + text.replace("$", r"\$")
 
 
@@ -230,11 +233,12 @@ img { max-width: 100% } pre { background: #f4f4f4; padding: 1em; overflow-x: aut
 
 
 def write_study_report(study: Study, store: str | Path, path: str | Path) -> None:
-    """Write the results so far of the study in `store` as one HTML file at `path`, replaced as a whole.
+    """Write the finished results of the study in `store` as one HTML file at `path`. An existing file is replaced as a
+    whole.
 
-    Maps of 24 finished points at most on one scale; mean against least sensitivity; every point's values and scores;
-    the study file, fingerprint and versions. Raises `ValueError` if no chunk is finished, `OSError` if the page cannot
-    be written, and as `open_results` does.
+    The page shows the maps of up to 24 finished points with the same colour scale, mean against minimum sensitivity,
+    parameters and scores of every point, and the study file, its fingerprint and the versions of packages. Raises
+    `ValueError` if no chunk is finished, `OSError` if the page cannot be written, and as `open_results` does.
     """
     data = open_results(study, store)
     if not data.finished.values.any():
@@ -259,8 +263,8 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
         f"<pre>{escape(study.text)}</pre>",
         f"<p>Fingerprint {study.fingerprint}</p>",
         "<h2>Versions</h2>",
-        f"<p>Computed with {_listed(made_by)}.</p>",
-        f"<p>Reported with {_listed(now)}, Python {platform.python_version()}, {escape(platform.platform())}.</p>",
+        f"<p>Computed with {_list_text(made_by)}.</p>",
+        f"<p>Reported with {_list_text(now)}, Python {platform.python_version()}, {escape(platform.platform())}.</p>",
     ]
     page = (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(study.name)}</title>'
@@ -288,7 +292,7 @@ def _picture(figure: Any, caption: str) -> str:
 
 
 def _table(study: Study, data) -> str:
-    """Table with a row for every point: the swept values, then the results."""
+    """HTML table with a row for every point: the swept parameters, then the scores."""
     swept = list(study.points[0].coordinates)
     found = {name: values_and_unit(data, name) for name in scores_of(data)}
     heads = ["point", *swept, *(name if unit == "1" else f"{name} / {unit}" for name, (_, unit) in found.items())]
@@ -307,5 +311,5 @@ def _cell(value) -> str:
     return f"<td>{'–' if math.isnan(value) else f'{value:.4g}'}</td>"
 
 
-def _listed(versions: dict[str, str]) -> str:
+def _list_text(versions: dict[str, str]) -> str:
     return ", ".join(f"{escape(name)} {escape(version)}" for name, version in versions.items())

@@ -10,19 +10,21 @@ from jeit.arguments import IN_MILLIMETRES, check_metres
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh.generate.unstructured import MOST_POINTS
 
-# Nodes of a plane mesh, times cell size squared over area: 1.155 for equilateral cells, and some for the edge.
+# Number of nodes of a plane mesh, multiplied by (cell size)² / area: 1.155 for equilateral cells, and slightly more due
+# to the nodes on the edge.
 _NODES = 1.2
-# Largest cell size, relative to the smallest diameter of the electrodes.
+# Maximum cell size, relative to the smallest diameter of the electrodes.
 _COARSEST = 1.5
 
 
 def check_cell_size(
     name: str, cell_size: float, layout: Layout | SurfaceLayout, area: float, num_layers: int = 0
 ) -> None:
-    """Raise `ValueError`, with `name` in millimetres in its message, where cells of this size (metres) are too large
-    for the electrodes of `layout`, or too many.
+    """Raise `ValueError` if cells of size `cell_size` (metres) are too large for the electrodes of `layout`, or if
+    there would be too many cells.
 
-    `area` of the skin in m²; `num_layers` of cells, 0 for a sheet.
+    `name`: name of the size in the error message; `area`: area of the skin, m²; `num_layers`: number of layers of
+    cells, 0 for a sheet.
     """
     check_metres(name, cell_size)
     smallest = smallest_diameter(layout)

@@ -1,4 +1,4 @@
-"""The surface of a curved skin from its table: generated, or read from a file."""
+"""Creation of the surface of a curved skin from its table in a TOML file: generated, or read from a file."""
 
 from __future__ import annotations
 
@@ -18,21 +18,22 @@ if TYPE_CHECKING:
     from jeit.design.skin.surface_tables import SurfaceTable
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
-# Plausible extent of a skin, metres, from which the likely unit of a file is determined.
+# Typical extent of a skin, metres, from which the likely unit of a file is determined.
 _USUAL = 0.15
-# An equilateral triangle's side, over the root of its area.
+# Side of an equilateral triangle divided by the square root of its area.
 _SIDE = 2 / 3**0.25
 
 
 def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
-    """Create a surface with cells of `cell_size` metres, or read its file of triangles; paths are relative to `folder`.
+    """Create the surface that `table` describes, with cells of `cell_size` metres, or read its file of triangles; paths
+    are relative to `folder`.
 
-    Raises `ValueError` for a surface that cannot be created or read, or is invalid; `ImportError` for a CAD file
-    without Gmsh.
+    Raises `ValueError` for a surface that cannot be created or read, or is invalid; `ImportError` for a CAD file if
+    Gmsh is not installed.
     """
     try:
-        with size_checked():  # a surface that is too large is rejected
-            surface = _made(table, folder, cell_size)
+        with size_checked():  # no warning about the size, since a surface that is too large is rejected
+            surface = _create_surface(table, folder, cell_size)
     except (ValueError, OSError) as error:
         raise ValueError(f"surface: {error}") from None
     _check_unit(table, surface)
@@ -40,7 +41,7 @@ def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Me
 
 
 def _check_unit(table: SurfaceTable, surface: Mesh) -> None:
-    """Raise `ValueError` for a file whose surface is implausibly large or small, with the likely unit."""
+    """Raise `ValueError` for a file whose surface is implausibly large or small; the message gives the likely unit."""
     from jeit.design.skin.surface_tables import ScanTable
 
     extent = float(np.ptp(np.asarray(surface.points), axis=0).max())
@@ -61,7 +62,7 @@ def _length_text(metres: float) -> str:
 
 
 def surface_identity(table: SurfaceTable, folder: Path) -> str:
-    """Text that identifies a surface; for a file it depends on the content."""
+    """Text that identifies a surface: its table, with a file replaced by the hash of its content."""
     kept = table.model_dump()
     if "file" in kept:
         kept["file"] = hashlib.sha256((folder / kept["file"]).read_bytes()).hexdigest()
@@ -69,11 +70,11 @@ def surface_identity(table: SurfaceTable, folder: Path) -> str:
 
 
 def typical_cell(surface: Mesh) -> float:
-    """Side of an equilateral triangle as large as those of a surface, metres."""
+    """Typical cell size of a surface, metres: side of an equilateral triangle with the mean area of its triangles."""
     return _SIDE * float(np.sqrt(np.mean(np.asarray(measures(surface)))))
 
 
-def _made(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
+def _create_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
     from jeit.design.skin import surface_tables as tables
 
     match table:

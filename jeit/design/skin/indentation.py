@@ -1,4 +1,4 @@
-"""Indentations of a skin's surface by touches: depth as a function of the distance from the centre."""
+"""Indentation of a skin by a touch: depth as a function of the distance from the centre."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jeit_solvers.engines import either_engine, namespace
 
 
 class AbstractIndentation(eqx.Module):
-    """Base class of indentations. A new indentation is one subclass."""
+    """Base class of indentations: to define a new indentation, subclass it."""
 
     @abc.abstractmethod
     def depth_at(self, distance: Float[Array | np.ndarray, "..."]) -> Float[Array | np.ndarray, "..."]:
@@ -27,40 +27,43 @@ class AbstractIndentation(eqx.Module):
 
 
 class Bell(AbstractIndentation):
-    """depth · exp(−r² / (2 deviation²)): by default the unit deformation of Park et al. 2022, text S4.
+    """Gaussian indentation depth · exp(−r² / (2 deviation²)) at distance r; with the default values, the unit
+    deformation of Park et al. 2022, text S4.
 
-    Cut off at three deviations, where it is a hundredth of its depth.
+    It is set to 0 beyond r = 3 deviation, where it has dropped to about a hundredth of `depth`.
     """
 
     depth: float
     deviation: float
 
     def __init__(self, depth: float = DEPTH, deviation: float = DEVIATION):
-        """Both in metres."""
+        """`depth`: maximum depth, metres; `deviation`: standard deviation of the Gaussian, metres."""
         self.depth = check_length("depth", depth)
         self.deviation = check_length("deviation", deviation)
 
     @either_engine
     def depth_at(self, distance):
-        """Depth of the bell at distances (metres), metres."""
+        """Depth in metres at horizontal distances (metres) from the centre."""
         xp = namespace(self, distance)
         distance = xp.asarray(distance)
         return xp.where(distance < self.reach, self.depth * xp.exp(-0.5 * (distance / self.deviation) ** 2), 0.0)
 
     @property
     def reach(self) -> float:
-        """Three deviations."""
+        """Distance beyond which the depth is 0: three times the deviation, metres."""
         return 3 * self.deviation
 
 
 class Hemisphere(AbstractIndentation):
-    """A rigid ball pressed in: depth − (R − √(R² − r²)) where that is positive; 15 mm across, as in the experiments."""
+    """Indentation by a rigid ball of radius R: depth − (R − √(R² − r²)) at distance r where this is positive, otherwise
+    0. The default diameter of 15 mm is that of the experiments of Park et al. 2022."""
 
     depth: float
     diameter: float
 
     def __init__(self, depth: float = DEPTH, diameter: float = BALL_DIAMETER):
-        """Both in metres. Raises `ValueError` for a ball pressed in beyond its middle."""
+        """`depth`: maximum depth, metres; `diameter`: diameter of the ball, metres. Raises `ValueError` for a depth
+        greater than the radius of the ball."""
         self.depth = check_length("depth", depth)
         self.diameter = check_length("diameter", diameter)
         if self.depth > self.diameter / 2:
@@ -71,12 +74,12 @@ class Hemisphere(AbstractIndentation):
 
     @either_engine
     def depth_at(self, distance):
-        """Depth of the ball at distances (metres), metres."""
+        """Depth in metres at horizontal distances (metres) from the centre of the ball."""
         xp, radius = namespace(self, distance), self.diameter / 2
         height = xp.sqrt(xp.maximum(radius**2 - xp.asarray(distance) ** 2, 0.0))
         return xp.maximum(self.depth - radius + height, 0.0)
 
     @property
     def reach(self) -> float:
-        """Radius of the cap's rim."""
+        """Distance beyond which the depth is 0: the radius of the contact area, metres."""
         return float((self.depth * (self.diameter - self.depth)) ** 0.5)

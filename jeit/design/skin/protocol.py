@@ -24,11 +24,15 @@ def skin_protocol(
     num_pairs: int | None = None,
     current: float = CURRENT,
 ) -> Protocol:
-    """Create the measurement protocol of a skin with electrodes of `layout`, at `current` amperes.
+    """Create the measurement protocol of a skin with electrodes of `layout`.
 
-    `num_pairs`, for "two-terminal" only: number of the pairs of nearest electrodes, on a curved skin by the distance
-    along it, 0 for all pairs; 94 unless given, as in Park et al. 2022, or all if there are fewer. Raises `ValueError`
-    for another name, more pairs than there are, pairs of another protocol, and as the protocols do.
+    - `name`: name of the protocol; `current`: injected current, amperes.
+    - `num_pairs`: for "two-terminal" only: number of pairs of nearest electrodes that are measured, 0 for all pairs. On
+      a curved skin, distances are along the surface. The default is 94 pairs, as in Park et al. 2022, or all pairs if
+      there are fewer.
+
+    Raises `ValueError` for an unknown name, for more pairs than exist, for `num_pairs` with another protocol, and as
+    the functions of the protocols do.
     """
     check_layout("layout", layout)
     check_name("protocol", name, PROTOCOLS)
@@ -44,7 +48,7 @@ def skin_protocol(
 
 
 def number_of_pairs(layout: Layout | SurfaceLayout, num_pairs: int | None) -> int:
-    """Number of measured pairs, as in `skin_protocol`. Raises `ValueError` for more than there are."""
+    """Number of measured pairs, as in `skin_protocol`. Raises `ValueError` for more pairs than exist."""
     pairs = layout.num_electrodes * (layout.num_electrodes - 1) // 2
     if num_pairs is None:
         return min(NUM_PAIRS, pairs)

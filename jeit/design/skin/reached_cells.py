@@ -1,4 +1,4 @@
-"""Cells of a skin within reach of a touch: distance along the surface, and depth below it (NumPy)."""
+"""Search for the cells of a skin within reach of a touch, by distance along the surface and depth below it (NumPy)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from scipy.spatial import KDTree
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geodesic import Geodesics, Triangles
 
-# Distance that positions may be off a curved skin's surface, relative to its thickness or cells.
+# Maximum distance of positions from the surface of a curved skin, relative to its thickness, or to the size of the
+# cells of a sheet.
 _OFF = 0.5
 
 
 class ReachedCells(NamedTuple):
-    """Cells within reach of n touches: `near`, the indices of each touch's cells, and `distance`, metres from its
-    position along the surface; `below` (m,), metres from the surface to every cell's middle, infinite for those deeper
-    than asked for; and `thickness` of a layer, metres, None of a sheet."""
+    """Cells within reach of n touches.
+
+    **Fields**: `near`: indices of the cells of each touch; `distance`: distances of their centroids from the position
+    of the touch along the surface, metres; `below` (m,): depth of the centroid of every cell of the mesh below the
+    surface, metres; `thickness`: thickness of a layer, metres, None for a sheet.
+    """
 
     near: list[Int[np.ndarray, " c"]]
     distance: list[Float[np.ndarray, " c"]]
@@ -27,23 +31,23 @@ class ReachedCells(NamedTuple):
 
 
 def is_curved(mesh: Mesh) -> bool:
-    """Whether a mesh is a surface in space, or a shell of one."""
+    """Whether a mesh is a surface in space, or a shell on such a surface."""
     return mesh.is_surface or {"inner", "outer"} <= set(mesh.tags)
 
 
 def touched_surface(mesh: Mesh, face: str = "outer") -> Triangles:
-    """The touched surface of a curved skin: a sheet itself, or the `face` of a shell."""
+    """The touched surface of a curved skin: the sheet itself, or the `face` of a shell."""
     return Triangles.of(mesh, None if mesh.is_surface else face)
 
 
 def reached_cells(
     mesh: Mesh, places: Float[np.ndarray, "n d"], reach: float, deepest: float, face: str = "outer"
 ) -> ReachedCells:
-    """Find the cells whose centroids lie within `reach` of `places` along the surface, and less than `deepest` below
-    it, metres.
+    """Find the cells whose centroids lie within `reach` metres of `places` along the surface, and less than `deepest`
+    metres below it.
 
-    Depths of a flat layer are below its top, at its greatest z; of a shell below its `face`, along the inward normal.
-    Raises `ValueError` for places off a curved surface.
+    In a flat layer, depth is measured from its top, at the maximum z; in a shell, from its `face` along the inward
+    normal. Raises `ValueError` for positions that are not on a curved surface.
     """
     middle = np.asarray(centroids(mesh))
     if is_curved(mesh):
@@ -80,7 +84,7 @@ def _on_surface(mesh: Mesh, middle, places, reach: float, deepest: float, face: 
 
 
 def shell_thickness(mesh: Mesh) -> float:
-    """Thickness of a shell, metres: the median distance of the nodes of its inner face from the outer one."""
+    """Thickness of a shell, metres: the median distance of the nodes of its inner face from its outer face."""
     inner = Triangles.of(mesh, "inner").points
     return float(np.median(Triangles.of(mesh, "outer").nearest(inner).away))
 

@@ -1,4 +1,4 @@
-"""`RestingSkin`: precomputed quantities of an untouched skin, for exact voltage changes by any number of touches."""
+"""`RestingSkin`: precomputed quantities of an untouched skin, for exact voltage changes due to many touches."""
 
 from __future__ import annotations
 
@@ -17,16 +17,22 @@ from jeit.forward.transfer import fields_and_inverse
 from jeit_solvers import NearInverse, Strips, over_cores
 from jeit_solvers.engines import on_device
 
-# Touches per call of a compiled program; and sizes to which nodes and cells are padded: one program is compiled for
-# each size, and the cost of a touch grows with the square of its nodes.
+# Number of touches per call of a compiled program, and ratios of successive sizes to which the numbers of nodes and of
+# cells are padded. One program is compiled for each size, and the cost of a touch grows with the square of its number
+# of nodes.
 _TOGETHER, _NODES, _CELLS = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
 
 
 class RestingSkin(eqx.Module):
-    """An untouched skin, with its inverse system matrix between all nodes that may be touched.
+    """An untouched skin, with the entries of its inverse system matrix for all pairs of nodes that may be touched.
 
-    **Fields**: `model`; `rest` (M,), its voltages, volts; `element` (m, q, q), the cells' parts of its matrix; `strips`
-    of the nodes that may be touched; the `fields` there and the `inverse` between any two of them.
+    **Fields**
+
+    - `model`: its forward model; `rest` (M,): its voltages, volts.
+    - `element` (m, q, q): contribution of each cell to the system matrix.
+    - `strips`: the nodes that may be touched, ordered in strips across the skin.
+    - `fields` (p, L): potentials at these nodes for unit currents into the electrodes; `inverse`: entries of the
+      inverse system matrix for pairs of these nodes.
     """
 
     model: ForwardModel
@@ -40,9 +46,12 @@ class RestingSkin(eqx.Module):
     def create(
         cls, model: ForwardModel, conductivity, touchable: Bool[np.ndarray, " n"], *, most: float = 2**31
     ) -> "RestingSkin | None":
-        """Of a model with a `conductivity`, S/m (2-D: S), whose nodes `touchable` (n,) touches may reach; None where
-        the inverse would take more than `most` bytes, 8 for each pair of these nodes and some more. Raises `ValueError`
-        for what is no model and no conductivity."""
+        """Precompute the quantities of a model with a `conductivity`, S/m (2-D: S).
+
+        `touchable`: mask (n,) of the nodes that touches may reach. Returns None if the inverse would take more than
+        `most` bytes; it takes slightly more than 8 bytes for each pair of these nodes. Raises `ValueError` if `model`
+        is not a forward model, and for an invalid conductivity.
+        """
         check_model(model)
         conductivity = cell_conductivity(model.mesh, check_conductivity(model.mesh, conductivity))
         strips = Strips.create(model.system.pattern, np.asarray(model.mesh.points), np.asarray(touchable))
@@ -54,18 +63,20 @@ class RestingSkin(eqx.Module):
         return cls(model, rest, cell_stiffness(model, conductivity), strips, *known)
 
     def changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
-        """Changes (n, M) of its voltages by n touches, one at a time, volts; exact, as of `touch_changes`, and raises
-        `RuntimeError` as that does."""
+        """Compute the exact voltage changes (n, M) due to n single touches, volts, as `touch_changes` does. Raises
+        `RuntimeError` as `touch_changes` does."""
         at = touched_nodes(self.model, touched, self.strips)
         cells, change = np.asarray(touched.cells), np.asarray(touched.change)
         used = np.count_nonzero(change, axis=1)
-        sizes = np.stack([_size((at.nodes < at.nodes[:, -1:]).sum(axis=1) + 1, _NODES), _size(used, _CELLS)], axis=1)
+        sizes = np.stack(
+            [_padded_size((at.nodes < at.nodes[:, -1:]).sum(axis=1) + 1, _NODES), _padded_size(used, _CELLS)], axis=1
+        )
         found = np.zeros((len(cells), self.model.protocol.num_measurements))
         known = self.fields, self.inverse
         for size in np.unique(sizes[used > 0], axis=0):
             alike = np.flatnonzero((sizes == size).all(axis=1) & (used > 0))
-            nodes = _wide(at.nodes, size[0], "edge")
-            arrays = (_wide(one, size[1], "constant") for one in (cells, change, at.corners))
+            nodes = _pad_rows(at.nodes, size[0], "edge")
+            arrays = (_pad_rows(one, size[1], "constant") for one in (cells, change, at.corners))
             cells_of, change_of, corners = arrays
             for some in np.split(alike, range(_TOGETHER, len(alike), _TOGETHER)):
                 rows = some[np.minimum(np.arange(_TOGETHER), len(some) - 1)]
@@ -76,13 +87,13 @@ class RestingSkin(eqx.Module):
         return found
 
 
-def _size(number, factor: float):
-    """Round up to one of a series of sizes, each `factor` times the one before; multiples of 16."""
+def _padded_size(number, factor: float):
+    """Round a number up to the next of a series of multiples of 16, each about `factor` times the previous one."""
     power = np.ceil(np.log(np.maximum(number, 16) / 16) / np.log(factor) - 1e-9)
     return (np.ceil(factor**power - 1e-9) * 16).astype(int)
 
 
-def _wide(rows: np.ndarray, size: int, mode) -> np.ndarray:
+def _pad_rows(rows: np.ndarray, size: int, mode) -> np.ndarray:
     """Truncate or pad rows (n, k, …) to `size` entries."""
     missing = max(size - rows.shape[1], 0)
     return np.pad(rows[:, :size], [(0, 0), (0, missing), *[(0, 0)] * (rows.ndim - 2)], mode)

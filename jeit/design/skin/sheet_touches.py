@@ -1,4 +1,4 @@
-"""Touches of a sheet whose voltage changes are differentiable in the positions touched."""
+"""Touches of a sheet, with the derivatives of their conductivity changes with respect to the touched positions."""
 
 from __future__ import annotations
 
@@ -17,11 +17,16 @@ from jeit_solvers.engines import gather, host, namespace, sum_into
 
 
 class SheetTouches(eqx.Module):
-    """Touches of a sheet at n positions, with derivatives in the positions; create them with `sheet_touches`.
+    """Touches of a sheet at n positions, with derivatives with respect to the positions; create them with
+    `sheet_touches`.
 
-    **Fields**: `touched`; `slope` (n, c, 2), the derivative of `touched.change` in the place, per metre, on a curved
-    sheet in two directions at right angles along it; `thickness` of the layer that the sheet stands for and `depth` of
-    the touches, metres.
+    **Fields**
+
+    - `touched`: the touched cells and their conductivity changes.
+    - `slope` (n, c, 2): derivative of `touched.change` with respect to the position, per metre; on a curved sheet in
+      two orthogonal tangential directions.
+    - `thickness`: thickness of the layer that the sheet represents, metres; `depth`: maximum depth of the touches,
+      metres.
     """
 
     touched: TouchedCells
@@ -30,14 +35,15 @@ class SheetTouches(eqx.Module):
     depth: float
 
     def at_thickness(self, thickness) -> "SheetTouches":
-        """The same touches of a layer of another thickness, metres; their changes are proportional to depth /
-        thickness."""
+        """The same touches on a layer of another `thickness`, metres; the conductivity changes are proportional to
+        depth / thickness."""
         share = self.thickness / thickness
         touched = eqx.tree_at(lambda one: one.change, self.touched, self.touched.change * share)
         return SheetTouches(touched, self.slope * share, jnp.asarray(thickness), self.depth)
 
     def weights(self, conductivity: Float[Array, " m"]) -> tuple[Float[Array, "n m"], Float[Array, "2 n m"]]:
-        """Change of every cell's conductivity by every touch, siemens, and its derivative in the place."""
+        """Change of the conductivity of every cell by every touch (n, m), siemens, and its derivatives with respect to
+        the two coordinates of the position (2, n, m), siemens per metre."""
         cells = self.touched.cells
         index = np.arange(len(cells))[:, None], cells
 
@@ -51,31 +57,31 @@ class SheetTouches(eqx.Module):
 def sheet_touches(
     mesh: Mesh, indentation: AbstractIndentation, places, *, thickness: float, contrast: float = CONTRAST
 ) -> SheetTouches:
-    """Compute the touches of a sheet (2-D mesh) of a layer of `thickness` metres at `places` (n, 2), metres.
+    """Compute touches at `places` (n, 2), metres, of a sheet (2-D mesh) that represents a layer of `thickness` metres.
 
-    Other arguments as in `touched_cells`. The derivative is that of the indentation's depth at the centroids. Raises
-    `ValueError` as `touched_cells` does, and for a mesh that is no sheet.
+    Other arguments as in `touched_cells`. The derivatives are those of the indentation's depth at the centroids of the
+    cells. Raises `ValueError` as `touched_cells` does, and for a mesh that is not a sheet.
     """
     if mesh.dimension != 2:
         raise ValueError(f"mesh is {mesh.dimension}-D; these touches are of the equivalent sheet, with a 2-D mesh.")
     touched = touched_cells(mesh, indentation, places, thickness=thickness, contrast=contrast)
 
     def change(place, middle):
-        # The root has no derivative at 0; a thousandth of a micrometre is nothing to a depth.
+        # The square root has no derivative at 0; adding a nanometre does not change the depth noticeably.
         distance = jnp.sqrt(jnp.sum((place - middle) ** 2) + 1e-18)
         return (contrast - 1) * indentation.depth_at(distance) / thickness
 
     middles, origin = centroids(mesh)[touched.cells], touched.places
     if mesh.is_surface:
-        middles, origin = _laid_out(mesh, touched, indentation.reach), jnp.zeros_like(origin[:, :2])
+        middles, origin = _flatten_centroids(mesh, touched, indentation.reach), jnp.zeros_like(origin[:, :2])
     slope = jax.jit(jax.vmap(jax.vmap(jax.grad(change), (None, 0))))(origin, middles)
     slope = jnp.where(touched.change[..., None] != 0, slope, 0.0)
     return SheetTouches(touched, slope, jnp.asarray(thickness, float), float(indentation.depth_at(host.zeros(()))))
 
 
-def _laid_out(mesh: Mesh, touched: TouchedCells, reach: float) -> Float[np.ndarray, "n c 2"]:
-    """Centroids of touched cells in the tangent plane at their touch's position, at the distance measured along the
-    surface."""
+def _flatten_centroids(mesh: Mesh, touched: TouchedCells, reach: float) -> Float[np.ndarray, "n c 2"]:
+    """Map the centroids of touched cells to the tangent plane at the position of their touch, keeping the distance
+    along the surface: coordinates (n, c, 2) relative to that position, metres."""
     surface, places, cells = Triangles.of(mesh), np.asarray(touched.places), np.asarray(touched.cells)
     middles = np.asarray(centroids(mesh))
     normal = surface.normals_at(surface.nearest(places))

@@ -1,4 +1,4 @@
-"""`Skin`: a layout of electrodes in a sheet or on the bottom of a layer, flat or curved, with its mesh and touches."""
+"""`Skin`: electrodes in a sheet or on the bottom of a layer, flat or curved, with the mesh and the touches."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
 from jeit_solvers.engines import host
 
-# Thickness of a layer of cells, relative to a touch's depth: centroids of the uppermost are a quarter of it deep.
+# Maximum thickness of a layer of cells, relative to the depth of a touch: the uppermost centroids are at a quarter of
+# the thickness of their layer.
 _THICKEST = 3.0
 
 
 class Skin(eqx.Module):
-    """A skin of one layout: disc electrodes in a sheet, or on the bottom of a layer that is touched on its top.
+    """A tactile skin: disc electrodes in a sheet, or on the bottom of a layer that is touched on its top.
 
-    With a `SurfaceLayout` the sheet or the layer is curved; touched positions are (n, 3), on its surface, and all else
-    is the same.
+    With a `SurfaceLayout` the sheet or the layer is curved, and touched positions are points (n, 3) on its surface.
 
     **Fields**
 
-    - `layout`: of the electrodes, with the skin's outline, or its surface.
-    - `model`: its forward model: mesh, electrodes and protocol.
-    - `thickness`: metres; for a sheet, that of the layer which it represents.
-    - `conductivity`: of the material, S/m, one number or one for each cell.
+    - `layout`: layout of the electrodes, with the outline of the skin, or its surface.
+    - `model`: forward model, with mesh, electrodes and protocol.
+    - `thickness`: thickness, metres; for a sheet, thickness of the layer that it represents.
+    - `conductivity`: conductivity of the material, S/m, one value or one for each cell.
     - `num_layers`: number of layers of cells; 0 for a sheet.
-    - `cell_size`: metres, of the plane mesh, if it was given.
+    - `cell_size`: cell size of the plane mesh, metres; None if it was not given.
 
-    Create it with `Skin.create`, which checks the arguments and makes the mesh; or from a custom `model` of
-    `SheetDiscs` (`SurfaceDiscs` on a curved sheet) or `FaceDiscs`.
+    Create it with `Skin.create`, which checks the arguments and makes the mesh, or from a custom `model` with
+    electrodes of class `SheetDiscs` (`SurfaceDiscs` on a curved sheet) or `FaceDiscs`.
     """
 
     layout: Layout | SurfaceLayout
@@ -69,7 +69,8 @@ class Skin(eqx.Module):
         num_layers: int = 0,
         cell_size: float | None = None,
     ):
-        """Raises `ValueError` for a model of other electrodes, or of another dimension."""
+        """Raises `ValueError` for a model with electrodes of another class or number, and for an invalid thickness or
+        conductivity."""
         sheet = SurfaceDiscs if isinstance(layout, SurfaceLayout) else SheetDiscs
         wanted = FaceDiscs if num_layers else sheet
         if not isinstance(model.electrodes, wanted):
@@ -103,13 +104,17 @@ class Skin(eqx.Module):
     ) -> "Skin":
         """Create a skin with electrodes of `layout`: check the arguments and make the mesh.
 
-        `thickness` in metres, `conductivity` in S/m. `contact_impedance` of the electrodes, ohm·m²: the layout's unless
-        given, and 1e-4 where it does not say. `num_layers` of cells, 0 for a sheet. `cell_size`, metres (4.5e-3), or
-        `num_points`, about, of the plane mesh; a `SurfaceLayout` has its own. `protocol`: that of
-        `skin_protocol(layout)` unless given.
+        - `thickness`: metres; `conductivity`: S/m.
+        - `contact_impedance`: contact impedance of the electrodes, ohm·m²; by default that of the layout, or 1e-4 if
+          the layout has none.
+        - `num_layers`: number of layers of cells, 0 for a sheet.
+        - `cell_size`: cell size of the plane mesh, metres (default 4.5e-3), or `num_points`: approximate number of its
+          nodes. Not for a `SurfaceLayout`, whose surface is a mesh already.
+        - `protocol`: measurement protocol, by default `skin_protocol(layout)`.
 
-        Raises `ValueError` for a layout without an outline, a skin thicker than wide, cells too small for any mesh,
-        electrodes too small for them, and as `jeit.mesh.shell` does, for a skin thicker than it is curved.
+        Raises `ValueError` for a layout without an outline, a skin that is thicker than wide, cells so small that the
+        mesh would have too many nodes, electrodes too small for the cells, and as `jeit.mesh.shell` does if the
+        thickness exceeds the radius of curvature.
         """
         check_layout("layout", layout)
         if isinstance(layout, SurfaceLayout):
@@ -136,31 +141,32 @@ class Skin(eqx.Module):
 
     @property
     def outline(self) -> Domain | Triangles:
-        """Outline of the skin, metres; for a curved one the touched surface."""
+        """Outline of the skin, metres; for a curved skin, the touched surface."""
         if isinstance(self.layout, SurfaceLayout):
             return touched_surface(self.model.mesh, self.touched_face)
         return self.layout.known_outline
 
     @property
     def flat_outline(self) -> Domain:
-        """Outline of a flat skin, metres. Raises `ValueError` for a curved one, which has none."""
+        """Outline of a flat skin, metres. Raises `ValueError` for a curved skin."""
         return flat_layout(self.layout).known_outline
 
     @property
     def touched_face(self) -> str:
-        """The touched face of a curved layer: "outer", or "inner" where its electrodes are on the outer one."""
+        """The touched face of a curved layer: "outer", or "inner" if its electrodes are on the outer face."""
         inward = isinstance(self.layout, SurfaceLayout) and not self.layout.outward
         return "inner" if inward else "outer"
 
     @property
     def model_conductivity(self) -> Float[Array, "..."]:
-        """Conductivity for the forward model: the material's in S/m for a layer, a sheet's in siemens."""
+        """Conductivity for the forward model: that of the material in S/m for a layer, the sheet conductivity in
+        siemens for a sheet."""
         return model_conductivity(self.conductivity, self.thickness, self.num_layers)
 
     def with_layout(self, layout: Layout | SurfaceLayout, contact_impedance: ArrayLike | None = None) -> "Skin":
-        """The same skin, on the same mesh and with the same protocol, with as many electrodes of another layout.
+        """The same skin with the electrodes of another layout, which must be as many; mesh and protocol are unchanged.
 
-        `contact_impedance` as in `create`. Raises `ValueError` for electrodes off the mesh or too small for it.
+        `contact_impedance` as in `create`. Raises `ValueError` for electrodes outside the mesh or too small for it.
         """
         electrodes, mesh = skin_electrodes(layout, self.num_layers, contact_impedance), self.model.mesh
         if self.cell_size is None or isinstance(layout, SurfaceLayout):
@@ -174,11 +180,11 @@ class Skin(eqx.Module):
     def touched_cells(
         self, places: ArrayLike, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
     ) -> TouchedCells:
-        """Conductivity changes by single touches at `places` (n, 2), on a curved skin (n, 3), metres; the indentation
-        is `Bell` unless given, as in `touched_cells`.
+        """Compute the conductivity changes due to single touches at `places` (n, 2), on a curved skin (n, 3), metres.
 
-        Raises `ValueError` for touches as deep as the skin, for a touch that changes no cell, as where a layer has too
-        few layers of cells, and for a contrast that changes nothing.
+        `indentation`: shape of the touches, by default `Bell()`; `contrast`: as in the function `touched_cells`. Raises
+        `ValueError` for touches as deep as the skin, for a touch that changes no cell, for instance because there are
+        too few layers of cells, and for a contrast of 1, which changes nothing.
         """
         indentation = Bell() if indentation is None else indentation
         if not self.num_layers:
@@ -203,23 +209,24 @@ class Skin(eqx.Module):
     def sheet_touches(
         self, places: ArrayLike, indentation: AbstractIndentation | None = None, *, contrast: float = CONTRAST
     ) -> SheetTouches:
-        """Touches of a sheet, with derivatives in the positions. Raises `ValueError` as `sheet_touches` does."""
+        """Compute touches of a sheet, with derivatives with respect to the positions; arguments as in `touched_cells`.
+        Raises `ValueError` as the function `sheet_touches` does."""
         indentation = Bell() if indentation is None else indentation
         return sheet_touches(self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast)
 
     def voltage_changes(self, touched: TouchedCells, *, linear: bool = False) -> Float[Array, "n M"]:
-        """Changes (n, M) of the voltages by touches, volts: exact, or linear; errors and limits as in
-        `touch_changes`."""
+        """Compute the voltage changes (n, M) due to touches, volts: exact, or linearised if `linear`. Errors and limits
+        as in `touch_changes`."""
         return touch_changes(self.model, self.model_conductivity, touched, linear=linear)
 
 
 def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Protocol], **options) -> list[Skin]:
-    """Create skins from layouts and their protocols, with `options` of `Skin.create`, whose errors it raises.
-    Consecutive layouts with the same outline and number of electrodes share one mesh and the plan of its
-    factorisation."""
+    """Create skins from layouts and their protocols, with `options` of `Skin.create`, and raise errors as it does.
+    Consecutive layouts with the same outline and number of electrodes share one mesh and the symbolic factorisation of
+    its system matrix."""
     made: list[Skin] = []
     for layout, protocol in zip(layouts, protocols, strict=True):
-        if made and _serves(made[-1], layout):
+        if made and _can_share_mesh(made[-1], layout):
             moved = made[-1].with_layout(layout, options.get("contact_impedance"))
             made.append(eqx.tree_at(lambda one: one.model, moved, moved.model.with_protocol(protocol)))
         else:
@@ -227,30 +234,30 @@ def skins_of(layouts: Sequence[Layout | SurfaceLayout], protocols: Sequence[Prot
     return made
 
 
-def _serves(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
-    """Whether the mesh of a skin can be used for a layout too."""
+def _can_share_mesh(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
+    """Whether the mesh of a skin can be used for another layout."""
     if isinstance(layout, SurfaceLayout):
         own = skin.layout
-        if not isinstance(own, SurfaceLayout) or own.outward != layout.outward or not _as_many(skin, layout):
+        if not isinstance(own, SurfaceLayout) or own.outward != layout.outward or not _same_number(skin, layout):
             return False
         return bool(eqx.tree_equal(own.surface, layout.surface))
     if isinstance(skin.layout, SurfaceLayout):
         return False
     same = eqx.tree_equal(skin.outline, plain_outline(layout.known_outline))
-    return bool(same) and _as_many(skin, layout)
+    return bool(same) and _same_number(skin, layout)
 
 
-def _as_many(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
+def _same_number(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
     return layout.num_electrodes == skin.layout.num_electrodes
 
 
 def check_skin(name: str, given) -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no `Skin`."""
+    """Raise `ValueError`, about the argument `name`, unless `given` is a `Skin`."""
     check_kind(name, given, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
 
 
 def longer_side(outline: Domain | Triangles) -> float:
-    """The longer side of an outline's bounding box, metres."""
+    """Longest side of the bounding box of an outline, metres."""
     if isinstance(outline, Triangles):
         return float(np.ptp(outline.points, axis=0).max())
     low_x, high_x, low_y, high_y = outline.extent
@@ -258,12 +265,14 @@ def longer_side(outline: Domain | Triangles) -> float:
 
 
 def model_conductivity(conductivity, thickness, num_layers: int):
-    """Conductivity for a forward model: the material's `conductivity`, S/m, for a layer, a sheet's in siemens."""
+    """Conductivity for a forward model: the `conductivity` of the material, S/m, for a layer; for a sheet, multiplied
+    by the thickness, in siemens."""
     return conductivity if num_layers else conductivity * thickness
 
 
 def plain_outline(outline: Domain) -> Domain:
-    """Replace an outline of four corners by a rectangle if it is one, so that it is meshed as such."""
+    """Replace an outline that is an axis-parallel rectangle by a `Rectangle`, so that it is meshed as one; return other
+    outlines unchanged."""
     if [len(loop) for loop in outline.loops()] != [4]:
         return outline
     low_x, high_x, low_y, high_y = outline.extent
@@ -276,8 +285,8 @@ def plain_outline(outline: Domain) -> Domain:
 def curved_model(
     layout: SurfaceLayout, thickness: float, num_layers: int, contact_impedance, protocol: Protocol | None
 ) -> ForwardModel:
-    """Create the forward model of a sheet that is the layout's surface, or of a shell of it. Raises `ValueError` as
-    `Skin.create` does."""
+    """Create the forward model of a curved skin: a sheet on the surface of the layout, or a shell if `num_layers` > 0.
+    Raises `ValueError` as `Skin.create` does."""
     surface = layout.surface
     check_metres("thickness", thickness, longer_side(Triangles.of(surface)), "the skin is wide")
     mesh = shell(surface, thickness, num_layers, outward=layout.outward) if num_layers else surface
@@ -288,8 +297,8 @@ def curved_model(
 def skin_electrodes(
     layout: Layout | SurfaceLayout, num_layers: int, contact_impedance=None
 ) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
-    """Create disc electrodes in a sheet (`num_layers` 0), or on the bottom of a layer. Contact impedance in ohm·m²: the
-    layout's unless given, and 1e-4 where it does not say."""
+    """Create disc electrodes in a sheet (`num_layers` = 0), or on the bottom of a layer. `contact_impedance`: in
+    ohm·m², by default that of the layout, or 1e-4 if the layout has none."""
     if contact_impedance is None and layout.contact_impedance is None:
         contact_impedance = CONTACT_IMPEDANCE
     if isinstance(layout, SurfaceLayout):

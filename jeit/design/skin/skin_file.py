@@ -1,4 +1,4 @@
-"""Files that describe a skin: the tables of their keys, and how they are read."""
+"""TOML files that describe a skin: tables of their keys, and reading."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LAYERS = Number(1, 50)
 
 
 class MaterialTable(Table):
-    """The skin's model and material."""
+    """Table "skin": model, size and material of the skin."""
 
     what = "a skin"
     model: Literal["sheet", "layer"] = "sheet"
@@ -41,7 +41,7 @@ class MaterialTable(Table):
 
 
 class LayoutTable(Table):
-    """The electrodes. NaN means the layout's own value."""
+    """Table "electrodes": layout, diameter and contact impedance. NaN stands for the value of the layout."""
 
     what = "a skin"
     layout: Word
@@ -50,7 +50,7 @@ class LayoutTable(Table):
 
 
 class MeasurementTable(Table):
-    """The measurement protocol."""
+    """Table "measurement": the measurement protocol."""
 
     what = "a skin"
     protocol: ProtocolName = defaults.PROTOCOL
@@ -59,7 +59,7 @@ class MeasurementTable(Table):
 
 
 class CellsTable(Table):
-    """The mesh."""
+    """Table "mesh": cell size and number of layers."""
 
     what = "a skin"
     cell_mm: Annotated[float, CELL] = 1e3 * defaults.CELL_SIZE
@@ -67,7 +67,7 @@ class CellsTable(Table):
 
 
 class SkinTable(Table):
-    """A complete skin file."""
+    """All tables of a skin file."""
 
     what = "a skin"
     skin: MaterialTable = MaterialTable()
@@ -83,7 +83,7 @@ class SkinTable(Table):
 
 
 def describes_skin(path: str | Path) -> bool:
-    """True for a TOML file with a table "skin", even if it is invalid otherwise; False for any other file."""
+    """Whether a file is a TOML file with a table "skin", even if it is invalid otherwise."""
     try:
         return isinstance(read_toml(path).get("skin"), dict)
     except (OSError, ValueError):
@@ -91,28 +91,30 @@ def describes_skin(path: str | Path) -> bool:
 
 
 def read_described_skin(path: str | Path) -> Skin:
-    """Read the skin that a TOML file describes: tables skin, electrodes (with `layout`, a name or a file beside it),
-    measurement and mesh, as in a study file, each key with one value and all but the layout with a default; of a curved
-    skin the table surface, too.
+    """Read the skin that a TOML file describes.
 
-    Raises `FileNotFoundError`, and `ValueError` for files that are not TOML, for unknown keys and invalid values, and
-    as `Skin.create` does.
+    The file has the tables skin, electrodes, measurement and mesh of a study file, and for a curved skin the table
+    surface. Every key has a single value. Only `layout` in the table electrodes is required, a name or a file in the
+    same folder; all other keys have defaults.
+
+    Raises `FileNotFoundError` if there is no such file, and `ValueError` for files that are not TOML, for unknown keys
+    and invalid values, and as `Skin.create` does.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"'{path}': there is no such file.")
-    # pydantic takes longer to import than most of what jeit does with a skin's file.
+    # Imported late, since the import of pydantic takes longer than most operations on a skin file.
     from jeit.files.limits import faults_message
     from jeit.files.schema import validated
 
     table = validated(SkinTable, read_toml(path), path.name)
     try:
-        return _made(table, path.parent)
+        return _create_skin(table, path.parent)
     except ValueError as error:
         raise ValueError(faults_message(path.name, [str(error)])) from None
 
 
-def _made(table: SkinTable, folder: Path) -> Skin:
+def _create_skin(table: SkinTable, folder: Path) -> Skin:
     material, electrodes, measurement = table.skin, table.electrodes, table.measurement
     diameter, impedance, cell_size = (
         1e-3 * electrodes.diameter_mm,

@@ -1,4 +1,4 @@
-"""Tables of a curved skin's surface by its kind: type, range and unit of every key."""
+"""Tables that describe the surface of a curved skin in a TOML file: type, range and unit of every key."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TubeTable(Table):
 
 
 class ForearmTable(Table):
-    """A tapered sleeve: a radius, or the half widths of an oval, of either end."""
+    """A tapered sleeve: each end is given by a radius, or by the two half widths of an oval."""
 
     what = "a forearm"
     kind: Literal["forearm"]
@@ -65,7 +65,7 @@ class BentSheetTable(Table):
 
 
 class ScanTable(Table):
-    """A file of triangles or a CAD file, with its unit of length."""
+    """A surface from a file of triangles or a CAD file, with the unit of length."""
 
     what = "a surface's file"
     file: Word
@@ -74,7 +74,7 @@ class ScanTable(Table):
 
     @property
     def has_cells(self) -> bool:
-        """Whether the triangles of the file are the cells; those of a CAD file are made by Gmsh."""
+        """Whether the triangles of the file are used as cells; a CAD file is meshed by Gmsh instead."""
         return not self.file.lower().endswith(CAD)
 
 
@@ -83,7 +83,7 @@ SURFACE = OneOf("kind", TubeTable, ForearmTable, SphereTable, CapTable, BentShee
 
 
 def check_of_curved(surface: SurfaceTable | None, skin: Table, mesh: Table) -> None:
-    """Raise a fault for keys of the tables `skin` and `mesh` that have no effect on a skin with this surface."""
+    """Raise an error for keys of the tables `skin` and `mesh` that have no effect on a skin with this surface."""
     if surface is None:
         return
     if sides := {"width_mm", "height_mm"} & skin.model_fields_set:

@@ -16,9 +16,11 @@ from jeit.mesh.geodesic import Triangles
 class TouchGrid(eqx.Module):
     """Grid of touched positions: the centres of equal rectangles that cover a skin.
 
-    - `places`: (n, 2) metres, on a curved skin (n, 3); `rows`, `columns`: (n,) of each in the raster, row 0
-      at the least y.
-    - `shape`: (rows, columns) of the raster; `pitch`: (width, height) of a rectangle, metres.
+    **Fields**
+
+    - `places`: positions (n, 2), on a curved skin (n, 3), metres.
+    - `rows`, `columns` (n,): row and column of each position in the raster; row 0 has the smallest y.
+    - `shape`: numbers of rows and columns of the raster; `pitch`: width and height of a rectangle, metres.
     """
 
     places: Float[np.ndarray, "n d"]
@@ -33,26 +35,25 @@ class TouchGrid(eqx.Module):
         return self.pitch[0] * self.pitch[1]
 
     def raster(self, values) -> Float[np.ndarray, "rows columns"]:
-        """Arrange values (n,) as an image, NaN off the skin."""
+        """Arrange values (n,) as an image (rows, columns), with NaN outside the skin."""
         image = np.full(self.shape, np.nan)
         image[self.rows, self.columns] = np.asarray(values)
         return image
 
 
 class SurfaceGrid(TouchGrid):
-    """Touched positions of a curved skin: `places` (n, 3), metres, spread evenly over it by distances along its
-    surface.
+    """Touched positions of a curved skin, spread evenly over it by distances along its surface.
 
-    They form no raster but one row. **Fields**: those of `TouchGrid`, and `areas` (n,) m², the area that each position
-    represents.
+    The raster has a single row. **Fields**: those of `TouchGrid`, and `areas` (n,): area that each position represents,
+    m².
     """
 
     areas: Float[np.ndarray, " n"]
 
     @classmethod
     def spread(cls, surface: Triangles, number: int, margin: float = 0.0) -> "SurfaceGrid":
-        """Spread a number of positions, `margin` metres from the edge. Raises `ValueError` where that leaves no
-        room."""
+        """Spread `number` positions evenly over a surface, at least `margin` metres from its edge. Raises `ValueError`
+        if the margin leaves no room."""
         places = spread(surface, number, margin=margin)
         kept = surface.node_areas * (surface.distance_to_border(surface.points) >= margin)
         each = float(kept.sum()) / number
@@ -60,8 +61,9 @@ class SurfaceGrid(TouchGrid):
         return cls(places, *flat, (1, number), (each**0.5, each**0.5), np.full(number, each))
 
     def on(self, surface: Triangles, face: Triangles) -> "SurfaceGrid":
-        """Map the positions to another surface: from the nearest point of `surface` to the same point of the same
-        triangle of `face`, which has as many nodes; areas are scaled accordingly."""
+        """Map the positions from `surface` to another surface `face` with the same triangulation: the nearest point of
+        `surface` is mapped to the point with the same coordinates within the same triangle. Areas are scaled
+        accordingly."""
         at = surface.nearest(self.places)
         areas = self.areas * at.of_nodes(surface, face.node_areas / surface.node_areas)
         each = float(areas.mean())
@@ -70,18 +72,18 @@ class SurfaceGrid(TouchGrid):
         )
 
     def raster(self, values) -> Float[np.ndarray, "rows columns"]:
-        """Raises `ValueError`: places on a curved skin are in no rows and columns."""
+        """Raises `ValueError`, since positions on a curved skin form no rows and columns."""
         raise ValueError(
             "grid is of a curved skin, whose places are in no raster; draw it with jeit.design.plots.plot_unrolled."
         )
 
 
 def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
-    """Create the grid of the rectangles over the bounding box of `outline` whose centre lies inside; 48 × 48 as in Park
-    et al. 2022.
+    """Create a grid of touched positions: divide the bounding box of `outline` into rows × columns equal rectangles,
+    and take the centres that lie inside. The default is 48 × 48, as in Park et al. 2022.
 
-    For a curved skin, whose outline is its surface, as many positions are spread evenly over it. Raises `ValueError`
-    for fewer than one row or column, and for what is no outline.
+    On a curved skin, whose outline is its surface, rows × columns positions are spread evenly over the surface. Raises
+    `ValueError` for fewer than one row or column, and if `outline` is not an outline.
     """
     check_kind("outline", outline, (Domain, Triangles), "an outline, such as skin.outline or Rectangle(0.2, 0.2)")
     if columns < 1 or rows < 1:
@@ -102,10 +104,10 @@ def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = P
 def touches_away_from_the_edge(
     outline: Domain | Triangles, margin: float, columns: int = PLACES, rows: int = PLACES
 ) -> TouchGrid:
-    """The positions of `touch_grid` whose touches do not reach over an edge: farther than `margin` (metres) from the
-    outline.
+    """The positions of `touch_grid` that are farther than `margin` (metres) from the outline, so that touches do not
+    reach beyond the edge.
 
-    Raises `ValueError` if no place is so far from the edge.
+    Raises `ValueError` if no position is that far from the edge.
     """
     if isinstance(outline, Triangles):
         return SurfaceGrid.spread(outline, columns * rows, margin)
@@ -118,13 +120,13 @@ def touches_away_from_the_edge(
 
 
 def check_grid(grid: TouchGrid) -> None:
-    """Raise `ValueError` for what is no `TouchGrid`, such as its places."""
+    """Raise `ValueError` unless `grid` is a `TouchGrid`; its positions alone are not enough."""
     check_kind("grid", grid, TouchGrid, "a TouchGrid, as of touch_grid(skin.outline)")
 
 
 def check_places(places, dimension: int = 2) -> Float[np.ndarray, "n d"]:
-    """Places (n, 2), or (n, 3) on a curved skin, metres, as an array. Raises `ValueError` for what are none, such as a
-    whole `TouchGrid`."""
+    """Convert positions (n, `dimension`), metres, to an array. Raises `ValueError` for anything else, such as a whole
+    `TouchGrid`, and for values that are not finite."""
     wanted = f"places must be (n, {dimension}), one or more, in metres, such as touch_grid(skin.outline).places"
     try:
         found = np.asarray(places, float)

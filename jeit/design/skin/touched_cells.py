@@ -1,4 +1,4 @@
-"""Cells and nodes of a mesh that a touch covers, and by how much."""
+"""Cells and nodes of a mesh that a touch changes, and the relative change of each cell's conductivity."""
 
 from __future__ import annotations
 
@@ -20,12 +20,13 @@ from jeit_solvers.engines import as_array, host
 
 
 class TouchedCells(eqx.Module):
-    """n touches, each of which makes the conductivity of up to c cells σ (1 + change).
+    """Changed cells of n touches: each touch changes the conductivity of up to c cells from σ to σ (1 + change).
 
     **Fields**
 
-    - `places`: (n, 2) metres, on a curved skin (n, 3), middles of the touches.
-    - `cells`: (n, c) indices; `change`: (n, c), −1 for a cell that no longer conducts; 0 where a touch has fewer cells.
+    - `places`: centres of the touches (n, 2), on a curved skin (n, 3), metres.
+    - `cells` (n, c): indices of the changed cells; `change` (n, c): relative change of their conductivity, −1 for a
+      cell that becomes an insulator. Touches with fewer than c cells are padded with changes of 0.
     - `num_cells`: number of cells of the mesh.
     """
 
@@ -45,21 +46,24 @@ def touched_cells(
     edge: float = 0.0,
     face: str = "outer",
 ) -> TouchedCells:
-    """Compute the cells changed by single indentations of a layer's top, or of a sheet, at `places` (n, 2) in metres;
-    on a curved skin (n, 3).
+    """Compute the cells changed by single indentations of the top of a layer, or of a sheet, at `places` (n, 2), on a
+    curved skin (n, 3), metres.
 
-    **Layer** (3-D mesh, top at its greatest z): cells in the indented part, by their centroids, get `contrast` times
-    their conductivity: 0, the default, for an insulating indenter (Park et al. 2022, text S4). With an `edge` in metres
-    the change rises smoothly over twice that depth, and so has derivatives in depth and place.
+    `contrast`: conductivity of the touched part divided by that of the rest: 0, the default, for an insulating indenter
+    (Park et al. 2022, text S4), above 1 for a conductor.
 
-    **Sheet** (2-D mesh) of a layer of `thickness` metres: a part depth / thickness of the current's way gets `contrast`
-    times its conductivity.
+    **Layer** (3-D mesh, top at its maximum z): the conductivity of cells whose centroids lie in the indented part is
+    multiplied by `contrast`. With an `edge` in metres, the change rises smoothly over twice that depth and is
+    differentiable with respect to depth and position.
 
-    **Curved skin** (a surface in space, or a shell of one): the same, with distances along the surface touched, the
-    `face` of a shell, and depths along its inward normal.
+    **Sheet** (2-D mesh) that represents a layer of `thickness` metres: a fraction depth / thickness of the
+    cross-section has its conductivity multiplied by `contrast`.
 
-    A `contrast` above 1 is that of a conductor. Raises `ValueError` for places where no cell is touched, for an
-    indentation as deep as the skin, and where `thickness` is missing or superfluous.
+    **Curved skin** (a surface in space, or a shell on such a surface): as above, with distances along the touched
+    surface, which is the `face` of a shell, and depths along its inward normal.
+
+    Raises `ValueError` for positions where no cell is touched, for an indentation as deep as the skin, and if
+    `thickness` is missing for a sheet or given for a layer.
     """
     places = check_places(places, 3 if is_curved(mesh) else 2)
     check_kind("indentation", indentation, AbstractIndentation, "an indentation, such as Bell() or Hemisphere()")
@@ -102,7 +106,8 @@ def touched_cells(
 
 
 def padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of whole numbers as one array, padded with zeros, and the mask of the entries."""
+    """Join rows of integers of different lengths to one array, padded with zeros. Returns the array and a mask of the
+    entries that are not padding."""
     length = np.array([len(row) for row in rows])
     there = np.arange(max(length.max(), 1)) < length[:, None]
     padded = np.zeros(there.shape, np.int32)
@@ -120,15 +125,20 @@ def _check_values(contrast: float, edge: float) -> None:
         raise ValueError(f"edge must be a depth in metres, not negative; it is {edge!r}.")
 
 
-# Touches processed at once; and the multiple to which the number of nodes is padded: programs are compiled for each.
+# Number of touches processed at once, and multiple to which the number of nodes is padded, since a program is compiled
+# for each number.
 _AT_ONCE, _MULTIPLE = 64, 16
 
 
 class TouchedNodes(eqx.Module):
-    """Nodes changed by n touches.
+    """Nodes of the cells that n touches change.
 
-    `strips`: all of them, in strips across the skin; `nodes` (n, k): those of each touch, as places in the strips, the
-    last one repeated to be as many; `corners` (n, c, d + 1): nodes of the touches' cells, as places among those k.
+    **Fields**
+
+    - `strips`: the nodes of all touches, ordered in strips across the skin.
+    - `nodes` (n, k): nodes of each touch, as indices into the order of `strips`; touches with fewer than k nodes repeat
+      the last one.
+    - `corners` (n, c, d + 1): nodes of the changed cells of each touch, as indices into its row of `nodes`.
     """
 
     strips: Strips
@@ -137,8 +147,8 @@ class TouchedNodes(eqx.Module):
 
 
 def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | None = None) -> TouchedNodes:
-    """Find the nodes of the cells that touches change; `strips` of these and more nodes, of these alone unless
-    given."""
+    """Find the nodes of the cells that touches change. `strips`: order of a set of nodes that contains these; by
+    default it is created for these nodes only."""
     mesh, cells, real = model.mesh, np.asarray(touches.cells), np.asarray(touches.change) != 0
     touched = np.zeros(mesh.num_points, bool)
     touched[np.asarray(mesh.cells)[cells[real]]] = True
@@ -150,7 +160,7 @@ def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | N
     for start in range(0, len(cells), _AT_ONCE):
         some = slice(start, start + _AT_ONCE)
         places = np.where(real[some, :, None], place[cells[some]], nowhere)
-        corners[some], (touch, number, node) = _numbered(places, nowhere)
+        corners[some], (touch, number, node) = _number_places(places, nowhere)
         found.append((start + touch, number, node))
     corners[~real] = 0
     touch, number, node = (np.concatenate(part) for part in zip(*found, strict=True))
@@ -160,9 +170,9 @@ def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | N
     return TouchedNodes(strips, np.take_along_axis(nodes, final, axis=1), corners)
 
 
-def _numbered(places: Int[np.ndarray, "b c q"], nowhere: int):
-    """The distinct places of each of b touches counted up from 0: the number of every place given (b, c, q); and
-    touch, number and place of all that are somewhere."""
+def _number_places(places: Int[np.ndarray, "b c q"], nowhere: int):
+    """Number the distinct places of each of b touches from 0, without the place `nowhere`. Returns the number of every
+    entry of `places` (b, c, q), and touch, number and place of every distinct place."""
     first = (nowhere + 1) * np.arange(len(places), dtype=np.int32)
     keys = places + first[:, None, None]
     reached = np.zeros(len(places) * (nowhere + 1), bool)

@@ -1,14 +1,16 @@
-"""Voltage changes by single touches: exact, by low-rank updates of one factorisation, or linear.
+"""Voltage changes due to single touches: exact, by low-rank updates of one factorisation, or linearised.
 
-A touch adds D to the system matrix K of the electrode model, nonzero only among its k nodes. With the fields F for unit
-currents into the electrodes and G = K⁻¹, both restricted to those nodes,
+A touch adds a matrix D to the system matrix K of the electrode model; D is nonzero only between the k nodes of the
+touch. Let F be the fields for unit currents into the electrodes and G = K⁻¹, both restricted to these nodes. By the
+Sherman-Morrison-Woodbury formula, the transfer impedance changes by
 
     ΔZ = −Fᵀ D F + (D F)ᵀ Y,    (G⁻¹ + D) Y = D F,
 
-(Sherman-Morrison-Woodbury), by conjugate gradients with G as the preconditioner: they need products with G and D only,
-never G⁻¹, in few steps, as touches of a bounded depth change the energy of any field by a bounded factor; nodes that a
-touch cuts off make the matrix singular, but nothing flows there. With the residual R of Y, (D F)ᵀ Y + Yᵀ R lacks
-Rᵀ (G⁻¹ + D)⁻¹ R, and Rᵀ G R is most of that. G is needed only between nodes of one touch, which lie near each other.
+The system for Y is solved by conjugate gradients with G as the preconditioner, which requires products with G and D
+only, not G⁻¹. Few steps are needed, since a touch changes the energy of any field by a bounded factor. Nodes that a
+touch disconnects make the matrix singular, but no current flows there. If Y has the residual R, then (D F)ᵀ Y + Yᵀ R
+differs from the exact value by Rᵀ (G⁻¹ + D)⁻¹ R, of which Rᵀ G R is the main part, and this is added. G is needed only
+between nodes of the same touch, which are close to each other.
 """
 
 from __future__ import annotations
@@ -31,29 +33,33 @@ from jeit.protocol import Protocol
 from jeit_solvers import over_cores
 from jeit_solvers.engines import has_values, on_device
 
-# Tolerance of the error's bound, relative to the voltages; most steps.
+# Tolerance of the error bound, relative to the voltages, and maximum number of steps.
 _TOLERANCE, _MOST_STEPS = 1e-8, 200
-# Flow around what is cut off changes by a factor that its shape bounds, not the conductivity left. And where next to
-# nothing is left, the conductivity bounds too much.
+# Factor by which an insulating touch is assumed to lower the energy of a field, which depends on the shape of the
+# touched part, and maximum of this factor for touched parts with a very low remaining conductivity.
 _CUT_OFF, _MOST_WEAKENED = 10.0, 1e6
-# Voltages below this, relative to the load's energy, are rounding errors.
+# Voltages below this, relative to the energy of the load D F, are rounding errors.
 _SMALLEST = 1e-12
-# Touches processed at once, so that their blocks of the inverse or the Jacobian fit into the cache.
+# Number of touches processed at once for exact and linearised changes, so that their blocks of the inverse or of the
+# Jacobian fit into the cache.
 EXACT_AT_ONCE, _LINEAR = 2, 8
-# Multiple to which the inverse's reach is padded: programs are compiled for each.
+# Multiple to which the number of strips that a touch spans is padded, since a program is compiled for each number.
 _STRIPS = 3
 
 
 def touch_changes(
     model: ForwardModel, conductivity, touched: TouchedCells, *, linear: bool = False
 ) -> Float[Array, "n M"]:
-    """Compute the changes (n, M) of the protocol's M voltages by n single touches, in volts.
+    """Compute the changes (n, M) of the M voltages of the protocol due to n single touches, in volts.
 
-    `linear`: J δσ, the Jacobian's, differentiable in everything and batched with `vmap`; else exact, as if the model
-    had been solved anew for every touch, to 1e-8 of the largest. Raises `ValueError` for touches of another mesh and
-    for exact changes under `jit`, `grad` or `vmap`, and `RuntimeError` where exact changes are not found: by conductors
-    of contrast above some 1e6, whose limit is reached long before, and where a touch cuts an electrode off.
-    `conductivity` as in `ForwardModel.voltages`, real, S/m (2-D: S); tensors, which a touch scales, for exact changes.
+    - `conductivity`: as in `ForwardModel.voltages`, real, S/m (2-D: S). Exact changes allow tensors, which a touch
+      scales.
+    - `linear`: if True, the linearised changes J δσ from the Jacobian J, which are differentiable and can be batched
+      with `vmap`. Otherwise the exact changes, equal to a separate solve for every touch up to 1e-8 of the largest.
+
+    Raises `ValueError` for touches of another mesh and for exact changes under `jit`, `grad` or `vmap`. Raises
+    `RuntimeError` if the exact changes are not found: for conductors with a contrast above about 1e6, where the
+    voltages no longer depend on the contrast, and if a touch disconnects an electrode.
     """
     check_model(model)
     check_kind("touched", touched, TouchedCells, "TouchedCells, as of skin.touched_cells(places)")
@@ -82,7 +88,7 @@ def _linear(model: ForwardModel, conductivity, touched: TouchedCells):
 
     number = len(changed)
     index = jnp.minimum(jnp.arange(-(-number // _LINEAR) * _LINEAR), number - 1).reshape(-1, _LINEAR)
-    return _joined(jax.lax.map(some, index))[:number]
+    return _join_chunks(jax.lax.map(some, index))[:number]
 
 
 def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
@@ -99,7 +105,7 @@ def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
 
 
 def check_found(changes, places: Float[np.ndarray, "n d"]) -> None:
-    """Raise `RuntimeError` where changes by touches at `places`, metres, were not found."""
+    """Raise `RuntimeError` if the changes due to any of the touches at `places`, metres, are not finite."""
     lost = np.flatnonzero(~np.isfinite(np.asarray(changes)).all(axis=1))
     if lost.size:
         raise RuntimeError(
@@ -111,40 +117,45 @@ def check_found(changes, places: Float[np.ndarray, "n d"]) -> None:
 
 @jax.jit
 def cell_stiffness(model: ForwardModel, conductivity) -> Float[Array, "m q q"]:
-    """Each cell's part of the system matrix, siemens; `conductivity` of the cells."""
-    return _symmetric(stiffness(model.mesh, conductivity), model.mesh.dimension + 1)
+    """Contribution of each cell to the system matrix (m, q, q), siemens; `conductivity` of the cells, S/m (2-D: S)."""
+    return _unpack_symmetric(stiffness(model.mesh, conductivity), model.mesh.dimension + 1)
 
 
 @jax.jit
 def changes_between(protocol: Protocol, element, known, touches, index):
-    """Changes of the voltages by the touches with these numbers (c, s), s of them at a time.
+    """Compute the voltage changes due to the touches with indices `index` (c, s), s touches at a time.
 
-    `element` as of `cell_stiffness`; `known` as of `fields_and_inverse`; `touches`: their cells, changes, nodes and
-    corners, as of `TouchedCells` and `touched_nodes`."""
+    `element`: from `cell_stiffness`; `known`: from `fields_and_inverse`; `touches`: cells and changes of all touches,
+    from `TouchedCells`, and their nodes and corners, from `touched_nodes`."""
     fields, inverse = known
     select = jax.vmap(lambda change: select_channels(protocol, change))
 
     def some(index):
         cells, change, nodes, corners = (array[index] for array in touches)
         blocks = element[cells] * change[..., None, None]
-        return select(_impedance_changes(blocks, corners, inverse.blocks(nodes), fields[nodes], _weakened(change)))
+        return select(
+            _impedance_changes(blocks, corners, inverse.blocks(nodes), fields[nodes], _weakening_factor(change))
+        )
 
-    return _joined(jax.lax.map(some, index))
+    return _join_chunks(jax.lax.map(some, index))
 
 
-def _joined(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
+def _join_chunks(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
     return chunks.reshape(-1, *chunks.shape[2:])
 
 
-def _weakened(change: Float[Array, "b c"]) -> Float[Array, " b"]:
-    """Largest factor by which touches lower the energy of a field."""
+def _weakening_factor(change: Float[Array, "b c"]) -> Float[Array, " b"]:
+    """Largest factor (b,) by which each touch lowers the energy of a field."""
     left = 1 + change
     return jnp.clip(jnp.where(left > 0, 1 / jnp.where(left > 0, left, 1.0), _CUT_OFF).max(axis=1), 1, _MOST_WEAKENED)
 
 
 def _impedance_changes(blocks, corners, inverse, fields, weakened):
-    """ΔZ (b, L, L) of b touches, from D as `blocks` (b, c, q, q) of cells at `corners` (b, c, q), G (b, k, k) and F
-    (b, k, L). The steps are those of all touches together, until the last has converged."""
+    """Change ΔZ (b, L, L) of the transfer impedance due to b touches.
+
+    D is given by its `blocks` (b, c, q, q) for cells with nodes `corners` (b, c, q), G by `inverse` (b, k, k), and F by
+    `fields` (b, k, L). All touches are iterated together until the last one has converged.
+    """
     touch = jnp.arange(len(fields))[:, None, None]
     size = fields.shape[1]
     added = jnp.zeros((len(fields), size, size))
@@ -154,10 +165,11 @@ def _impedance_changes(blocks, corners, inverse, fields, weakened):
     def step(state):
         solution, residual, scaled_residual, direction, scaled, energy, ratio, number = state
         direction = scaled_residual + ratio * direction
-        scaled = residual + ratio * scaled  # G⁻¹ of the direction, which is a combination of what G was applied to
+        # G⁻¹ times the direction, without a solve: the same combination of the residuals.
+        scaled = residual + ratio * scaled
         product = scaled + added @ direction
         curvature = jnp.sum(direction * product, axis=1, keepdims=True)
-        # Converged touches are left unchanged: their residual and curvature are rounding errors.
+        # Converged touches are not changed any more, since their residual and curvature are rounding errors.
         going = (energy > enough) & (curvature > 0)
         length = jnp.where(going, energy / jnp.where(going, curvature, 1.0), 0.0)
         solution, residual = solution + length * direction, residual - length * product
@@ -172,27 +184,27 @@ def _impedance_changes(blocks, corners, inverse, fields, weakened):
 
     scaled_load, blank = inverse @ load, jnp.zeros_like(load)
     first = jnp.sum(load * scaled_load, axis=1, keepdims=True)
-    # What is left of the error is at most Rᵀ G R, the energy, times what weakens it. Insulators change the voltages by
-    # Fᵀ D F and more, conductors by its square over the load's energy at least.
+    # The remaining error is at most the energy Rᵀ G R times the factor `weakened`. The voltages change by at least
+    # Fᵀ D F due to insulators, and by at least the square of this divided by the energy of the load due to conductors.
     linear = jnp.abs(jnp.sum(fields * load, axis=1, keepdims=True))
     voltages = jnp.minimum(linear, linear**2 / jnp.where(first > 0, first, 1.0))
     enough = _TOLERANCE * jnp.maximum(voltages, _SMALLEST * first) / weakened[:, None, None]
     start = blank, load, scaled_load, blank, blank, first, jnp.zeros_like(first), jnp.zeros((), int)
     solution, residual, scaled_residual, *_, energy, _, _ = jax.lax.while_loop(unfinished, step, start)
-    change = _transposed(solution) @ (load + residual) + _transposed(residual) @ scaled_residual
-    change -= _transposed(fields) @ load
-    # Rounding of the load is all that is left of voltages that are so small beside it.
+    change = _transpose(solution) @ (load + residual) + _transpose(residual) @ scaled_residual
+    change -= _transpose(fields) @ load
+    # Voltages that are so small compared with the load consist of its rounding errors.
     drowned = jnp.sum(voltages, axis=(1, 2)) < _SMALLEST * jnp.sum(first, axis=(1, 2))
     converged = jnp.all(energy <= enough, axis=(1, 2)) & ~drowned
-    return jnp.where(converged[:, None, None], (change + _transposed(change)) / 2, jnp.nan)
+    return jnp.where(converged[:, None, None], (change + _transpose(change)) / 2, jnp.nan)
 
 
-def _transposed(matrices):
+def _transpose(matrices):
     return jnp.swapaxes(matrices, -1, -2)
 
 
-def _symmetric(packed: Float[Array, "p m"], size: int) -> Float[Array, "m q q"]:
-    """Symmetric matrices from their lower triangles."""
+def _unpack_symmetric(packed: Float[Array, "p m"], size: int) -> Float[Array, "m q q"]:
+    """Unpack symmetric matrices (m, q, q) from their lower triangles (p, m)."""
     rows, columns = np.tril_indices(size)
     place = np.zeros((size, size), int)
     place[rows, columns] = place[columns, rows] = np.arange(len(rows))

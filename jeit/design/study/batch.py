@@ -1,4 +1,4 @@
-"""Sensitivity maps and scores of the points of a chunk, in one jitted batch or one by one."""
+"""Computation of the sensitivity maps and scores of the points of a chunk, in one compiled batch or one by one."""
 
 from __future__ import annotations
 
@@ -34,9 +34,11 @@ from jeit.protocol import Protocol
 
 
 class _Shared(eqx.Module):
-    """Data shared by points of one shape: the model, and the cells `touched` on a skin of `thickness` metres.
+    """Data shared by all points of one shape.
 
-    `touches`, the same with their derivatives in the places, and the `prior` are None unless a score needs them.
+    **Fields**: `model`: the forward model; `touched`: the touched cells on a skin of `thickness` metres; `touches`: the
+    same touches with derivatives with respect to the position, and `prior`: the prior of their amplitudes, both None
+    unless a score needs them; `grid`: the touched positions; `key`: random key for k-means.
     """
 
     model: ForwardModel
@@ -49,8 +51,8 @@ class _Shared(eqx.Module):
 
 
 class _Varied(eqx.Module):
-    """Data that differ between points of one shape; `conductivity` of the mesh's cells, noise in volts. In a batch of k
-    of them every array has a leading axis of k."""
+    """Data that differ between points of one shape. `conductivity` is that of the forward model, S/m (2-D: S), and
+    `noise` is in volts. In a batch of k points, every array has a leading axis of length k."""
 
     electrodes: SheetDiscs | SurfaceDiscs | FaceDiscs
     protocol: Protocol
@@ -60,8 +62,8 @@ class _Varied(eqx.Module):
 
 
 def check_points(study: Study) -> None:
-    """Check all points by creating their skins, touches and electrodes. Raises `ValueError` for a mesh that is too
-    coarse."""
+    """Check all points of a study by creating their skins, touches and electrodes. Raises `ValueError` for a mesh that
+    is too coarse."""
     seen = set()
     for index in itertools.chain.from_iterable(study.chunks):  # grouped by shape
         point = study.points[index]
@@ -91,10 +93,11 @@ def check_points(study: Study) -> None:
 
 
 def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None = None) -> dict[str, np.ndarray]:
-    """Compute the results of chunk `number` for each of its k points: "sensitivity" (k, n) in volts, and scores (k,).
+    """Compute the results of chunk `number` for its k points: "sensitivity" (k, n) in volts, and the scores (k,).
 
-    Linear maps are computed in one compiled batch, of equal size for every chunk of a shape, divided among the devices
-    of JAX. Exact maps are computed one after the other; after each but the last, `solved` is called with their number.
+    Linearised maps are computed in one compiled batch, which has the same size for every chunk of a shape and is
+    divided among the devices of JAX. Exact maps are computed one after the other; after each but the last, `solved` is
+    called with the number of finished maps.
     """
     points = [study.points[index] for index in study.chunks[number]]
     shared = _shared(study, points[0].shape)
@@ -113,14 +116,14 @@ def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None 
 
 
 def study_grid(study: Study) -> TouchGrid:
-    """Grid of touched positions; curved layers are touched above or below these positions of their electrodes'
-    surface."""
+    """Grid of touched positions of a study. On curved layers, the positions are on the surface with the electrodes, and
+    the opposite face is touched above or below them."""
     return touch_grid(study.outline, study.columns, study.rows)
 
 
 @lru_cache(maxsize=4)
 def _skin(study: Study, shape: Shape) -> Skin:
-    """Skin of the first point of a shape; the others have the same mesh."""
+    """Skin of the first point of a shape; all points of a shape have the same mesh."""
     point = next(point for point in study.points if point.shape == shape)
     return Skin.create(
         point.layout,
@@ -187,7 +190,7 @@ def _batch(
 def _exact(
     shared: _Shared, varied: list[_Varied], options: dict, solved: Callable[[int], None] | None
 ) -> Iterator[dict[str, Array]]:
-    """Results of each skin with exact maps."""
+    """Yield the results of each skin, with exact maps; `solved` as in `solve_chunk`."""
     for number, one in enumerate(varied, 1):
         model, touched = _touched(shared, one)
         yield _results(shared, one, touch_changes(model, one.conductivity, touched), **options)
@@ -196,10 +199,10 @@ def _exact(
 
 
 def _touched(shared: _Shared, varied: _Varied) -> tuple[ForwardModel, TouchedCells]:
-    """The model of a skin, and its touches."""
+    """The forward model of a skin, and its touched cells."""
     model = shared.model.with_electrodes(varied.electrodes).with_protocol(varied.protocol)
     touched = eqx.tree_at(
-        # A touch of a sheet takes depth / thickness of the current's way; layers of one shape are equally thick.
+        # The change of a sheet is proportional to depth / thickness; layers of one shape have the same thickness.
         lambda all: all.change,
         shared.touched,
         replace_fn=lambda change: change * (shared.thickness / varied.thickness),
@@ -211,7 +214,7 @@ def _touched(shared: _Shared, varied: _Varied) -> tuple[ForwardModel, TouchedCel
 def _results(
     shared: _Shared, varied: _Varied, changes: Float[Array, "n M"], *, scores, num_taxels: int, threshold: float
 ) -> dict[str, Array]:
-    """Results of one skin from the voltage changes by its touches, volts."""
+    """Compute the results of one skin from the voltage changes due to its touches, volts."""
     found = SensitivityMap(shared.grid, changes)
     results = {"sensitivity": found.values}
     for name in ("minimum", "mean", "uniformity"):
@@ -240,7 +243,8 @@ def _results(
 def _optimality(
     shared: _Shared, varied: _Varied, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
 ) -> dict[str, Array]:
-    """Optimality scores from linear changes. A batch has the Jacobian already, and XLA does not compute it again."""
+    """Compute the optimality scores from linearised changes. In a batch, the Jacobian has been computed already, and
+    XLA reuses it."""
     model, _ = _touched(shared, varied)
     touches = touches.at_thickness(varied.thickness)
     found = layout_scores(model, varied.conductivity, touches, prior=prior, noise=varied.noise)
@@ -251,7 +255,8 @@ def _optimality(
         if name in scores:
             results[name] = getattr(found, name)
     if "localisation_error" in scores:
-        # Where a position cannot be determined, mean and worst are infinite; the share is that part of the skin's area.
+        # Mean and maximum are infinite if any position cannot be determined; `localisation_lost` is the fraction of the
+        # area where this is the case.
         results["localisation_error_mean"] = 1e3 * jnp.mean(found.localisation_error)
         results["localisation_error_max"] = 1e3 * jnp.max(found.localisation_error)
         results["localisation_lost"] = jnp.mean(jnp.isinf(found.localisation_error))

@@ -1,4 +1,4 @@
-"""Contents of a store: the arrays of a study, with their names, units and descriptions."""
+"""Contents of the store of a study: names, units and descriptions of its arrays."""
 
 from __future__ import annotations
 
@@ -36,11 +36,15 @@ _SCORES = {
 
 
 class Contents(NamedTuple):
-    """Description of a store's contents, results by chunks.
+    """Description of the contents of a store, whose results are computed in chunks.
 
-    **Fields**: `kind`, one word for it, and `made_by`, what makes it, for messages; `fingerprint`, of all that decides
-    the results; `chunks`, the rows of every array that each chunk has; `arrays`, names of the results; `attributes`,
-    plain values to be kept with them; `fill`, which makes all arrays in an empty Zarr group.
+    **Fields**
+
+    - `kind`: one word for the contents, such as "study"; `made_by`: the command that creates them; both for messages.
+    - `fingerprint`: hash of everything that determines the results.
+    - `chunks`: for each chunk, the rows of every array that it contains.
+    - `arrays`: names of the results; `attributes`: plain values stored with them.
+    - `fill`: function that creates all arrays in an empty Zarr group.
     """
 
     kind: str
@@ -53,7 +57,7 @@ class Contents(NamedTuple):
 
 
 def study_contents(study: Study) -> Contents:
-    """Contents of a study's store: each row of an array is a point, in separate files."""
+    """Contents of the store of a study. Each row of an array belongs to one point and is stored in a separate file."""
     coordinates = [point.coordinates for point in study.points]
     along = {name: [values[name] for values in coordinates] for name in coordinates[0]}
     arrays = _arrays(study)

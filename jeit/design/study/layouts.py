@@ -1,4 +1,4 @@
-"""Layouts of a study by name, on sheets and curved surfaces."""
+"""Creation of the layouts of a study by name, on flat skins and curved surfaces."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ def curved_layout(
     contact_impedance: float,
     minimum_gap: float,
 ) -> SurfaceLayout:
-    """`study_layout` of a curved skin: "inner-N", spread evenly along `surface`, or a `.csv` file with places in space.
+    """Create or read the layout `name` of a curved skin: "inner-N" for N electrodes spread evenly over `surface`, or a
+    `.csv` file with positions in space. Other arguments as in `study_layout`.
 
-    Gaps are along the surface. Raises `ValueError` for an unknown name, electrodes that overlap or are off the
-    surface, and gaps below `minimum_gap`.
+    Gaps are measured along the surface. Raises `ValueError` for an unknown name, electrodes that overlap or are not on
+    the surface, and gaps below `minimum_gap`.
     """
     try:
         layout = _make_curved(name, folder, surface, outward, diameter)
@@ -64,11 +65,12 @@ _SUFFIXES = (".csv", ".dxf", ".svg")
 def study_layout(
     name: str, folder: Path, outline: Rectangle, diameter: float, contact_impedance: float, minimum_gap: float
 ) -> Layout:
-    """Create or read the layout `name` on a skin of `outline`, with files relative to `folder`; units are metres and
-    ohm·m².
+    """Create or read the layout `name` of a skin with this `outline`. Files are relative to `folder`; units are metres
+    and ohm·m².
 
-    Diameter and contact impedance are the file's own, or 6 mm and 1e-4 ohm·m², where they are NaN. Raises
-    `ValueError` for an unknown name, electrodes that overlap or leave the skin, and gaps below `minimum_gap`.
+    If `diameter` or `contact_impedance` is NaN, the value in the file is used, or 6 mm and 1e-4 ohm·m² if there is
+    none. Raises `ValueError` for an unknown name, electrodes that overlap or extend beyond the skin, and gaps below
+    `minimum_gap`.
     """
     try:
         layout = _make(name, folder, outline, diameter)
@@ -84,7 +86,7 @@ def study_layout(
 
 
 def is_file(name: str) -> bool:
-    """Whether this layout is read from a file."""
+    """Whether the name of a layout is that of a file."""
     return Path(name).suffix.lower() in _SUFFIXES
 
 
@@ -106,13 +108,13 @@ def _make(name: str, folder: Path, outline: Rectangle, diameter: float) -> Layou
 
 
 def check_number(number: int) -> None:
-    """Raise `ValueError` for fewer or more electrodes than those of a study have."""
+    """Raise `ValueError` unless the number of electrodes is allowed in a study."""
     if not 4 <= number <= 1024:
         raise ValueError(f"it has {number} electrodes; give 4 to 1024.")
 
 
 def check_spacing(layout: Layout | SurfaceLayout, lengths: Float[np.ndarray, "L L"], least: float) -> None:
-    """Raise `ValueError` for gaps below `least` between electrodes whose centres are `lengths` apart, metres."""
+    """Raise `ValueError` for gaps below `least` between electrodes; `lengths`: distances of their centres, metres."""
     radii = np.asarray(layout.diameters) / 2
     gap = lengths - radii[:, None] - radii
     np.fill_diagonal(gap, np.inf)

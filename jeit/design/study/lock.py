@@ -1,4 +1,5 @@
-"""Lock for one writing process per store: a file beside the store names the process, and is ignored if it has ended."""
+"""Lock that allows one process at a time to write a store: a file beside the store names the process, and is ignored
+once that process has ended."""
 
 from __future__ import annotations
 
@@ -23,18 +24,19 @@ _LONGEST = 4096
 
 @contextlib.contextmanager
 def locked(path: Path, kind: str) -> Iterator[None]:
-    """Context in which this process alone writes the store at `path`, of a `kind` in one word.
+    """Context in which no other process writes the store at `path`. `kind`: one word for the contents of the store, for
+    messages.
 
     The lock is the file `.NAME.lock` beside the store, held by `flock`, which the system releases when the process ends
-    for any reason. Its content names the owner; where that is on another machine, whose processes cannot be checked,
-    the content alone holds the lock. Raises `ValueError` where another process, or another thread of this one, writes
-    the store, and `OSError` where no file can be written beside it.
+    for any reason. Its content names the owner. If the owner is on another machine, whose processes cannot be checked,
+    the store counts as locked as long as the file exists. Raises `ValueError` if another process, or another thread of
+    this process, writes the store, and `OSError` if no file can be written beside it.
     """
-    path = path.resolve()  # one lock, by whatever link it is reached
+    path = path.resolve()  # the same lock, whichever link leads to the store
     place = path.with_name(f".{path.name}.lock")
     try:
         place.parent.mkdir(parents=True, exist_ok=True)
-        handle = _own(place, path, kind)
+        handle = _acquire(place, path, kind)
     except OSError as error:
         done = "written" if path.exists() else "made"
         reason = f"the {kind}'s store cannot be {done} ({error.strerror})"
@@ -47,17 +49,17 @@ def locked(path: Path, kind: str) -> Iterator[None]:
         os.close(handle)
 
 
-def _own(place: Path, path: Path, kind: str) -> int:
-    """The lock's file, opened and held."""
+def _acquire(place: Path, path: Path, kind: str) -> int:
+    """Open the file of the lock and acquire the lock; returns the file descriptor."""
     while True:
         handle = os.open(place, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
             held = _hold(handle)
-            if held and not _is_at(handle, place):  # its owner has just ended and removed it
+            if held and not _is_at(handle, place):  # the previous owner has just ended and removed the file
                 os.close(handle)
                 continue
             owner = _owner(handle)
-            if held is False or (owner and not _gone(owner, certain=held is True)):
+            if held is False or (owner and not _has_ended(owner, certain=held is True)):
                 raise ValueError(_refusal(owner, place, path, kind))
             try:
                 _sign(handle)
@@ -72,7 +74,8 @@ def _own(place: Path, path: Path, kind: str) -> int:
 
 
 def _hold(handle: int) -> bool | None:
-    """Whether this process now holds the file; None where the system or the file system does not support locks."""
+    """Try to lock the file. Returns whether this process holds the lock now; None if the system or the file system does
+    not support locks."""
     if fcntl is None:
         return None
     try:
@@ -100,7 +103,7 @@ def _sign(handle: int) -> None:
 
 
 def _owner(handle: int) -> dict:
-    """Owner named in the file; empty if the owner ended before it was written."""
+    """Read the owner from the file; empty if the owner ended before the file was written."""
     try:
         owner = json.loads(os.pread(handle, _LONGEST, 0))
     except (ValueError, RecursionError):
@@ -108,9 +111,9 @@ def _owner(handle: int) -> dict:
     return owner if isinstance(owner, dict) else {}
 
 
-def _gone(owner: dict, *, certain: bool) -> bool:
-    """Whether the owner has ended; `certain` where it no longer holds the file, which is conclusive on this machine
-    only."""
+def _has_ended(owner: dict, *, certain: bool) -> bool:
+    """Whether the owner has ended. `certain`: it is known not to hold the lock of the file any more, which is
+    conclusive for an owner on this machine only."""
     return _is_here(owner) and (certain or not is_alive(owner.get("pid")))
 
 

@@ -1,4 +1,4 @@
-"""Outlines or surfaces of a study's skins for each cell size, and the functions that create layouts on them."""
+"""Outline or surfaces of the skins of a study for each cell size, and functions that create layouts on them."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from jeit.design.study.study_tables import StudyTable
 
 Maker = Callable[[str, float, float, float], Layout | SurfaceLayout]
-"""A layout by name, with a diameter, contact impedance and least gap, as in `study_layout`."""
+"""Function that creates a layout from name, diameter, contact impedance and minimum gap, as `study_layout` does."""
 
 
 def meshes_of(table: StudyTable, folder: Path) -> tuple[list[float], Rectangle | Triangles, Sequence[Maker]]:
-    """Cell sizes, metres; the outline, for curved skins the surface of the first size; and the functions that create
-    layouts: one for all sizes, or for curved skins one for each."""
-    from jeit.design.skin.surface_tables import ScanTable  # it was imported when the table was read
+    """Returns the cell sizes, metres; the outline, or for curved skins the surface for the first cell size; and the
+    functions that create layouts: a single one for flat skins, and one for each cell size for curved skins."""
+    from jeit.design.skin.surface_tables import ScanTable  # imported already when the table was read
 
     cells = [1e-3 * size for size in table.mesh.cell_mm]
     described = table.surface

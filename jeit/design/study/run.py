@@ -1,4 +1,4 @@
-"""Run a study: batches on this machine or on a cluster, with progress."""
+"""Running of a study, on this machine or on a cluster, with reports of the progress."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from jeit.design.study.store import Store, open_results, writing
 
 
 class Progress(NamedTuple):
-    """Progress of a study: finished and total points and chunks; `seconds_left`, None until the first point of this
-    run.
+    """Progress of a study.
 
-    With exact maps, `points` also counts those of a chunk that is not finished, and would be solved again.
+    **Fields**: `points`, `all_points`: finished and total number of points; `chunks`, `all_chunks`: the same for
+    chunks; `seconds_left`: estimated remaining time, None until this run has finished its first point.
+
+    With exact maps, `points` includes points of the current chunk, which would be solved again after an interruption.
     """
 
     points: int
@@ -31,8 +33,8 @@ class Progress(NamedTuple):
 
 
 class ProgressReporter:
-    """Calls `progress` for work in `chunks`, and estimates the remaining time from the points finished since its
-    creation; `done` were finished before."""
+    """Reports the progress of work in `chunks` by calling `progress`, and estimates the remaining time from the points
+    finished since its creation. `done`: numbers of the chunks that were finished before."""
 
     def __init__(self, chunks: Sequence[Sequence[int]], done: set[int], progress: Callable[[Progress], None] | None):
         self._chunks, self._done, self._progress = chunks, set(done), progress
@@ -67,14 +69,14 @@ _Result = TypeVar("_Result")
 def over_cluster(
     client: Any, solve: Callable[[Any, int], _Result], work: Any, numbers: Iterable[int]
 ) -> Iterator[tuple[int, _Result]]:
-    """Yield the numbers of chunks with the results of `solve(work, number)`, as the workers of a
-    `dask.distributed.Client` complete them; chunks of a lost worker are solved again."""
+    """Yield the number of each chunk with its results `solve(work, number)`, in the order in which the workers of a
+    `dask.distributed.Client` complete them. Chunks of a lost worker are solved again."""
     distributed = optional("distributed", "a cluster")
-    # The work is sent once, as a task: where the only worker that has it is lost, it is sent again. Scattered, it would
-    # be lost; with every chunk, a layer of 70 MB would go out a thousand times.
+    # The work is sent once, as a task, so that it is sent again if the only worker that has it is lost. Scattered data
+    # would be lost in this case, and sending it with every chunk would transfer a layer of 70 MB a thousand times.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sending large graph")
-        sent = client.submit(_same, work, pure=False)
+        sent = client.submit(_identity, work, pure=False)
     futures = {client.submit(solve, sent, number, pure=False, retries=2): number for number in numbers}
     try:
         for future, results in distributed.as_completed(futures, with_results=True):
@@ -84,26 +86,28 @@ def over_cluster(
         client.cancel([sent, *futures])
 
 
-def _same(work: Any) -> Any:
+def _identity(work: Any) -> Any:
     return work
 
 
 def run_study(
     study: Study, path: str | Path, *, client: Any = None, progress: Callable[[Progress], None] | None = None
 ):
-    """Run the unfinished chunks of a study, and return its results, as of `open_results`.
+    """Run the unfinished chunks of a study, and return the results as `open_results` does.
 
-    If killed at any moment, the next run continues after the last finished chunk and gives the same store bit for bit.
+    If a run is killed at any moment, the next run continues after the last finished chunk and gives the same store bit
+    for bit.
 
-    - `path`: path of the Zarr store; created if there is none.
-    - `client`: a `dask.distributed.Client`, whose workers have jeit installed; chunks of a worker that is lost are
-      solved again, and only this process writes. In this process unless given.
-    - `progress`: called with a `Progress` at the start and after each chunk; in this process, after each exact map too.
+    - `path`: path of the Zarr store, which is created if it does not exist.
+    - `client`: a `dask.distributed.Client` whose workers have jeit installed. Chunks of a lost worker are solved again,
+      and only this process writes. By default, the chunks are computed in this process.
+    - `progress`: called with a `Progress` at the start and after each chunk; without a `client`, also after each exact
+      map.
 
-    Only one process at a time may run a study; locks of ended processes are ignored. Raises `ValueError` for meshes too
-    coarse for their electrodes or touches, for another study's store, and for one that another process writes, before
-    anything runs, `ImportError` without the extra `cluster`, and `OSError` where the store cannot be written, such as
-    on a full disk: finished chunks are kept.
+    Only one process at a time may run a study; locks of processes that have ended are ignored. Raises, before anything
+    runs, `ValueError` for meshes too coarse for their electrodes or touches, for the store of another study, and for a
+    store that another process writes. Raises `ImportError` without the extra `cluster`, and `OSError` if the store
+    cannot be written, such as on a full disk; finished chunks are kept.
     """
     need_extra("cluster", "a study")
     check_points(study)
@@ -118,8 +122,8 @@ def run_study(
 
 
 def study_progress(study: Study, path: str | Path) -> Progress:
-    """Progress of the study in a store; chunks that no longer match their checksums do not count. Raises as `Store`
-    does."""
+    """Progress of the study in a store. Chunks that do not match their checksums count as unfinished. Raises errors as
+    `Store` does."""
     finished = Store(study, path, create=False).sound()
     points = sum(len(study.chunks[number]) for number in finished)
     return Progress(points, len(study.points), len(finished), len(study.chunks), None)
@@ -128,7 +132,8 @@ def study_progress(study: Study, path: str | Path) -> Progress:
 def _solved(
     study: Study, numbers: list[int], client: Any, solved: Callable[[int], None]
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Yield chunks with their results, as they are solved; `solved` as in `solve_chunk`."""
+    """Yield the number of each chunk with its results, in the order in which they are solved; `solved` as in
+    `solve_chunk`."""
     if client is None:
         for number in numbers:
             yield number, solve_chunk(study, number, solved)

@@ -15,5 +15,5 @@ ScoreName = Literal[
     "largest_variance",
     "localisation_error",
 ]
-# Of linear changes of a sheet's voltages, with a prior: see `jeit.design.layout_scores`.
+# Scores for sheets only, from linearised voltage changes and a prior: see `jeit.design.layout_scores`.
 OPTIMALITY = ("information", "mean_variance", "largest_variance", "localisation_error")

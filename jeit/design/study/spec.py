@@ -1,4 +1,4 @@
-"""`Study`: a sweep over layouts and skin parameters from a TOML file, checked before anything runs."""
+"""`Study`: a sweep over layouts and skin parameters, read from a TOML file and checked before anything runs."""
 
 from __future__ import annotations
 
@@ -32,17 +32,17 @@ from jeit.protocol import Protocol
 if TYPE_CHECKING:
     from jeit.design.study.study_tables import StudyTable
 
-# Increase when the same study would give other results.
+# Version of the results: increase it if the same study would give different results.
 _VERSION = 2
-# Fewest electrodes of a protocol.
+# Minimum number of electrodes of each protocol.
 _FEWEST = {"adjacent": 4, "opposite": 4, "two-terminal": 2}
-# Bytes of a study's file, and of its store of results.
+# Maximum size of a study file, and of its store of results, bytes.
 _LONGEST, _MOST_STORED = 2**22, 20e9
 
 
 class Shape(NamedTuple):
-    """What points must share to share a mesh and a batch: see `Point`. `thickness` is 0 for sheets, which differ in it
-    without another mesh."""
+    """Parameters that points must have in common to share a mesh and a batch; fields as in `Point`. `thickness` is 0
+    for sheets, whose mesh does not depend on it."""
 
     electrodes: int
     protocol: str
@@ -56,8 +56,8 @@ class Shape(NamedTuple):
 class Point:
     """One skin of a study: its `layout` (with diameters and contact impedances) and other parameters, in SI units.
 
-    `pairs`: of the nearest electrodes, that a two-terminal `protocol` measures, 0 for all. `layers`: of cells of a
-    solid skin's mesh, 0 for a sheet.
+    `pairs`: number of pairs of nearest electrodes that a two-terminal `protocol` measures, 0 for all pairs. `layers`:
+    number of layers of cells, 0 for a sheet.
     """
 
     layout: Layout | SurfaceLayout
@@ -71,13 +71,13 @@ class Point:
 
     @property
     def shape(self) -> Shape:
-        """Points of one shape can share a batch."""
+        """Parameters that determine which points can share a batch: those with the same shape."""
         thickness = self.thickness if self.layers else 0.0
         return Shape(self.layout.num_electrodes, self.protocol, self.pairs, self.cell_size, self.layers, thickness)
 
     @property
     def electrodes(self) -> SheetDiscs | SurfaceDiscs | FaceDiscs:
-        """Electrodes in the sheet, or on the bottom of the layer."""
+        """Electrodes of the forward model, in the sheet or on the bottom of the layer."""
         return skin_electrodes(self.layout, self.layers)
 
     def measured(self, current: float) -> Protocol:
@@ -86,7 +86,7 @@ class Point:
 
     @property
     def coordinates(self) -> dict[str, str | int | float]:
-        """The swept values, by their names in the study file; means where electrodes differ."""
+        """The swept parameters, by their names in the study file; mean values if the electrodes differ."""
         return {
             "layout": self.layout.name,
             "electrodes": self.layout.num_electrodes,
@@ -103,18 +103,20 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """A sweep: every combination of the lists in a study file. Make it with `read_study`.
+    """A sweep over every combination of the lists in a study file; create it with `read_study`.
 
-    - `points`: the skins, in the order of the lists, the last list fastest.
-    - `outline`: theirs, of curved skins the surface of the first.
-    - `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether its changes
-      are, or linear; `columns`, `rows`: of the grid of touches.
-    - `current`: amperes. `scores`: those wanted; `num_taxels`, `threshold`, `seed`: of `find_taxels`; `correlation`: of
-      `TouchPrior`, metres.
-    - `chunk_points`: most points in a chunk. `text`: the study file. `surface`: text that identifies the surface of
-      curved skins, empty for flat ones.
+    **Fields**
 
-    Studies are equal if their results would be.
+    - `name`: name of the study; `points`: the skins, in the order of the lists, where the last list varies fastest.
+    - `outline`: outline of the skins; for curved skins, the surface for the first cell size.
+    - `indentation`, `contrast`: the touch, as in `touched_cells`; `exact`: whether voltage changes are exact instead of
+      linearised; `columns`, `rows`: size of the grid of touched positions.
+    - `current`: injected current, amperes; `scores`: names of the scores that are computed.
+    - `num_taxels`, `threshold`, `seed`: as in `find_taxels`; `correlation`: as in `TouchPrior.create`, metres.
+    - `chunk_points`: maximum number of points in a chunk; `text`: content of the study file; `surface`: text that
+      identifies the surface of curved skins, empty for flat skins.
+
+    Studies compare equal if they have the same results.
     """
 
     name: str
@@ -137,7 +139,7 @@ class Study:
 
     @cached_property
     def chunks(self) -> tuple[tuple[int, ...], ...]:
-        """Points (by number) of each chunk: of one shape, at most `chunk_points`."""
+        """Numbers of the points of each chunk: at most `chunk_points` points, all with the same shape."""
         shapes: dict[tuple, list[int]] = {}
         for number, point in enumerate(self.points):
             shapes.setdefault(point.shape, []).append(number)
@@ -148,7 +150,7 @@ class Study:
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that determines the results, without comments and the study's name."""
+        """SHA-256 hash of everything that determines the results; comments and the name of the study do not."""
         of_skin = [self.surface] if isinstance(self.outline, Triangles) else [*map(float, self.outline.extent)]
         content = [_VERSION, *of_skin, type(self.indentation).__name__]
         content += [*map(float, vars(self.indentation).values()), self.columns, self.rows, self.current]
@@ -156,7 +158,8 @@ class Study:
         content += [self.seed, self.chunk_points]
         for point in self.points:
             content += [point.coordinates, point.layers]
-            if is_file(point.layout.name):  # the last digits of others depend on how they were compiled
+            # Positions of built-in layouts are left out, since their last digits depend on the compilation.
+            if is_file(point.layout.name):
                 arrays = (point.layout.centres, point.layout.diameters, point.layout.contact_impedance)
                 content += [(np.round(array, 12) + 0.0).tolist() for array in map(np.asarray, arrays)]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
@@ -169,49 +172,52 @@ class Study:
 
 
 def read_study(path: str | Path) -> Study:
-    """Read the study that a TOML file describes. Lengths are in millimetres; lists are swept, in every combination::
+    """Read the study that a TOML file describes. Lengths are in millimetres. Keys with lists are swept: every
+    combination of their values is a point::
 
         name = "32 electrodes: inside or around"
         [skin]
-        model = "sheet"                      # or "layer": solid, electrodes on its bottom, mesh.layers (5) of cells
-        width_mm = 200                       # and height_mm, a rectangle about the origin
+        model = "sheet"                      # or "layer": solid, electrodes on its bottom; mesh.layers (default 5)
+        width_mm = 200                       # with height_mm: a rectangle about the origin
         thickness_mm = [5, 10]
         conductivity_S_per_m = 1.0
-        [surface]                            # of curved skins, without sides: inner-N, .csv files
+        [surface]                            # for curved skins, without width and height; layouts: inner-N, .csv files
         kind = "tube"                        # or "forearm", "sphere", "cap", "bent sheet"; or file = "arm.stl" and unit
         radius_mm = 30
         height_mm = 120
-        outward = true                       # false: a layer inside of the surface
+        outward = true                       # false: the layer is inside the surface
         [electrodes]
         layouts = ["park-inner", "park-boundary", "grid-8x4", "perimeter-32", "inner-32", "mine.csv"]
-        diameter_mm = [6, 8]                 # and contact_impedance_ohm_m2: the file's own, or 6 and 1e-4, unless given
+        diameter_mm = [6, 8]                 # and contact_impedance_ohm_m2; default: as in the file, or 6 and 1e-4
         minimum_gap_mm = 2
         [measurement]
         protocol = "two-terminal"            # or "adjacent", "opposite"
-        pairs = [0, 94]                      # of two-terminal: so many of the nearest electrodes; 0: all; 94, or all
+        pairs = [0, 94]                      # number of nearest two-terminal pairs; 0: all; default: 94 or fewer
         current_mA = 1
         noise_V = 2e-5
         [touch]
         indentation = "bell"                 # depth_mm, deviation_mm; or "hemisphere": depth_mm, diameter_mm
-        contrast = 0                         # of the touched part's conductivity; above 1 for a conductor
-        exact = false                        # true: solved anew for every touch, one point after the other
-        columns = 24                         # and rows
+        contrast = 0                         # factor for the conductivity where touched; above 1 for a conductor
+        exact = false                        # true: exact voltage changes, computed one point after the other
+        columns = 24                         # and rows, of the grid of touched positions
         [mesh]
         cell_mm = 4.5
         [scores]
         wanted = ["minimum", "mean", "uniformity", "blind_spot", "taxels"]    # num_taxels, threshold, seed
-        # of sheets also "information", "mean_variance", "largest_variance", "localisation_error": correlation_mm
+        # for sheets also "information", "mean_variance", "largest_variance", "localisation_error"; correlation_mm
 
-    Only `electrodes.layouts` must be there; defaults are those of `jeit.design.defaults`. Files are looked for
-    beside the study's. Raises `FileNotFoundError` if there is no such file and `ValueError`, naming the keys and what
-    to do, for keys that are not known or have no effect beside the others, values of another kind or out of range (such
-    as metres for millimetres), electrodes that overlap, impossible spacings, layouts that do not have the electrodes
-    that a protocol needs, and what would take more memory or disk than a study may.
+    Only `electrodes.layouts` is required; the defaults of other keys are those of `jeit.design.defaults`. Paths of
+    files are relative to the study file.
+
+    Raises `FileNotFoundError` if there is no such file. Raises `ValueError`, naming the keys and a remedy, for keys
+    that are unknown or have no effect in combination with the others, values of the wrong type or out of range (such as
+    metres for millimetres), electrodes that overlap, impossible spacings, layouts without the electrodes that a
+    protocol needs, and studies that would take too much memory or disk space.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
-    # pydantic takes longer to import than most of what jeit does with a study's file.
+    # Imported late, since the import of pydantic takes longer than most operations on a study file.
     from jeit.design.study.study_tables import StudyTable
     from jeit.files.limits import faults_message
     from jeit.files.schema import validated
@@ -232,7 +238,7 @@ def _study(text: str, table: StudyTable, folder: Path) -> Study:
     electrodes = table.electrodes
     gap = 1e-3 * electrodes.minimum_gap_mm
     cells, outline, makers = meshes_of(table, folder)
-    # Of every layout one on each mesh, which of flat skins is the same.
+    # Every layout is created once for each mesh; on flat skins, a single one serves all meshes.
     layouts = [
         [make(name, diameter, impedance, gap) for make in makers]
         for name, diameter, impedance in itertools.product(
@@ -303,7 +309,7 @@ def _indentation(table: StudyTable) -> AbstractIndentation:
 
 
 def _check_touches(table: StudyTable) -> None:
-    """Check that there are enough touches for the scores, and few enough for memory."""
+    """Check that there are enough touches for the scores, and that results and computations fit disk and memory."""
     scores, touches = table.scores, table.touch.columns * table.touch.rows
     of_sheets = [score for score in OPTIMALITY if score in scores.wanted]
     stored = 8.0 * table.num_points * touches
@@ -325,14 +331,14 @@ def _check_touches(table: StudyTable) -> None:
             f"scores.wanted has {', '.join(of_sheets)}, known for sheets only, and skin.model is 'layer'; leave them "
             "out, or take 'sheet'."
         )
-    # Of the covariance of all touches, and what its eigenvectors take.
+    # Memory for the covariance matrix of all touches and for its eigendecomposition.
     check_memory(f"scores.wanted = {of_sheets[0]!r} of {touches:,} touches (columns × rows)", 24.0 * touches**2)
 
 
 def _check_layout(
     layout: Layout | SurfaceLayout, outline: Rectangle | Triangles, layers: int, table: StudyTable
 ) -> None:
-    """Check that a layout can be measured and meshed with all swept parameters."""
+    """Check that a layout can be measured and meshed for all values of the swept parameters."""
     widest, thickest = 1e3 * longer_side(outline), max(table.skin.thickness_mm)
     if thickest > widest:
         raise ValueError(f"skin.thickness_mm is {thickest:g}, more than the skin is wide: {widest:g} mm.")
@@ -355,7 +361,7 @@ def _check_layout(
 
 
 def _pairs(layout: Layout | SurfaceLayout, protocol: str, pairs: int | None) -> int:
-    """Number of pairs as given, 0 for all; unless given, the default number, or all if there are fewer."""
+    """Number of pairs for `Point`, 0 for all pairs: the given number, or by default 94, or all if there are fewer."""
     if pairs is not None:
         return pairs
     return defaults.NUM_PAIRS if protocol == "two-terminal" and _all_pairs(layout) > defaults.NUM_PAIRS else 0
@@ -366,7 +372,7 @@ def _all_pairs(layout: Layout | SurfaceLayout) -> int:
 
 
 def _check_measurement(layout: Layout | SurfaceLayout, protocol: str, pairs: int) -> None:
-    """Check that the layout has enough electrodes for its protocol and pairs."""
+    """Check that a layout has enough electrodes for its protocol and number of pairs."""
     name, number, fewest = layout.name, layout.num_electrodes, _FEWEST[protocol]
     if number < fewest:
         raise ValueError(
@@ -394,5 +400,5 @@ def _metres(lengths: list[float]) -> list[float]:
 
 
 def _tidy(value) -> float:
-    """Round off the digits due to the conversion of units."""
+    """Round to 12 digits, which removes rounding errors of unit conversion."""
     return float(f"{float(value):.12g}")

@@ -1,15 +1,13 @@
-"""The store of a study: points and results in Zarr, checked before they are opened.
+"""The store of a study: points and results in Zarr.
 
-Check of a store's metadata as plain JSON, before Zarr opens any of it.
+`Store` holds the results of a study, or of other work in chunks, on disk. Chunks have separate files. A single file
+lists the finished chunks with their checksums, and is replaced as a whole after the files of a chunk are written; a
+chunk that is not in the list counts as unfinished.
 
-Zarr looks up a codec by the name in a file, and one of them, pickle, runs whatever the file holds. So a store from
-somebody else is opened only where it is what jeit writes: format 3, the arrays of its contents and no other, of numbers
-and text, through codecs that only pack bytes, and no links to other places.
-
-`Store`: results of a study or of other chunked work on disk, in Zarr; a chunk is either finished or does not count.
-
-Chunks have separate files. The list of finished chunks, with a checksum of each, is in one file that is replaced as a
-whole after the files of a chunk are written.
+The metadata of a store are checked as plain JSON before Zarr opens them. Zarr looks up codecs by the names in a file,
+and one of them, pickle, executes code from the file. A store is therefore opened only if it has the form that jeit
+writes: format 3, the expected arrays and no others, only numbers and text, codecs that only pack bytes, and no links to
+other paths.
 """
 
 from __future__ import annotations
@@ -36,9 +34,9 @@ from jeit.design.study.contents import Contents, study_contents
 from jeit.design.study.lock import locked
 from jeit.design.study.spec import Study
 
-# Those that pack bytes and nothing else. One that holds further codecs (sharding) is not among them.
+# Allowed codecs: they only pack bytes. Sharding is excluded, since it contains further codecs.
 CODECS = frozenset({"blosc", "bytes", "crc32c", "transpose", "vlen-utf8", "zstd"})
-# Bytes of a chunk of texts at most, and of what a chunk of numbers may have beside them.
+# Maximum unpacked size of a chunk of text, and maximum overhead of a chunk of numbers, bytes.
 _LARGEST, _BESIDE = 2**24, 2**12
 
 _NUMBERS = tuple(f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64))
@@ -49,7 +47,8 @@ _UNREADABLE = f"has a {_METADATA} that is no JSON object, or nested too deep"
 
 
 class ArrayShape(NamedTuple):
-    """Of one array of a store: how many values along each axis, how many in a chunk, and Zarr's name of its type."""
+    """Size of an array of a store: number of values along each axis, the same for a chunk, and Zarr's name of the data
+    type."""
 
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
@@ -57,7 +56,7 @@ class ArrayShape(NamedTuple):
 
 
 def danger(path: Path) -> str | None:
-    """The reason why the store must not be opened; None where nothing in it can run code or link to other paths. Raises
+    """Reason why a store must not be opened; None if nothing in it can run code or link to other paths. Raises
     `OSError` for files that cannot be read."""
     for folder, folders, files in os.walk(path):
         for name in [*folders, *files]:
@@ -67,7 +66,7 @@ def danger(path: Path) -> str | None:
             if name in _FORMAT_2:
                 return f"'{place.relative_to(path)}' is of Zarr's format 2, which jeit does not write"
     for file in path.rglob(_METADATA):
-        content = _read(file)  # what Zarr cannot read is damage, not danger
+        content = _read(file)  # a file that Zarr cannot read is damaged, but not dangerous
         for where, node in [] if content is None else _nodes(content, str(file.relative_to(path))):
             reason = _node_danger(node)
             if reason:
@@ -76,14 +75,14 @@ def danger(path: Path) -> str | None:
 
 
 def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
-    """The difference from a store of the arrays `expected`, by name; None if there is none. Raises `OSError` for files
-    that cannot be read."""
+    """Description of the first difference from a store with the arrays `expected`, by name; None if there is none.
+    Raises `OSError` for files that cannot be read."""
     content = _read(path / _METADATA)
     if content is None:
         return _UNREADABLE
     found = {folder.name for folder in path.iterdir() if folder.is_dir()}
     if found != set(expected):
-        return f"its arrays are not those of its contents: {_shortened(found ^ set(expected))}"
+        return f"its arrays are not those of its contents: {_short_text(found ^ set(expected))}"
     if content.get("zarr_format") != 3 or content.get("node_type") != "group":
         return "it is no group of Zarr's format 3"
     consolidated = content.get("consolidated_metadata")
@@ -102,20 +101,21 @@ def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
 
 
 def _chunk_damage(folder: Path, array: ArrayShape) -> str | None:
-    """Whether a chunk declares a larger unpacked size than its array's chunks have."""
+    """Description of the first chunk whose unpacked size is unknown or larger than a chunk of the array can be; None if
+    there is none."""
     most = _LARGEST if array.data_type == "string" else 8 * math.prod(array.chunks) + _BESIDE
     for file in folder.rglob("*"):
         if file.is_file() and file.name != _METADATA:
             with file.open("rb") as opened:
-                size = _unpacked(opened.read(18), file.stat().st_size)
+                size = _unpacked_size(opened.read(18), file.stat().st_size)
             if size is None or size > most:
                 return f"has a chunk, '{file.relative_to(folder)}', of {size or 'unknown'} bytes, more than {most}"
     return None
 
 
-def _unpacked(beginning: bytes, size: int) -> int | None:
-    """Bytes of a chunk that begins so and has this `size`, unpacked: as a frame of zstd says (RFC 8878), or a header of
-    blosc; of none of these its size itself. None where a frame does not say it."""
+def _unpacked_size(beginning: bytes, size: int) -> int | None:
+    """Unpacked size in bytes of a chunk, from its `beginning` and its `size` on disk: as stated in a zstd frame (RFC
+    8878) or a blosc header, otherwise `size` itself. None if a frame does not state it."""
     if beginning.startswith(b"\x28\xb5\x2f\xfd") and len(beginning) > 5:
         about = beginning[4]
         single = about >> 5 & 1
@@ -129,7 +129,8 @@ def _unpacked(beginning: bytes, size: int) -> int | None:
 
 
 def _nodes(content: Any, where: str) -> Iterator[tuple[str, Any]]:
-    """Every group and array that metadata describe, those of consolidated metadata, however deep, included."""
+    """Yield the location and the metadata of every group and array that `content` describes, including consolidated
+    metadata at any depth."""
     yield f"'{where}'", content
     consolidated = content.get("consolidated_metadata") if isinstance(content, dict) else None
     inner = consolidated.get("metadata") if isinstance(consolidated, dict) else None
@@ -146,11 +147,11 @@ def _node_danger(node: Any) -> str | None:
         return "asks for storage transformers"
     data_type = node.get("data_type")
     if "data_type" in node and not (isinstance(data_type, str) and data_type in _TYPES):
-        return f"holds neither numbers nor text but {_shortened([data_type])}"
+        return f"holds neither numbers nor text but {_short_text([data_type])}"
     codecs = node.get("codecs", [])
-    names = [codec.get("name") if isinstance(codec, dict) else codec for codec in _listed(codecs)]
+    names = [codec.get("name") if isinstance(codec, dict) else codec for codec in _as_list(codecs)]
     strange = [name for name in names if not (isinstance(name, str) and name in CODECS)]
-    return f"asks for {_shortened(strange)}, and not only for codecs that pack bytes" if strange else None
+    return f"asks for {_short_text(strange)}, and not only for codecs that pack bytes" if strange else None
 
 
 def _node_damage(node: Any, expected: ArrayShape) -> str | None:
@@ -167,7 +168,7 @@ def _node_damage(node: Any, expected: ArrayShape) -> str | None:
 
 
 def _read(file: Path) -> dict[str, Any] | None:
-    """The JSON object in a file; None for anything else. Raises `OSError`."""
+    """Read the JSON object in a file; None if the file contains anything else. Raises `OSError`."""
     try:
         content = json.loads(file.read_bytes())
     except (ValueError, RecursionError):
@@ -175,12 +176,12 @@ def _read(file: Path) -> dict[str, Any] | None:
     return content if isinstance(content, dict) else None
 
 
-def _listed(values: Any) -> list[Any]:
+def _as_list(values: Any) -> list[Any]:
     return values if isinstance(values, list) else [values]
 
 
-def _shortened(values: Any) -> str:
-    """Names from a file that nobody can trust: short, and on one line."""
+def _short_text(values: Any) -> str:
+    """Format up to three names from an untrusted file as a short text on one line."""
     return ", ".join(ascii(value)[:60] for value in [*values][:3])
 
 
@@ -194,13 +195,16 @@ class OtherContents(ValueError):
 
 
 class Store:
-    """The store of a study, or of other `Contents`, at `path`; made empty if there is none, or only read where none is
-    to be made. See `writing`."""
+    """The store of a study, or of other `Contents`, at `path`.
+
+    With `create`, it is opened for writing and created empty if it does not exist; otherwise it is opened for reading
+    only. Use `writing` to write a store.
+    """
 
     def __init__(self, work: Study | Contents, path: str | Path, *, create: bool = True):
-        """Raises `FileNotFoundError` if there is no store and none is to be made, `ValueError` if there is something
-        else, or another study's, or if it is damaged, or might run code when it is opened, `ImportError` without the
-        extra `cluster`, and `OSError` if it cannot be written."""
+        """Raises `FileNotFoundError` if there is no store and `create` is False. Raises `ValueError` if the path is not
+        a store or that of another study, if the store is damaged, or if it might run code when it is opened. Raises
+        `ImportError` without the extra `cluster`, and `OSError` if the store cannot be written."""
         zarr = optional("zarr", _TASK)
         self.contents = work if isinstance(work, Contents) else study_contents(work)
         check_kind("path", path, (str, os.PathLike), _A_PATH)
@@ -233,7 +237,7 @@ class Store:
 
     @property
     def versions(self) -> dict[str, str]:
-        """Versions of the packages that made the store."""
+        """Versions of the packages that created the store, by their names."""
         return self._attributes()["versions"]
 
     def finished(self) -> dict[int, str]:
@@ -245,7 +249,8 @@ class Store:
         return [number for number, checksum in self.finished().items() if self._checksum(number) == checksum]
 
     def write(self, number: int, results: Mapping[str, np.ndarray]) -> None:
-        """Write chunk `number`, then mark it as finished. Raises `OSError`, after which it does not count."""
+        """Write the results of chunk `number`, then mark it as finished. Raises `OSError` if it cannot be written; the
+        chunk then counts as unfinished."""
         try:
             for name, values in results.items():
                 self.write_array(name, self.contents.chunks[number], values)
@@ -260,7 +265,7 @@ class Store:
             ) from error
 
     def write_array(self, name: str, points: Sequence[int], values: np.ndarray) -> None:
-        """Write `values` (k, …) of array `name` at k points."""
+        """Write `values` (k, …) of the array `name` for k points."""
         array, first = self._group[name], 0
         for rows in _runs(points):
             last = first + rows.stop - rows.start
@@ -271,7 +276,7 @@ class Store:
         content = _read_json(self.path)
         finished = content["attributes"]["finished"] | {str(number): checksum}
         content["attributes"]["finished"] = dict(sorted(finished.items(), key=lambda item: int(item[0])))
-        # Beside the store, not in it, where a file left behind would be unknown to Zarr.
+        # The temporary file is beside the store: inside, Zarr would not recognise it if it were left behind.
         temporary = self.path.with_name(f".{self.path.name}.{os.getpid()}.tmp")
         try:
             with open(temporary, "w", encoding="utf-8") as file:
@@ -292,11 +297,11 @@ class Store:
             return None  # a file that cannot be decoded
 
     def open_dataset(self):
-        """The whole store as an `xarray.Dataset`, read when it is asked for."""
+        """Open the whole store as an `xarray.Dataset`, whose values are read when they are needed."""
         return optional("xarray", _TASK).open_zarr(str(self.path), chunks=None, zarr_format=3)
 
     def _check(self, expected: Mapping[str, ArrayShape]) -> None:
-        """Check the store before Zarr opens any of it."""
+        """Check the metadata of the store before Zarr opens it. Raises `ValueError` if it is dangerous or damaged."""
         try:
             reason = danger(self.path)
             wrong = None if reason else damage(self.path, expected)
@@ -312,7 +317,9 @@ class Store:
             raise self._damaged(wrong)
 
     def _attributes(self) -> dict:
-        """Attributes of a study's store; empty for anything else. Raises `ValueError` if they cannot be read."""
+        """Read the attributes of the store; empty if the path is not a store. Raises `ValueError` if they cannot be
+        read.
+        """
         try:
             content = _read_json(self.path)
         except (FileNotFoundError, NotADirectoryError):
@@ -336,10 +343,11 @@ class Store:
 
 @contextlib.contextmanager
 def writing(work: Study | Contents, path: str | Path) -> Iterator[Store]:
-    """Open the store of `work` at `path`, created empty if there is none, for this process alone to write.
+    """Context with the store of `work` at `path`, which no other process can write; it is created empty if it does not
+    exist.
 
-    Temporary files of killed runs are removed. Raises as `Store` does, and `ValueError` where another process writes
-    it.
+    Temporary files of killed runs are removed. Raises errors as `Store` does, and `ValueError` if another process
+    writes the store.
     """
     check_kind("path", path, (str, os.PathLike), _A_PATH)
     contents = work if isinstance(work, Contents) else study_contents(work)
@@ -347,16 +355,17 @@ def writing(work: Study | Contents, path: str | Path) -> Iterator[Store]:
     with locked(path, contents.kind):
         _clear_beside(path)
         store = Store(contents, path)
-        for left in path.rglob("*.partial"):  # of Zarr
+        for left in path.rglob("*.partial"):  # temporary files of Zarr
             left.unlink(missing_ok=True)
         yield store
 
 
 def open_results(study: Study, path: str | Path):
-    """Open the results as an `xarray.Dataset` with dimensions point and place; unfinished points are NaN.
+    """Open the results of a study as an `xarray.Dataset` with dimensions "point" and "place"; the values of unfinished
+    points are NaN.
 
-    `xarray.open_zarr(path)` opens the same store, but does not detect half-written chunks of an interrupted run, nor
-    code that somebody else's store may run. Raises as `Store` does.
+    `xarray.open_zarr(path)` opens the same store, but detects neither half-written chunks of an interrupted run nor
+    code that a store from another source may execute. Raises errors as `Store` does.
     """
     xarray = optional("xarray", _TASK)
     store = Store(study, path, create=False)
@@ -374,7 +383,7 @@ def open_results(study: Study, path: str | Path):
 
 
 def _shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
-    """Of the arrays that `contents` fills a store with: of one in memory, which has no values."""
+    """Sizes of the arrays of `contents`, by name, from a store in memory that has no values."""
     group = zarr.open_group(zarr.storage.MemoryStore(), mode="w", zarr_format=3)
     contents.fill(group)
     return {
@@ -384,14 +393,14 @@ def _shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
 
 
 def _runs(points: Sequence[int]) -> list[slice]:
-    """Group consecutive points."""
+    """Group consecutive numbers of points to slices."""
     places = np.asarray(points)
     ends = np.flatnonzero(np.diff(places) != 1) + 1
     return [slice(int(run[0]), int(run[-1]) + 1) for run in np.split(places, ends)]
 
 
 def _create(zarr: ModuleType, contents: Contents, path: Path) -> None:
-    """Create the store atomically: under another name, then renamed."""
+    """Create the store atomically: under a temporary name, which is then changed."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
     shutil.rmtree(temporary, ignore_errors=True)
     attributes = {
@@ -412,7 +421,7 @@ def _create(zarr: ModuleType, contents: Contents, path: Path) -> None:
 
 
 def _clear_beside(path: Path) -> None:
-    """Remove the files that killed runs have left beside the store."""
+    """Remove temporary files beside the store that killed runs have left."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*"):
         pid, _, kind = left.name.removeprefix(f".{path.name}.").partition(".")
         if pid.isdecimal() and kind == "new":

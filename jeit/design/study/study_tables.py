@@ -1,4 +1,4 @@
-"""Tables of a study's file: type, range and unit of every key; lists are swept."""
+"""Tables of a study file: type, range and unit of every key. Keys with lists are swept."""
 
 from __future__ import annotations
 
@@ -24,12 +24,13 @@ from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_of_curv
 from jeit.design.study.scores import OPTIMALITY, ScoreName
 from jeit.files.schema import Number, Several, Table, Word, fault
 
-# Layouts, and points, that are made before anything runs: some milliseconds and some kilobytes each.
+# Maximum numbers of layouts and of points: they are created before anything runs and take milliseconds and kilobytes
+# each.
 _MOST_LAYOUTS, _MOST_POINTS = 2000, 100_000
 
 
 class MaterialSweep(Table):
-    """The skins' model and material."""
+    """Table "skin": model, size and material of the skins."""
 
     what = "a study"
     model: Literal["sheet", "layer"] = "sheet"
@@ -40,7 +41,7 @@ class MaterialSweep(Table):
 
 
 class LayoutSweep(Table):
-    """The electrodes. NaN means the layout's own value."""
+    """Table "electrodes": layouts, diameters and contact impedances. NaN stands for the values of the layout."""
 
     what = "a study"
     layouts: Several[Word]
@@ -50,7 +51,7 @@ class LayoutSweep(Table):
 
 
 class MeasurementSweep(Table):
-    """The measurement protocol."""
+    """Table "measurement": measurement protocols, current and noise."""
 
     what = "a study"
     protocol: Several[ProtocolName] = Field(default=[defaults.PROTOCOL])
@@ -60,7 +61,7 @@ class MeasurementSweep(Table):
 
 
 class TouchTable(Table):
-    """The touches and their grid."""
+    """Table "touch": shape of the touches, and grid of the touched positions."""
 
     what = "a study"
     indentation: Literal["bell", "hemisphere"] = "bell"
@@ -74,7 +75,7 @@ class TouchTable(Table):
 
 
 class CellsSweep(Table):
-    """The meshes."""
+    """Table "mesh": cell sizes and number of layers."""
 
     what = "a study"
     cell_mm: Annotated[list[float], CELL] = Field(default=[1e3 * defaults.CELL_SIZE])
@@ -82,7 +83,7 @@ class CellsSweep(Table):
 
 
 class ScoresTable(Table):
-    """The wanted scores and their parameters."""
+    """Table "scores": scores to be computed, and their parameters."""
 
     what = "a study"
     wanted: Several[ScoreName] = Field(default=["minimum", "mean", "uniformity"])
@@ -93,7 +94,7 @@ class ScoresTable(Table):
 
 
 class StudyTable(Table):
-    """A complete study file."""
+    """All tables of a study file."""
 
     what = "a study"
     name: Word = "study"
@@ -108,19 +109,19 @@ class StudyTable(Table):
 
     @property
     def num_layouts(self) -> int:
-        """Number of layouts."""
+        """Number of layouts, including the combinations with diameters and contact impedances."""
         one = self.electrodes
         return math.prod(map(len, (one.layouts, one.diameter_mm, one.contact_impedance_ohm_m2)))
 
     @property
     def num_points(self) -> int:
-        """Number of points: all combinations."""
+        """Number of points, that is of all combinations of swept values."""
         skin, measurement = self.skin, self.measurement
         of_points = (measurement.protocol, measurement.pairs or [0], measurement.noise_V, self.mesh.cell_mm)
         return self.num_layouts * math.prod(map(len, (skin.thickness_mm, skin.conductivity_S_per_m, *of_points)))
 
     def at(self, where: str) -> Any:
-        """The value of a key by its dotted name."""
+        """Value of a key, given by its dotted name such as "mesh.layers"."""
         section, name = where.split(".")
         return getattr(getattr(self, section), name)
 
@@ -163,7 +164,7 @@ class StudyTable(Table):
         return self
 
 
-# Keys without effect unless another has one of these words.
+# Keys that have an effect only if another key has one of the given values.
 _NEEDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "mesh.layers": ("skin.model", ("layer",)),
     "touch.deviation_mm": ("touch.indentation", ("bell",)),

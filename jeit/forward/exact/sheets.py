@@ -1,68 +1,62 @@
 """Exact voltages of homogeneous disks and of sheets with discs, flat or curved.
 
-Exact solutions of a disk fed through its rim: point electrodes, and the complete electrode model.
-
-A disk fed through its rim: the Neumann-to-Dirichlet kernel, and point electrodes.
-
-A current density j(φ) (A/m) leaving the rim of a disk of radius a and sheet conductivity σ inwards raises
-the rim's potential, up to a constant, to
+**A disk fed through its rim: the Neumann-to-Dirichlet kernel, and point electrodes.** A current density j(φ) (A/m) that
+enters a disk of radius a and sheet conductivity σ through its rim raises the potential of the rim, up to a constant, to
 
     u(θ) = ∫ N(θ − φ) j(φ) a dφ,    N(δ) = 1/(πσ) Σ_k λ_k cos(kδ)/k .
 
-For the homogeneous disk λ_k = 1 and the series is −log|2 sin(δ/2)|/(πσ) (u = r^k cos kθ has σ ∂u/∂r = σk/a
-times itself on the rim). With a concentric inclusion of radius ρa and conductivity σ_i, matching
-potential and current on r = ρa gives
+For the homogeneous disk λ_k = 1 and the series is −log|2 sin(δ/2)|/(πσ) (on the rim, u = r^k cos kθ satisfies σ ∂u/∂r =
+σk/a · u). With a concentric inclusion of radius ρa and conductivity σ_i, continuity of potential and current at r = ρa
+gives
 
     λ_k = (1 − μ ρ^{2k}) / (1 + μ ρ^{2k}),    μ = (σ_i − σ)/(σ_i + σ),
 
-so that the inclusion adds the smooth series −2 Σ_k μρ^{2k}/(1 + μρ^{2k}) cos(kδ)/k to the logarithm
-(Isaacson 1986, "Distinguishability of conductivities by electric current computed tomography").
+so that the inclusion adds the smooth series −2 Σ_k μρ^{2k}/(1 + μρ^{2k}) cos(kδ)/k to the logarithm (Isaacson 1986,
+"Distinguishability of conductivities by electric current computed tomography").
 
-The complete electrode model on the rim of a disk, to many digits.
+**A disk fed through its rim: the complete electrode model, to many digits.** On electrode l, an arc of half-angle h_l
+about θ_l, the current density satisfies the integral equation of the second kind
 
-On electrode l, an arc of half-angle h_l about θ_l, the current density obeys the integral equation
+    z_l j(θ) + ∫ N(θ − φ) j(φ) a dφ = U_l − c,    a ∫ j dθ = I_l.
 
-    z_l j(θ) + ∫ N(θ − φ) j(φ) a dφ = U_l − c,    a ∫ j dθ = I_l,
-
-of the second kind (N: the kernel of `jeit.forward.exact.sheets`). With z > 0 the density is bounded, and behaves like
-s log s at a distance s from an electrode's edge; Legendre polynomials of degree < p on each arc therefore
-give electrode potentials to O(p^-6). The logarithm on one and the same arc is integrated exactly:
+For z > 0 the density is bounded, and behaves like s log s at a distance s from the edge of an electrode; Legendre
+polynomials of degree < p on each arc therefore give electrode potentials to O(p^-6). The logarithm on a single arc is
+integrated exactly:
 
     ∫∫ P_m(x) P_n(y) log|x − y| dx dy = 8 / [(m+n)(m+n+2)((m−n)²−1)]   for m + n even and positive,
 
-0 for m + n odd and 4 log 2 − 6 for m = n = 0 (from ∫ P_n(x) log|y−x| dx = 2 (Q_{n+1} − Q_{n−1})(y)/(2n+1)
-and ∫ P_m Q_n = 2/((m−n)(m+n+1)) for m + n odd, DLMF 14.17). All else is smooth and left to Gauss-Legendre.
+0 for m + n odd and 4 log 2 − 6 for m = n = 0 (from ∫ P_n(x) log|y−x| dx = 2 (Q_{n+1} − Q_{n−1})(y)/(2n+1) and ∫ P_m Q_n
+= 2/((m−n)(m+n+1)) for m + n odd, DLMF 14.17). All other integrands are smooth and are integrated by Gauss-Legendre
+quadrature.
 
-Disc electrodes lying on a conducting sheet that is itself a disk with an insulated rim.
+**Disc electrodes on a conducting sheet that is itself a disk with an insulated rim.** Under a disc of radius b the
+contact takes current from the sheet everywhere, σ Δu = (u − U)/z, so that with the transfer length λ = √(σz) the
+potential there is U + Σ_n A_n I_n(r/λ) cos n(φ − φ_n); outside the discs u is harmonic.
 
-Under a disc of radius b the contact takes current from the sheet everywhere, σ Δu = (u − U)/z, so that with
-the transfer length λ = √(σz) the potential there is U + Σ_n A_n I_n(r/λ) cos n(φ − φ_n); outside the discs u
-is harmonic.
-
-One disc in the middle, all current leaving through the rim, has only n = 0: a closed form. For several discs
-anywhere, the field about each disc is expanded in its own multipoles (b/r)^n and in the regular harmonics
-(r/b)^n that the other discs and the mirror images in the rim raise there; matching value and flux on r = b
-gives
+For a single disc in the middle and all current leaving through the rim only n = 0 occurs, which gives a closed form.
+For several discs at any places, the field about each disc is expanded in the multipoles (b/r)^n of the disc and in the
+regular harmonics (r/b)^n that the other discs and the mirror images in the rim produce there; continuity of potential
+and flux at r = b gives
 
     multipole_n = regular_n (n − q_n)/(n + q_n),    q_n = (b/λ) I_n'(b/λ) / I_n(b/λ),
 
-a linear system whose truncation error falls geometrically with the number of multipoles. A harmonic function
-h satisfies the insulating condition on |w| = a when h(a²/w̄), its image, is added.
+a linear system whose truncation error decreases geometrically with the number of multipoles. A harmonic function h
+satisfies the insulating condition on |w| = a if its image h(a²/w̄) is added.
 
-Sheets that are curved, fed through points: a closed sphere, and a sleeve that is open at its ends.
+**Curved sheets fed through points: a closed sphere, and a sleeve (an open cylinder).** A current of one ampere that is
+fed into a sphere of sheet conductivity σ at a point, and taken out uniformly over the sphere, gives the potential
 
-A current of one ampere fed into a sphere of sheet conductivity σ at a point, and taken out evenly all over it, raises
+    u = −1/(2πσ) log |chord|,
 
-    u = −1/(2πσ) log |chord|
+because stereographic projection is conformal and maps it to the logarithm in the plane.
 
-there: stereographic projection is conformal, and turns it into the plane's logarithm.
-
-Round a sleeve of radius R, u is a Fourier series in n φ. An endless one has, for n > 0 and s = |z − z'|/R,
+On a sleeve of radius R, u is a Fourier series in n φ. On an infinite sleeve the terms n > 0 sum to, with s = |z −
+z'|/R,
 
     1/(2πσ) Σ_n e^{−ns} cos(nφ) / n = −1/(4πσ) log(1 − 2 e^{−s} cos φ + e^{−2s}),
 
-and insulated ends at z = 0 and z = H mirror the source, again and again, to 2kH ± z'. What is left is n = 0, a rod with
-a source and an even sink: 1/(2πRσ) [(z² + z'²)/2H − max(z, z')].
+and insulated ends at z = 0 and z = H mirror the source repeatedly, to 2kH ± z'. The term n = 0 is that of a rod with a
+source and a uniform sink: 1/(2πRσ) [(z² + z'²)/2H − max(z, z')].
 """
 
 from __future__ import annotations
@@ -75,8 +69,8 @@ from scipy.special import ive
 
 @dataclass(frozen=True)
 class ConductingDisk:
-    """A disk: `radius` in metres, sheet `conductivity` in siemens, and perhaps a concentric inclusion
-    of `inclusion_ratio` times the radius and of `inclusion_conductivity`."""
+    """A disk. **Fields**: `radius` in metres; `conductivity`: sheet conductivity in siemens; `inclusion_ratio`: radius
+    of a concentric inclusion divided by that of the disk, 0 for none; `inclusion_conductivity` in siemens."""
 
     radius: float = 1.0
     conductivity: complex = 1.0
@@ -84,7 +78,7 @@ class ConductingDisk:
     inclusion_conductivity: complex = 1.0
 
     def inclusion_kernel(self, angle: np.ndarray) -> np.ndarray:
-        """Contribution of the inclusion to the kernel N at angular distance `angle`, in ohm."""
+        """Contribution of the inclusion to the kernel N at the angular distance `angle`, in ohm."""
         angle = np.asarray(angle, dtype=float)
         if self.inclusion_ratio == 0.0:
             return np.zeros_like(angle)
@@ -97,16 +91,16 @@ class ConductingDisk:
         return series / (np.pi * self.conductivity)
 
     def kernel(self, angle: np.ndarray) -> np.ndarray:
-        """The kernel N, in ohm, at angular distances that are not zero."""
+        """The kernel N, in ohm, at nonzero angular distances."""
         logarithm = -np.log(np.abs(2.0 * np.sin(np.asarray(angle) / 2.0)))
         return logarithm / (np.pi * self.conductivity) + self.inclusion_kernel(angle)
 
 
 def point_transfer_impedance(disk: ConductingDisk, angles: np.ndarray) -> np.ndarray:
-    """Rim potential (V) at each of `angles` (L,) for one ampere into each: (L, L), but for a constant.
+    """Rim potential (V) at each of `angles` (L,) for one ampere into each point; (L, L), up to a constant.
 
-    A point that feeds a current has an infinite potential; the diagonal holds zero there, so use the matrix
-    only where the measured electrodes are not the driven ones.
+    The potential at a point that feeds a current is infinite; the diagonal is set to zero, so use the matrix only where
+    the measured electrodes are not the driven ones.
     """
     distance = angles[:, None] - angles[None, :]
     off_diagonal = ~np.eye(len(angles), dtype=bool)
@@ -116,12 +110,13 @@ def point_transfer_impedance(disk: ConductingDisk, angles: np.ndarray) -> np.nda
 
 
 def point_inclusion_effect(disk: ConductingDisk, angles: np.ndarray) -> np.ndarray:
-    """Contribution of the inclusion to `point_transfer_impedance`: (L, L), finite on the diagonal too."""
+    """Contribution (L, L) of the inclusion to `point_transfer_impedance`; finite on the diagonal too."""
     return disk.inclusion_kernel(angles[:, None] - angles[None, :])
 
 
 def point_potentials(disk: ConductingDisk, angles: np.ndarray, current: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Potential (V) at `points` (n, 2), no inclusion; `current` (L,) in all zero entering at `angles`."""
+    """Potential (V) at `points` (n, 2) of a disk without inclusion; `current` (L,), with sum zero, enters at
+    `angles`."""
     feet = disk.radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     distance = np.linalg.norm(points[:, None, :] - feet[None, :, :], axis=-1)
     return -np.log(distance) @ current / (np.pi * disk.conductivity)
@@ -144,11 +139,11 @@ def arc_transfer_impedance(
     contact_impedance: np.ndarray,
     order: int = 48,
 ) -> np.ndarray:
-    """Electrode potentials (V), of sum zero, for one ampere into each electrode and −1/L into all: (L, L).
+    """Electrode potentials (V) with sum zero, for one ampere into each electrode and −1/L into all electrodes; (L, L).
 
-    `angles` (L,) are the arcs' centres in radians, `widths` (L,) their lengths in metres along the circle,
-    `contact_impedance` (L,) is in ohm·m. For drive patterns D and measurement patterns M, of sum zero, the
-    voltages are M Z Dᵀ.
+    `angles` (L,) are the centres of the arcs in radians, `widths` (L,) their lengths in metres along the circle,
+    `contact_impedance` (L,) is in ohm·m. For drive patterns D and measurement patterns M with sum zero, the voltages
+    are M Z Dᵀ, where Z is the matrix returned.
     """
     num = len(angles)
     half = np.broadcast_to(widths, (num,)) / (2.0 * disk.radius)
@@ -168,7 +163,7 @@ def arc_transfer_impedance(
             if row != column:
                 block = weighted.T @ disk.kernel(distance) @ weighted
             else:
-                # 2 sin(δ/2)/δ, by sinc(x) = sin(πx)/(πx), is the smooth factor of the logarithm's argument.
+                # 2 sin(δ/2)/δ, computed with sinc(x) = sin(πx)/(πx), is the smooth factor of the logarithm's argument.
                 smooth = -np.log(np.sinc(distance / (2.0 * np.pi))) / (np.pi * disk.conductivity)
                 block = weighted.T @ (smooth + disk.inclusion_kernel(distance)) @ weighted
                 logarithm = logarithm_moments(order)
@@ -187,10 +182,10 @@ def arc_transfer_impedance(
 
 
 def disc_contact_resistance(conductivity: complex, radius: float, contact_impedance: complex) -> complex:
-    """U − u on the disc's edge, in volts, per ampere fed into the disc: λ I_0(b/λ) / (2πσb I_1(b/λ)).
+    """U − u at the edge of the disc, in volts per ampere fed into the disc: λ I_0(b/λ) / (2πσb I_1(b/λ)).
 
-    Sheet `conductivity` σ in siemens, `radius` b in metres, `contact_impedance` z in ohm·m². As b/λ → 0 this is
-    z/(πb²), a contact fed uniformly; as b/λ → ∞ it is that of a ring of width λ.
+    Sheet `conductivity` σ in siemens, `radius` b in metres, `contact_impedance` z in ohm·m². For b/λ → 0 this is
+    z/(πb²), a uniformly fed contact; for b/λ → ∞ it is the resistance of a ring of width λ.
     """
     transfer_length = np.sqrt(conductivity * contact_impedance)
     argument = radius / transfer_length
@@ -202,7 +197,7 @@ def centre_to_rim_resistance(
 ) -> complex:
     """Resistance (ohm) from a disc electrode in the middle to an electrode that covers the whole rim.
 
-    `contact_impedance` of the disc in ohm·m², of the rim in ohm·m.
+    `contact_impedance` of the disc is in ohm·m², `rim_contact_impedance` in ohm·m.
     """
     spreading = np.log(disk.radius / radius) / (2.0 * np.pi * disk.conductivity)
     rim = rim_contact_impedance / (2.0 * np.pi * disk.radius)
@@ -216,16 +211,16 @@ def disc_transfer_impedance(
     contact_impedance: np.ndarray,
     num_multipoles: int = 24,
 ) -> np.ndarray:
-    """Electrode potentials (V), of sum zero, for one ampere into each disc and −1/L into all: (L, L).
+    """Electrode potentials (V) with sum zero, for one ampere into each disc and −1/L into all discs; (L, L).
 
-    `positions` (L, 2) and `radii` (L,) in metres, `contact_impedance` (L,) in ohm·m²; no inclusion.
+    `positions` (L, 2) and `radii` (L,) in metres, `contact_impedance` (L,) in ohm·m²; the disk has no inclusion.
     """
     num = len(positions)
     order = np.arange(1, num_multipoles + 1)
     centre = positions[:, 0] + 1j * positions[:, 1]
     num_samples = 4 * num_multipoles
     circle = np.exp(2j * np.pi * np.arange(num_samples) / num_samples)
-    # Row n of `analysis` takes samples on a circle to the coefficient of cos nφ; row N + n to that of sin nφ.
+    # Row n of `analysis` maps samples on a circle to the coefficient of cos nφ, and row N + n to that of sin nφ.
     harmonics = circle ** order[:, None]
     analysis = np.concatenate([harmonics.real, harmonics.imag]) * (2.0 / num_samples)
     dtype = np.result_type(disk.conductivity, contact_impedance, 1.0)
@@ -246,9 +241,9 @@ def disc_transfer_impedance(
 
         point = centre[at] + radii[at] * circle
         for source in range(num):
-            # The image a²/w̄ − w_l = (a² − w_l w̄)/w̄; the log|w̄| it brings cancels over currents of sum zero.
+            # The image is a²/w̄ − w_l = (a² − w_l w̄)/w̄; its term log|w̄| cancels for currents with sum zero.
             logarithm = -np.log(np.abs(disk.radius**2 - centre[source] * point.conj()))
-            # Multipole cos nφ is the real part of (b/(w − w_l))^n, sin nφ minus its imaginary part.
+            # The multipole cos nφ is the real part of (b/(w − w_l))^n, and sin nφ is minus its imaginary part.
             field = (radii[source] * point.conj() / (disk.radius**2 - centre[source] * point.conj()))[:, None] ** order
             if at == source:
                 logarithm = logarithm - np.log(radii[source])
@@ -270,15 +265,16 @@ def disc_transfer_impedance(
     return centring @ potential
 
 
-# Images that are farther off than this many radii are not seen in double precision.
+# Distance in radii beyond which images are negligible in double precision.
 _FARTHEST = 45.0
 
 
 def sphere_sheet_impedance(positions: np.ndarray, conductivity: complex) -> np.ndarray:
-    """Potential (V) at each of `positions` (L, 3), metres, on a sphere for one ampere into each: (L, L), but for a
-    constant.
+    """Potential (V) at each of `positions` (L, 3), in metres on a sphere, for one ampere into each point; (L, L), up to
+    a constant.
 
-    Sheet `conductivity` in siemens. A point that feeds a current has an infinite potential; the diagonal holds zero.
+    Sheet `conductivity` in siemens. The potential at a point that feeds a current is infinite; the diagonal is set to
+    zero.
     """
     distance = np.linalg.norm(positions[:, None] - positions, axis=-1)
     np.fill_diagonal(distance, 1.0)
@@ -288,11 +284,12 @@ def sphere_sheet_impedance(positions: np.ndarray, conductivity: complex) -> np.n
 def sleeve_sheet_impedance(
     radius: float, height: float, angles: np.ndarray, heights: np.ndarray, conductivity: complex
 ) -> np.ndarray:
-    """Potential (V) at each of L points of a sleeve for one ampere into each: (L, L), but for what cancels over
-    currents of sum zero.
+    """Potential (V) at each of L points of a sleeve for one ampere into each point; (L, L), up to terms that cancel for
+    currents with sum zero.
 
-    `radius` and `height` of the sleeve in metres; the points' `angles` (L,) round it in radians and `heights` (L,)
-    above its lower end in metres; sheet `conductivity` in siemens. The diagonal holds zero, as of a sphere.
+    `radius` and `height` of the sleeve in metres; `angles` (L,) of the points around it in radians, and their `heights`
+    (L,) above its lower end in metres; sheet `conductivity` in siemens. The diagonal is set to zero, where the
+    potential is infinite.
     """
     around = angles[:, None] - angles
     z, source = heights[:, None], heights

@@ -1,30 +1,29 @@
 """Exact voltages of homogeneous boxes, cylinders and spheres, as series.
 
-A cylinder, solid or hollow, fed through patches of its wall, the current spread evenly over each (the gap model).
-
-In 0 < z < H with insulated ends and R₁ < r < R₂, insulated at R₁, potentials are sums of F(r) cos nφ cos kz, k = mπ/H,
-with
+**A solid or hollow cylinder**, fed through patches of its wall, with a current that is uniform over each patch (the gap
+model). In 0 < z < H with insulated ends and R₁ < r < R₂, insulated at R₁, potentials are sums of F(r) cos nφ cos kz, k
+= mπ/H, with
 
     F = I_n(kr) − I_n'(kR₁)/K_n'(kR₁) K_n(kr)   for m > 0,      F = (r/R₂)^n + (R₁²/rR₂)^n   for m = 0 < n,
 
-and a density of current j in this mode raises the wall by j F(R₂) / (σ F'(R₂)). A patch of half-angle α and height h at
-(φ_l, z_l) that carries one ampere has the density Σ ε_n ε_m w_nm cos n(φ − φ_l) cos kz / (2πR₂H), with w_nm =
-sin(nα)/(nα) · sin(kh/2)/(kh/2) · cos kz_l, ε_0 = 1 and else 2; its mean potential weighs the modes the same way. Ratios
-of Bessel functions come from their recurrences, those of I_n downwards and those of K_n upwards, which are stable.
+and a current density j in this mode raises the potential of the wall by j F(R₂) / (σ F'(R₂)). A patch of half-angle α
+and height h at (φ_l, z_l) that carries one ampere has the density Σ ε_n ε_m w_nm cos n(φ − φ_l) cos kz / (2πR₂H), with
+w_nm = sin(nα)/(nα) · sin(kh/2)/(kh/2) · cos kz_l, where ε_0 = 1 and all other ε are 2; its mean potential weights the
+modes in the same way. Ratios of Bessel functions are computed from recurrences in their stable directions: downwards
+for I_n, upwards for K_n.
 
-An electrode with a contact impedance z that is large against its size over σ carries an even current, and measures the
-mean potential beneath it, besides the drop z I / area at its own contact.
+An electrode whose contact impedance z is large compared with its size divided by σ carries a uniform current density.
+It measures the mean potential beneath it plus the voltage z I / area across its contact.
 
-A ball, or a hollow one, fed through caps of its surface, the current spread evenly over each (the gap model).
-
-Between an insulated R₁ and R₂ potentials are sums of F(r) P_n(cos γ), F = r^n + n/(n+1) R₁^{2n+1} r^{−n−1}. A cap of
-half-angle α that carries one ampere has the density Σ (2n+1) w_n P_n(cos γ) / (4πR₂²), γ the angle from its middle,
-with
+**A solid or hollow ball**, fed through caps of its surface, with a current that is uniform over each cap (the gap
+model). With an insulated inner surface at R₁, potentials are sums of F(r) P_n(cos γ), F = r^n + n/(n+1) R₁^{2n+1}
+r^{−n−1}. A cap of half-angle α that carries one ampere has the density Σ (2n+1) w_n P_n(cos γ) / (4πR₂²), where γ is
+the angle from the centre of the cap, with
 
     w_n = (P_{n−1}(cos α) − P_{n+1}(cos α)) / ((2n+1)(1 − cos α)),
 
-the mean of P_n over the cap; by the addition theorem the mean of P_n(cos γ) over another cap is w_n P_n of the angle
-between them. The effect of contact impedances is described in `jeit.forward.exact.solids`.
+the mean of P_n over the cap. By the addition theorem the mean of P_n(cos γ) over another cap is w_n P_n of the angle
+between the caps. Contact impedances act as described for the cylinder.
 """
 
 from __future__ import annotations
@@ -36,10 +35,10 @@ from scipy.special import ive, kve
 
 
 def plate_resistance(length: float, area: float, conductivity: complex, contact_impedance: complex) -> complex:
-    """R = ℓ/(σA) + 2z/A, in ohm: Ohm's law, and one contact layer at each plate.
+    """Resistance R = ℓ/(σA) + 2z/A in ohm: Ohm's law for the conductor and one contact layer at each plate.
 
-    In 3-D `area` is in m², `conductivity` in S/m, `contact_impedance` in ohm·m²; in 2-D `area` is the plate's
-    length in metres, `conductivity` in siemens, `contact_impedance` in ohm·m.
+    In 3-D `area` is in m², `conductivity` in S/m and `contact_impedance` in ohm·m²; in 2-D `area` is the length of the
+    plate in metres, `conductivity` is in siemens and `contact_impedance` in ohm·m.
     """
     return length / (conductivity * area) + 2.0 * contact_impedance / area
 
@@ -51,14 +50,16 @@ def face_patch_impedance(
     conductivity: complex,
     num_modes: tuple[int, int] = (300, 300),
 ) -> np.ndarray:
-    """Mean potential (V) under each of L patches on the lower and upper face of a box for one ampere into each, spread
-    evenly over it (the gap model): (L, L), but for what cancels over currents of sum zero.
+    """Mean potential (V) under each of L patches on the lower and upper face of a box, for one ampere into each patch,
+    with a uniform current density (the gap model). The result (L, L) is exact up to terms that cancel for currents that
+    sum to zero.
 
-    `size` (a, b, c) of the box, which fills 0 ≤ x ≤ a, 0 ≤ y ≤ b, 0 ≤ z ≤ c; `positions` (L, 3) of the patches'
-    middles, with z = 0 or c; `patch`: their widths along x and y, all in metres; `conductivity` in S/m.
+    `size`: (a, b, c) of the box, which fills 0 ≤ x ≤ a, 0 ≤ y ≤ b, 0 ≤ z ≤ c; `positions`: (L, 3) centres of the
+    patches, with z = 0 or c; `patch`: widths of the patches along x and y; all in metres. `conductivity` in S/m.
 
-    Modes cos(pπx/a) cos(qπy/b), of wave number κ, have the potential coth(κc)/κ on the face that they are fed through
-    and 1/(κ sinh κc) on the other; p = q = 0 is a rod, with c/2 between its ends and an even sink.
+    The mode cos(pπx/a) cos(qπy/b), of wave number κ, has the potential coth(κc)/κ on the face through which it is fed
+    and 1/(κ sinh κc) on the opposite face. The mode p = q = 0 is that of a rod with a uniform sink, with a difference
+    of c/2 between its ends.
     """
     a, b, c = size
     wave = [np.arange(number) * np.pi / side for number, side in zip(num_modes, (a, b), strict=True)]
@@ -82,8 +83,8 @@ def face_patch_impedance(
 
 @dataclass(frozen=True)
 class ConductingCylinder:
-    """An upright cylinder from z = 0 up to its `height`: `radius` in metres, `conductivity` in S/m, and, if it is
-    hollow, an insulated `inner_radius`."""
+    """An upright cylinder from z = 0 to its `height`. `radius` and `height` in metres, `conductivity` in S/m; a hollow
+    cylinder has an insulated `inner_radius`."""
 
     radius: float
     height: float
@@ -91,7 +92,8 @@ class ConductingCylinder:
     inner_radius: float = 0.0
 
     def response(self, num_around: int, num_along: int) -> np.ndarray:
-        """F(R₂) / F'(R₂) of the modes n < `num_around` and m < `num_along`, metres: (n, m); 0 for the constant."""
+        """F(R₂) / F'(R₂), (n, m) in metres, of the modes n < `num_around` and m < `num_along`; 0 for the constant
+        mode."""
         order = np.arange(num_around)[:, None]
         ratio = self.inner_radius / self.radius
         found = np.zeros((num_around, num_along))
@@ -102,7 +104,7 @@ class ConductingCylinder:
         found[:, 1:] = 1 / (wave * outer.growth)
         if self.inner_radius > 0:
             inner = _Bessel(num_around, wave * self.inner_radius)
-            # Minus what K_n has of F at R₂, against what I_n has of it.
+            # Ratio of the K_n term of F to its I_n term at R₂.
             share = inner.growth / inner.decay * np.exp(inner.log_i - inner.log_k + outer.log_k - outer.log_i)
             found[:, 1:] *= (1 + share) / (1 - share * outer.decay / outer.growth)
         return found
@@ -115,10 +117,10 @@ def wall_patch_impedance(
     size: tuple[float, float],
     num_modes: tuple[int, int] = (300, 300),
 ) -> np.ndarray:
-    """Mean potential (V) under each of L patches for one ampere into each: (L, L), but for a constant.
+    """Mean potential (V) under each of L patches for one ampere into each patch; (L, L), up to a constant.
 
-    The patches' middles lie at `angles` (L,) in radians and `heights` (L,) in metres; all have the `size` (arc length,
-    height) in metres. `num_modes`: how many are summed, round the cylinder and along it.
+    The centres of the patches lie at `angles` (L,) in radians and `heights` (L,) in metres; all have the `size` (arc
+    length, height) in metres. `num_modes`: number of modes summed around and along the cylinder.
     """
     n, m = np.arange(num_modes[0]), np.arange(num_modes[1])
     wave = m * np.pi / cylinder.height
@@ -133,8 +135,8 @@ def wall_patch_impedance(
 
 
 class _Bessel:
-    """Modified Bessel functions of orders n < `count` at x (m,), as arrays (n, m): logarithms, growth I_n'/I_n and
-    decay −K_n'/K_n."""
+    """Modified Bessel functions of orders n < `count` at x (m,), as arrays (n, m): their logarithms, the growth
+    I_n'/I_n and the decay −K_n'/K_n."""
 
     def __init__(self, count: int, x: np.ndarray):
         order = np.arange(count)[:, None]
@@ -155,7 +157,7 @@ class _Bessel:
 
 @dataclass(frozen=True)
 class ConductingSphere:
-    """A ball round the origin: `radius` in metres, `conductivity` in S/m, and, if it is hollow, an insulated
+    """A ball around the origin. `radius` in metres, `conductivity` in S/m; a hollow ball has an insulated
     `inner_radius`."""
 
     radius: float
@@ -164,10 +166,10 @@ class ConductingSphere:
 
 
 def cap_impedance(sphere: ConductingSphere, directions: np.ndarray, radius: float, num_modes: int = 400) -> np.ndarray:
-    """Mean potential (V) under each of L caps for one ampere into each: (L, L), but for a constant.
+    """Mean potential (V) under each of L caps for one ampere into each cap; (L, L), up to a constant.
 
-    `directions` (L, 3): unit vectors to the caps' middles; `radius`: of all, metres, in a straight line from the middle
-    to the rim, as of `jeit.electrodes.FaceDiscs`. `num_modes`: how many are summed.
+    `directions`: (L, 3) unit vectors to the centres of the caps; `radius`: radius of all caps in metres, measured in a
+    straight line from centre to rim, as for `jeit.electrodes.FaceDiscs`. `num_modes`: number of modes summed.
     """
     n = np.arange(1, num_modes + 1)
     cosine = 1 - (radius / sphere.radius) ** 2 / 2  # a chord is 2 R sin(α/2)

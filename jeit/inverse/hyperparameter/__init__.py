@@ -1,4 +1,4 @@
-"""The hyperparameter λ: rules that choose it, the curves that they use, and their comparison on the same data."""
+"""Rules that choose the hyperparameter λ, the curves they are based on, and their comparison on the same data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Result of choosing a hyperparameter: the λ chosen, the rule, and the rule's curve."""
+"""Result of choosing a hyperparameter: λ, the rule, and the rule's curves."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from jeit_solvers.engines import as_array
 
 
 class Choice(eqx.Module):
-    """A hyperparameter λ and how it came about: chosen by a rule on a grid of candidates, or given.
+    """A hyperparameter λ that was chosen by a rule from a grid of candidates, or given.
 
-    **Fields**: `hyperparameter` λ; `candidates` (K,), the λ evaluated, ascending; `criterion` (K,), the rule's
-    criterion at every candidate (see the rules in `jeit.inverse.hyperparameter`); `residual` (K,), ‖w (v - Jx)‖ in
-    standard deviations, and `penalty` (K,), √(xᵀQx), of the image x at every candidate: the coordinates of the L-curve;
-    `rule`, its name, or "given"; `target`, the required value of the criterion, None where the rule takes its minimum
-    or maximum; `edge`, "smallest" or "largest" where λ is that candidate, so that the rule's own would lie beyond it,
-    else empty.
+    **Fields**: `hyperparameter`: λ; `candidates` (K,): values of λ evaluated, ascending; `criterion` (K,): criterion of
+    the rule at every candidate (see the rules in `jeit.inverse.hyperparameter`); `residual` (K,): ‖w (v - Jx)‖ of the
+    image x at every candidate, in standard deviations; `penalty` (K,): √(xᵀQx) of the image, which together with the
+    residual forms the L-curve; `rule`: name of the rule, or "given"; `target`: value of the criterion that the rule
+    looks for, None if it takes the minimum or maximum; `edge`: "smallest" or "largest" if λ is the first or last
+    candidate, so that the rule's optimum may lie beyond the grid, else empty.
 
-    A given number is its own only candidate, and its curves are empty, (0,); so are residual and penalty without data.
+    For a given number, the number is the only candidate and the curves are empty, (0,). Without data, residual and
+    penalty are empty.
     """
 
     hyperparameter: Float[Array, ""]
@@ -34,7 +35,7 @@ class Choice(eqx.Module):
 
     @classmethod
     def given(cls, hyperparameter) -> "Choice":
-        """Choice of a number that was given."""
+        """Create from a given number."""
         value = as_array(hyperparameter, float)
         nothing = as_array(np.zeros(0))
         return cls(value, as_array(np.reshape(value, 1)), nothing, nothing, nothing, "given")
@@ -43,9 +44,9 @@ class Choice(eqx.Module):
     def among(
         cls, rule: str, candidates, index: int, criterion, curves, *, target: float | None = None, between=None
     ) -> "Choice":
-        """Choice of candidate number `index`, or of `between`, a λ found between that candidate and the next.
+        """Create from a rule's result: candidate number `index`, or `between`, a λ between that candidate and the next.
 
-        `curves`: residual and penalty at every candidate, or empty ones.
+        `curves`: residual and penalty at every candidate, or empty arrays.
         """
         edge = {0: "smallest", len(candidates) - 1: "largest"}.get(int(index), "") if between is None else ""
         value = candidates[index] if between is None else between
@@ -54,7 +55,7 @@ class Choice(eqx.Module):
 
     @property
     def note(self) -> str:
-        """Reason to doubt the choice, in a sentence; empty when there is none."""
+        """Sentence that gives a reason to doubt the choice; empty if there is none."""
         if not self.edge:
             return ""
         return (
@@ -63,9 +64,9 @@ class Choice(eqx.Module):
         )
 
     def read(self, curve: ArrayLike, hyperparameter=None) -> float:
-        """Value of one of its curves (K,) at any λ, the one chosen unless given; interpolated between candidates.
+        """Interpolate one of the curves (K,) at `hyperparameter`, by default the chosen λ.
 
-        Raises `ValueError` for a curve that it does not have.
+        Raises `ValueError` if the curve is empty.
         """
         if np.size(curve) == 0:
             raise ValueError(f"curve: this choice ('{self.rule}') has none; let a rule choose, and give it data.")

@@ -1,4 +1,4 @@
-"""Choice of the hyperparameter for given data by one rule, or by all rules for comparison."""
+"""Choice of the hyperparameter for given data by one rule, or by several rules for comparison."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def choose_hyperparameter(
 ) -> Choice:
     """Choose the λ that `one_step` would use with the same arguments, without computing the image.
 
-    `rule`: a name in `jeit.inverse.RULES`, or a rule: one of `jeit.inverse.hyperparameter` with a setting of its own,
-    `functools.partial(noise_figure, target=0.5)`, or your own, a function of (spectrum, data, mesh) to a `Choice`. The
-    choice can be given to `one_step` as its hyperparameter. Raises `ValueError` for arguments that do not fit.
-    `conductivity`: the background, S/m (2-D: S).
+    `conductivity`: the background, S/m (2-D: S). `rule`: a name in `jeit.inverse.RULES`, or a function of (spectrum,
+    data, mesh) that returns a `Choice`, such as `functools.partial(noise_figure, target=0.5)` with a rule of
+    `jeit.inverse.hyperparameter.rules`. The choice can be given to `one_step` as its hyperparameter. Raises
+    `ValueError` for arguments that do not fit together.
     """
     if not (isinstance(rule, str) or callable(rule)):
         raise ValueError(f"rule: give one of {', '.join(RULES)}, not {rule!r}; a number needs no choosing.")
@@ -50,12 +50,11 @@ def compare_rules(
     rules: Mapping[str, Rule] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Choice]:
-    """Choose λ by every rule for the same data; return the choices by name. The problem is decomposed once for all
-    rules.
+    """Choose λ for the same data by several rules, and return the choices by name. The problem is decomposed once.
 
-    `rules`: those to compare, `jeit.inverse.RULES` unless given; `progress` is called with the name of each step and
-    rule as it begins; other arguments as in `one_step`.
-    `jeit.plot.plot_choice` draws the result. Raises `ValueError` for arguments that do not fit.
+    `rules`: rules to compare, default `jeit.inverse.RULES`; `progress`: called with the name of each step and rule as
+    it begins; other arguments as in `one_step`. `jeit.plot.plot_choice` plots the result. Raises `ValueError` for
+    arguments that do not fit together.
     """
     rules, report = RULES if rules is None else rules, progress or (lambda step: None)
     report("linearise")

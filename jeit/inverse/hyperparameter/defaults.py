@@ -1,10 +1,11 @@
-"""Default values of λ; GREIT and filtered back-projection have scales of their own."""
+"""Default values of λ. GREIT and filtered back-projection scale λ differently and have their own defaults."""
 
 from __future__ import annotations
 
 RULE = "noise-figure"
-"""The rule that chooses λ of linear images, and of nonlinear problems linearised at the background."""
+"""Default rule that chooses λ, for linear images and for nonlinear problems linearised at the background."""
 ITERATED = 5.0
-"""λ of Gauss-Newton images of a tank against its reference, with a smooth prior: log σ varies by a fifth."""
+"""Default λ of Gauss-Newton images of a tank relative to a reference frame, with a smooth prior; the prior standard
+deviation of log σ is then a fifth."""
 EDGE_PRICE = 300.0
-"""λ of total variation: what an edge as long as the body is wide costs, per unit of log σ."""
+"""Default λ of total variation: penalty of an edge as long as the body is wide, per unit of log σ."""

@@ -1,8 +1,8 @@
-"""Rules that choose the hyperparameter, and the point spread that one of them uses.
+"""Rules that choose the hyperparameter λ.
 
-A rule takes the `Spectrum` of the problem, the whitened data (None if there are none) and the mesh, and returns a
-`Choice`. All share the one eigendecomposition: with c = UᵀQᵀv the data components, f = λ²/(Λ + λ²) the filter, the
-residual is ‖r‖² = Σ f²c² and the penalty xᵀQx = Σ Λc²/(Λ + λ²)².
+A rule takes the `Spectrum` of the problem, the whitened data (or None) and the mesh, and returns a `Choice`. All rules
+use the eigendecomposition of the spectrum: with the data components c = UᵀQᵀv and the filter f = λ²/(Λ + λ²), the
+residual r has ‖r‖² = Σ f²c² and the image x has the penalty xᵀQx = Σ Λc²/(Λ + λ²)².
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ def best_resolution(
     signal_to_noise: float = 1.0,
     num_targets: int = 30,
 ) -> Choice:
-    """λ whose point spread functions have the least blur radius, averaged over targets spread through the body.
+    """Choose the λ with the smallest blur radius, averaged over point targets spread through the body.
 
-    Without noise the least λ would always be sharpest, so the images of the targets are noisy: each target is strong
-    enough to make the root mean square of its data `signal_to_noise` times the noise. No data are used, so that λ
-    depends on the system and not on the frame: what Graham and Adler, Physiol. Meas. 27 (2006) S65-S79, find by
-    calibration on a small target in a tank. Criterion: the mean of `blur_radius` over the targets, relative to the size
-    of the body. Raises `ValueError` without a mesh, and for settings that are not positive.
+    Without noise the smallest λ would always be sharpest, so the images of the targets are noisy; the root mean square
+    of a target's data is `signal_to_noise` times the noise. No measured data are used, so λ depends on the system and
+    not on the frame. Graham and Adler, Physiol. Meas. 27 (2006) S65-S79, calibrate λ in this way with a small target in
+    a tank. Criterion: mean `blur_radius` over `num_targets` targets, relative to the size of the body. Raises
+    `ValueError` without a mesh and for settings that are not positive.
     """
     if mesh is None:
         raise ValueError("The rule 'best-resolution' measures areas: give the mesh that the spectrum belongs to.")
@@ -65,11 +65,12 @@ def blur_radius(
 ) -> Float[np.ndarray, "K T"]:
     """Blur radius of the noisy image of every target cell for every candidate λ, relative to the size of the body.
 
-    √(A/A₀) (3-D: the cube root), A₀ the area (volume) of the body and A that of the half-amplitude set: the cells where
-    the image reaches half of what it has *at the target*. (Half of the image's own peak, as in Adler and Guardo, IEEE
-    Trans. Med. Imaging 15 (1996) 170-179, would call an image sharp that has a narrow peak elsewhere.) A is the
-    expected one over white noise of variance one in the data: with target image p = R_λJ_t of strength s, and noise of
-    variance (RRᵀ)_ii, cell i belongs to the set with probability Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
+    The blur radius is √(A/A₀) (3-D: the cube root), where A₀ is the area (volume) of the body and A that of the
+    half-amplitude set: the cells where the image is at least half its value *at the target*. (With half the image's
+    maximum, as in Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179, an image with a narrow peak elsewhere
+    would count as sharp.) A is the expected value for white noise of unit variance in the data: for a target of
+    strength s in cell t with image p = R_λJ_t and noise variance (RRᵀ)_ii, cell i belongs to the set with probability
+    Φ(s (p_i - p_t/2) / √(RRᵀ)_ii).
     """
     area = np.asarray(measures(mesh))
     eigenvalues, modes = np.asarray(spectrum.eigenvalues), np.asarray(spectrum.modes())
@@ -77,7 +78,7 @@ def blur_radius(
     size = np.linalg.norm(signals, axis=0)
     strength = signal_to_noise * np.sqrt(len(signals)) / np.maximum(size, np.finfo(float).tiny)
     components = adjoint(np.asarray(spectrum.basis)) @ signals
-    # Data in the range of the null space are imaged whatever λ is.
+    # Data in the range of the null space are imaged independently of λ.
     free = np.asarray(spectrum.null_space) @ np.linalg.pinv(np.asarray(spectrum.seen))
     fixed, fixed_variance = free @ signals, np.sum(abs(free) ** 2, axis=1)
     damping = 1 / (eigenvalues + np.asarray(candidates)[:, None] ** 2)
@@ -91,7 +92,7 @@ def blur_radius(
 
 
 def spread_cells(mesh: Mesh, number: int) -> Int[np.ndarray, " T"]:
-    """About `number` cells, spread evenly through the body: those nearest to the points of a regular lattice in it."""
+    """About `number` cells spread evenly through the body: the cells nearest to the points of a regular lattice."""
     centre, size = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
     low, high = np.asarray(mesh.points).min(axis=0), np.asarray(mesh.points).max(axis=0)
     spacing = (size.sum() / number) ** (1 / mesh.dimension)
@@ -99,19 +100,20 @@ def spread_cells(mesh: Mesh, number: int) -> Int[np.ndarray, " T"]:
     steps = [a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts, strict=True)]
     lattice = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
     distance, nearest = (np.asarray(found) for found in KDTree(centre).query(lattice))
-    # A surface in space passes between the points of a lattice.
+    # A surface in space passes between lattice points, so points up to half a spacing away count.
     inside = distance <= (spacing / 2 if mesh.is_surface else size[nearest] ** (1 / mesh.dimension))
     return np.unique(nearest[inside] if inside.any() else nearest)
 
 
 def greit_noise_figure(target: float, eigenvalues, signal, level: float, painted, measure) -> float:
-    """The least λ whose noise figure is `target`. Raises `ValueError` where none is.
+    """Smallest λ at which GREIT's noise figure is `target`. Raises `ValueError` if there is none.
 
-    The figure is that of GREIT's authors, the signal-to-noise ratio of the data over that of the image of one target
-    (Adler et al., Physiol. Meas. 30, S35, 2009); `noise_figure` of `rules.py` draws its signals from the prior.
+    The noise figure is the signal-to-noise ratio of the data divided by that of the image, for one target (Adler et
+    al., Physiol. Meas. 30, S35, 2009); in contrast, `noise_figure` draws signals from the prior.
 
-    With YYᵀ = VΛVᵀ the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy: `signal` is Vᵀy, `painted` XYᵀV, `level` the signal of
-    the data. White noise of unit variance in the data gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
+    With the eigendecomposition YYᵀ = VΛVᵀ, the image of data y is XYᵀV (Λ + λ²)⁻¹ Vᵀy. `signal`: Vᵀy; `painted`: XYᵀV;
+    `level`: signal-to-noise ratio of the data; `measure`: areas of the cells. White noise of unit variance in the data
+    gives a cell of the image the variance Σ (XYᵀV)² / (Λ + λ²)².
     """
     weight = measure / measure.sum()
     gain = weight @ painted**2
@@ -138,27 +140,28 @@ Rule = Callable[[Spectrum, Float[Array, " M"] | None, Mesh | None], Choice]
 
 
 def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None) -> Choice:
-    """λ that predicts each channel best from the others: least M‖r‖²/(tr(I - H))². Golub, Heath and Wahba 1979.
+    """Choose λ by generalised cross-validation: it minimises M‖r‖²/(tr(I - H))², an estimate of the error of predicting
+    each of M channels from the others; H maps data to predicted data. Golub, Heath and Wahba 1979.
 
-    Criterion: that score, the mean squared error of prediction in units of the noise's variance. Raises `ValueError`
-    without data.
+    Criterion: this score, in units of the noise variance. Raises `ValueError` without data.
     """
-    candidates, data = spectrum.candidates(), _needed(data, "gcv")
+    candidates, data = spectrum.candidates(), _check_data(data, "gcv")
     residual, penalty = spectrum.curves(data, candidates)
-    # Repeated readings leave no residual, but would be counted as if they did: their filter is 1.
+    # Repeated readings have filter 1 but leave no residual, so they are subtracted from both counts.
     number = len(data) - spectrum.repeated
     score = number * residual**2 / (_filters(spectrum, candidates).sum(axis=1) - spectrum.repeated) ** 2
     return Choice.among("gcv", candidates, int(np.argmin(score)), score, (residual, penalty))
 
 
 def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None, *, noise: float = 1.0) -> Choice:
-    """Largest λ whose residual is no more than the noise: ‖r‖² = r noise², r being the number of components.
+    """Choose λ by the discrepancy principle: the largest λ with ‖r‖² ≤ n noise², for the residual r with n independent
+    components.
 
-    Criterion: ‖r‖/√r, the residual in standard deviations. `noise`: the standard deviation that the whitened data
-    really have (each part of complex data), 1 where the channels' noise was given as it is. Morozov, Soviet Math. Dokl.
-    7 (1966) 414-417. Raises `ValueError` without data.
+    Criterion: ‖r‖/√n, the residual in standard deviations. `noise`: standard deviation of the whitened data (of each
+    part of complex data), 1 if the noise of the channels was specified correctly. Morozov, Soviet Math. Dokl. 7 (1966)
+    414-417. Raises `ValueError` without data.
     """
-    candidates, data = spectrum.candidates(), _needed(data, "discrepancy")
+    candidates, data = spectrum.candidates(), _check_data(data, "discrepancy")
     components = abs(adjoint(np.asarray(spectrum.basis)) @ data)
     freedom = spectrum.freedom * (2 if np.iscomplexobj(data) else 1)
     residual, penalty = spectrum.curves(data, candidates)
@@ -178,11 +181,12 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
 
 
 def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None) -> Choice:
-    """λ at the corner of greatest curvature of log ‖r‖ against log √(xᵀQx). Hansen, SIAM Review 34 (1992) 561-580.
+    """Choose λ at the corner of the L-curve, where the curve of log √(xᵀQx) against log ‖r‖ has its maximum curvature.
+    Hansen, SIAM Review 34 (1992) 561-580.
 
-    Criterion: that curvature, positive where the curve bends towards the origin. Raises `ValueError` without data.
+    Criterion: this curvature, positive at a corner that points to the origin. Raises `ValueError` without data.
     """
-    candidates, data = spectrum.candidates(), _needed(data, "l-curve")
+    candidates, data = spectrum.candidates(), _check_data(data, "l-curve")
     residual, penalty = spectrum.curves(data, candidates)
     bend = _curvature(spectrum, data, candidates)
     bend = np.where(np.isfinite(bend), bend, np.min(bend[np.isfinite(bend)], initial=0))
@@ -192,11 +196,12 @@ def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None
 def noise_figure(
     spectrum: Spectrum, data: ArrayLike | None = None, mesh: Mesh | None = None, *, target: float = 1.25
 ) -> Choice:
-    """λ at which the signal-to-noise ratio of the image is 1 / `target` times that of the data; uses no data.
+    """Choose the λ at which the noise figure, the signal-to-noise ratio of the data divided by that of the image, is
+    `target`. No measured data are used.
 
-    Signals are drawn from the prior and the noise is white: the ratio of the data is trΛ / r, that of the image
-    tr(RJΓJᵀRᵀ) / tr(RRᵀ). Adler and Guardo 1996, with the prior in place of their one central object.
-    Criterion: the noise figure.
+    Signals are drawn from the prior and the noise is white: the ratio of the data is trΛ / n for n components, that of
+    the image tr(RJΓJᵀRᵀ) / tr(RRᵀ), in squared amplitudes. This follows Adler and Guardo 1996, who use one object at
+    the centre in place of the prior. Criterion: the noise figure.
     """
     candidates = spectrum.candidates()
     eigenvalues = np.asarray(spectrum.eigenvalues)
@@ -225,10 +230,10 @@ RULES: dict[str, Rule] = {
 
 
 def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mesh: Mesh | None = None) -> Choice:
-    """Choice of λ from a number, the name of a rule, a rule, or an earlier choice.
+    """Choose λ from a number, the name of a rule, a rule, or an earlier choice.
 
-    `spectrum`: a `Spectrum`, which only rules use. Raises `ValueError` for the name of no rule, for a rule where the
-    problem is traced, and for a number that is not positive and finite.
+    `spectrum`: a `Spectrum`, used by rules only. Raises `ValueError` for an unknown name, for a rule if the problem is
+    traced, and for a number that is not positive and finite.
     """
     if isinstance(hyperparameter, Choice):
         return hyperparameter
@@ -247,7 +252,7 @@ def choose(spectrum: Any, hyperparameter: float | str | Rule | Choice, data, mes
 
 
 def _check_problem(problem, name: str) -> None:
-    """Raise `ValueError` for a traced problem, which has no values for a rule to use."""
+    """Raise `ValueError` for a traced problem, because a rule needs its values."""
     instead = "give a number, such as the one that jeit.inverse.choose_hyperparameter finds outside"
     check_has_values("hyperparameter: the problem", problem, f"the rule '{name}' looks at", instead)
 
@@ -258,12 +263,12 @@ def _filters(spectrum: Spectrum, candidates) -> Float[np.ndarray, "K r"]:
 
 
 def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
-    """Curvature of the L-curve in its parameter t = log λ, from df/dt = 2f(1 - f) for the filter f."""
+    """Curvature of the L-curve with parameter t = log λ, computed with df/dt = 2f(1 - f) for the filter f."""
     left, eigenvalues = _filters(spectrum, candidates), np.asarray(spectrum.eigenvalues)
     squared = abs(adjoint(np.asarray(spectrum.basis)) @ data) ** 2
     image = squared * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2  # its sum is the penalty
     rest = squared * left**2  # its sum is ‖r‖²
-    # d/dt of rest is 4 rest (1 - f), of image -4 image f.
+    # The derivatives with respect to t are 4 rest (1 - f) and -4 image f.
     first = _log_derivatives(rest, 4 * (1 - left), 8 * (1 - left) * (2 - 3 * left))
     second = _log_derivatives(image, -4 * left, -8 * left * (1 - 3 * left))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -271,13 +276,14 @@ def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
 
 
 def _log_derivatives(terms, once, twice):
-    """First and second derivative of ½ log Σ terms, whose own are terms · once and terms · twice."""
+    """First and second derivative of ½ log Σ terms, where the derivatives of the terms are terms · once and
+    terms · twice."""
     total = terms.sum(axis=1)
     slope = (terms * once).sum(axis=1) / total
     return slope / 2, ((terms * twice).sum(axis=1) / total - slope**2) / 2
 
 
-def _needed(data, rule: str) -> Float[np.ndarray, " M"]:
+def _check_data(data, rule: str) -> Float[np.ndarray, " M"]:
     if data is None:
         raise ValueError(f"The rule '{rule}' looks at the data: give difference, the change of voltages to be imaged.")
     instead = "give a number as hyperparameter, such as the one that the rule finds outside"

@@ -1,1 +1,1 @@
-"""Linear difference images: a reconstruction matrix, computed once, times a difference of frames."""
+"""Linear difference imaging: a reconstruction matrix that is computed once multiplies a difference of frames."""

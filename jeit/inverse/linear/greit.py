@@ -1,8 +1,7 @@
-"""GREIT: a reconstruction matrix trained on small targets, so that each is imaged as a smooth disc of one size.
+"""GREIT: a reconstruction matrix trained on small targets, so that each is imaged as a smooth disc of the same size.
 
 Adler et al., "GREIT: a unified approach to 2D linear EIT reconstruction of lung images", Physiol. Meas. 30 (2009)
-S35-S55. There the body is a disk; here the targets and their images follow the mesh, whatever its outline; in a solid
-body they are balls.
+S35-S55. The paper treats a disk; here bodies of any outline are allowed, and targets in a solid body are balls.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.linearisation import combined_blocks, data_directions, used_channels
 from jeit.mesh import Mesh, centroids, check_flat, measures
 
-# Desired images fall from their height to zero over this much of their radius to either side of it.
+# Half width of the edge of a desired image, relative to its radius.
 _EDGE = 0.25
-# Samples of a target along its radius: some fifty of a disc, some sixty of a ball.
+# Sampling points along the radius of a target, by dimension: about 50 points in a disc, about 60 in a ball.
 _SAMPLED = {2: 4.0, 3: 2.5}
-# Samples at a time; and distance from a centre within which they are searched, in radii: all that are in a ball, and
-# hardly more.
+# Number of sampling points processed at a time; search distance around the centre of a ball, in radii, slightly above 1
+# so that rounding excludes no point of the ball.
 _AT_ONCE, _CLOSE = 500_000, 1 + 1e-9
-# A training target counts if this share of it lies in the body.
+# Minimum fraction of a training target that must lie in the body.
 _INSIDE = 0.9
-# Cells of which a mean is taken, about.
+# Approximate number of cells over which means for the noise figure are taken.
 _ENOUGH = 10_000
-# Least size of targets: smaller ones give the same in a linear model, but need more points to be sampled.
+# Minimum target radius: smaller targets give the same result in a linear model but need more sampling points.
 _LEAST = 0.01
 
 
@@ -52,24 +51,26 @@ def greit(
     target_radius: float = 0.05,
     num_targets: int = 1000,
 ) -> LinearReconstruction:
-    """GREIT reconstruction matrix R = XYᵀ(YYᵀ + λ²W⁻¹)⁻¹ of a body of any shape, at a background conductivity.
+    """GREIT reconstruction matrix R = XYᵀ(YYᵀ + λ²W⁻¹)⁻¹ for a body of any shape, at a background conductivity.
 
-    Trained on about `num_targets` small discs (3-D: balls) spread evenly over the body, on a hexagonal grid (3-D:
-    cubic). Y holds their responses to a change of one siemens, taken **from the Jacobian**: exact for small changes;
-    the contrast of large ones is underestimated, as in any linear image. X holds the images desired: discs of one
-    radius with a smooth edge, cut off at the outline, each with as much change (its integral) as its target. Both are
-    divided by √(number of targets).
+    The training targets are about `num_targets` small discs (3-D: balls) on a hexagonal (3-D: cubic) grid over the
+    body. Y holds their responses to a unit change of conductivity (S/m; 2-D: S), computed **from the Jacobian**. They
+    are exact for small changes; as in any linear image, the contrast of large changes is underestimated. X holds the
+    desired images: discs of one radius with a smooth edge, cut off at the body's outline, each with the same integral
+    as its target. X and Y are divided by √(number of targets).
 
-    `radius` of the desired images and `target_radius` of the targets: fractions of the body's radius, that of the disc
-    with its area (3-D: of the ball with its volume). `radius` is 1/√L unless given, 0.25 for 16 electrodes; a smaller
-    radius gives better resolution, with more ringing and noise. `hyperparameter`: λ itself, or "noise-figure": the λ at
-    which the signal-to-noise ratio of the data is `noise_figure` times that of the image, for a target in the middle of
-    the body; 0.5 is what GREIT's authors agreed on. Signal is the mean absolute value, over channels in units of their
-    noise and over the body; noise is the root mean square standard deviation. `noise`: standard deviation of the
-    channels, W = noise⁻²; one number or (M,), in volts (or relative to each other). `mask`: True for the channels to
-    use.
+    - `radius`, `target_radius`: radii of the desired images and of the targets, as fractions of the body's radius,
+      which is that of the disc of equal area (3-D: ball of equal volume). Default `radius` 1/√L, 0.25 for 16
+      electrodes; a smaller radius improves resolution but increases ringing and noise.
+    - `hyperparameter`: λ, or "noise-figure" for the λ at which the signal-to-noise ratio of the data is `noise_figure`
+      times that of the image, for a target in the middle of the body. The default 0.5 is the value agreed on by GREIT's
+      authors. The signal is the mean absolute value, over channels in units of their noise or over the body; the noise
+      is the root mean square standard deviation.
+    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
+      other).
+    - `mask`: True for the channels to use.
 
-    Raises `ValueError` for arguments that do not fit, and for a noise figure that no λ reaches.
+    Raises `ValueError` for arguments that do not fit together, and for a noise figure that no λ reaches.
     """
     check_model(model)
     instead = (
@@ -89,7 +90,7 @@ def greit(
     body_radius, middle = _radius(float(measure.sum()), mesh.dimension), measure @ centre / measure.sum()
     position, covered = _targets(mesh, middle, target_radius * body_radius, num_targets)
     desired = _desired_images(mesh, position, covered.T @ measure, radius * body_radius)
-    # In the directions in which a body can change data, which are fewer than the channels.
+    # Responses are computed for the directions in which a body can change the data; they are fewer than the channels.
     directions = data_directions(model.protocol, channels, root_weight)
     weighted = directions.T * np.asarray(root_weight)  # (r, K)
     response, shares = np.zeros((len(weighted), len(position))), covered.tocsr()
@@ -113,17 +114,17 @@ def greit(
 
 
 def _radius(measure: float, dimension: int) -> float:
-    """Radius of the disc of an area, or the ball of a volume."""
+    """Radius of the disc of a given area or the ball of a given volume."""
     return float(np.sqrt(measure / np.pi) if dimension == 2 else np.cbrt(3 * measure / (4 * np.pi)))
 
 
 def _ball(radius: float, dimension: int) -> float:
-    """Area of a disc, volume of a ball."""
+    """Area of a disc or volume of a ball."""
     return np.pi * radius**2 if dimension == 2 else 4 / 3 * np.pi * radius**3
 
 
 def _targets(mesh: Mesh, middle, radius: float, number: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
-    """Centres (K, 2) of the targets that lie in the body, and the share of every cell that each covers (m, K)."""
+    """Centres (K, d) of the targets that lie in the body, and the fraction (m, K) of every cell that each covers."""
     measure, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
     low, high = points.min(axis=0), points.max(axis=0)
     if mesh.dimension == 2:
@@ -136,7 +137,7 @@ def _targets(mesh: Mesh, middle, radius: float, number: int) -> tuple[np.ndarray
     for samples, cell, share in _samples(mesh, radius / _SAMPLED[mesh.dimension]):
         if mesh.dimension == 3:
             place = (samples - middle) / spacing
-            place -= np.rint(place)  # from the next centre, in which balls reach some eighth of all samples
+            place -= np.rint(place)  # offset from the nearest centre; only part of the points lie within a ball
             near = np.flatnonzero(np.einsum("qi,qi->q", place, place) < (_CLOSE * radius / spacing) ** 2)
             samples, cell, share = samples[near], cell[near], share[near]
         pairs = tree.sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
@@ -153,7 +154,7 @@ def _targets(mesh: Mesh, middle, radius: float, number: int) -> tuple[np.ndarray
 
 
 def _hexagonal(low, high, middle, spacing: float) -> np.ndarray:
-    """Points (k, 2) of a hexagonal grid about `middle` that covers the box from `low` to `high`."""
+    """Points (k, 2) of a hexagonal grid with a point at `middle` that covers the box from `low` to `high`."""
     step = spacing * np.array([1, np.sqrt(0.75)])
     (first, bottom), (last, top) = np.floor((low - middle) / step) - 1, np.ceil((high - middle) / step) + 1
     row, column = np.meshgrid(np.arange(bottom, top + 1), np.arange(first, last + 1), indexing="ij")
@@ -161,18 +162,19 @@ def _hexagonal(low, high, middle, spacing: float) -> np.ndarray:
 
 
 def _cubic(low, high, middle, spacing: float) -> np.ndarray:
-    """Points (k, 3) of a cubic grid about `middle` that covers the box from `low` to `high`."""
+    """Points (k, 3) of a cubic grid with a point at `middle` that covers the box from `low` to `high`."""
     first, last = np.floor((low - middle) / spacing) - 1, np.ceil((high - middle) / spacing) + 1
     steps = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
     return middle + spacing * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _samples(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Points (q, 2) spread evenly over every cell, about `spacing` apart, with their cells and their shares of these,
-    some cells after others.
+    """Iterate over groups of cells, and yield sampling points (q, d) spread evenly over each cell, their cells, and the
+    fraction of the cell that each point represents.
 
-    The centres of the upright triangles that n cuts along each side leave: barycentric (i + 1/3, j + 1/3, k + 1/3) / n
-    with i + j + k = n - 1; of tetrahedra likewise.
+    Points are about `spacing` apart. Each side of a triangle is divided into n parts, and the points are the centres
+    of the upright small triangles, with barycentric coordinates (i + 1/3, j + 1/3, k + 1/3) / n, i + j + k = n - 1.
+    Tetrahedra are treated likewise.
     """
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
     count = corners.shape[1]
@@ -191,7 +193,8 @@ def _samples(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.ndarra
 
 
 def _desired_images(mesh: Mesh, position, area, radius: float) -> scipy.sparse.csc_array:
-    """X (m, K): a disc about each position whose integral over the body is `area` (K,); half as high at `radius`."""
+    """Desired images X (m, K): a disc around each position, with half its height at `radius` and the integral `area`
+    (K,) over the body."""
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     pairs = KDTree(centre).sparse_distance_matrix(KDTree(position), (1 + _EDGE) * radius, output_type="ndarray")
     ramp = np.clip((pairs["v"] / radius - 1) / _EDGE, -1, 1)

@@ -1,4 +1,4 @@
-"""Linear images: one Newton step with a prior, and back-projection."""
+"""Linear image reconstruction: one Gauss-Newton step with a prior, and back-projection."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from jeit.inverse.spectrum import Spectrum
 from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array, has_values, is_forked, on_device, on_host
 
-# Approximate number of cells used to find which channels are tied.
+# Approximate number of cells used to find which channels have proportional columns.
 _ENOUGH = 4000
 
 
@@ -37,15 +37,15 @@ _ENOUGH = 4000
 class LinearReconstruction:
     """A linear image reconstruction: change of conductivity = matrix · change of voltages.
 
-    Two channels that reciprocity ties together (v_b = r v_a) have proportional columns in the matrix, so they are
-    added first and multiplied once: half the arithmetic, the same image. Where what is left is of fewer dimensions
-    than channels, these are mixed first.
+    Two reciprocal channels (v_b = r v_a) have proportional columns in the matrix, so they are added before the product,
+    which halves the arithmetic. If the matrix has a lower rank r than there are combined channels, these are first
+    reduced to r combinations.
 
-    **Fields**: `mesh`; `first`, `second` (K,) the channels added to make each combined channel, and `ratio` (K,) the
-    weight of the second; `weights` (K, m), siemens per metre (2-D: siemens) per volt of combined channel, or, with a
-    `mixing` (K, r), (r, m) of its combinations; `hyperparameter` λ, and `rule`, how it was chosen; `method`, the name
-    of the reconstruction; `choice`, the curves used in choosing λ and whether to trust it (`choice.note`), where λ came
-    from `jeit.inverse.RULES` or a number.
+    **Fields**: `mesh`; `first`, `second` (K,): channels added to form each combined channel; `ratio` (K,): weight of
+    the second; `weights` (K, m): S/m (2-D: S) per volt of combined channel, or (r, m) if there is a `mixing`; `mixing`
+    (K, r): matrix that reduces the combined channels, or None; `hyperparameter`: λ; `rule`: how λ was chosen;
+    `method`: name of the reconstruction; `choice`: curves used in choosing λ and a note on their reliability
+    (`choice.note`), or None if the method chooses λ differently; `num_measurements`: number of channels M.
     """
 
     mesh: Mesh
@@ -70,10 +70,10 @@ class LinearReconstruction:
         method: str,
         choice: Choice | None = None,
     ):
-        """Create from images and their weights, whose product is the reconstruction matrix; the product is not formed
-        where it is larger than they are."""
+        """Create from images (m, r) and weights (r, M), whose product is the reconstruction matrix. The product is
+        formed only if it is smaller than the factors."""
         images, weights = factors
-        some = images[:: max(1, len(images) // _ENOUGH)]  # what ties channels ties them in every cell
+        some = images[:: max(1, len(images) // _ENOUGH)]  # channels are proportional in every cell or in none
         first, second, ratio = _combine(model, some @ weights)
         tied = (weights.T[first] + ratio[:, None] * weights.T[second]) / (1 + ratio**2)[:, None]
         rows, mixing = (images.T, tied) if len(first) > images.shape[1] else (tied @ images.T, None)
@@ -87,13 +87,13 @@ class LinearReconstruction:
     def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str, choice: Choice | None = None):
         """Create from a full reconstruction matrix (m, M)."""
         if not has_values(model.protocol, matrix, hyperparameter):
-            # It is not known which columns are proportional: every channel stays on its own.
+            # It is unknown which columns of a traced matrix are proportional, so no channels are combined.
             every, nothing = jnp.arange(matrix.shape[1]), jnp.zeros(matrix.shape[1])
             given = every, every, nothing, jnp.asarray(matrix).T, jnp.asarray(hyperparameter, float)
             return cls(model.mesh, *given, matrix.shape[1], rule, method, choice)
         matrix = np.asarray(matrix)
         first, second, ratio = _combine(model, matrix)
-        # The mean of two tied columns is used, not either: their rounding errors are large where λ is small, and
+        # The weighted mean of two proportional columns is used: for small λ their rounding errors are large and
         # opposite.
         tied = matrix.T[first] + ratio[:, None] * matrix.T[second]
         weights = tied / (1 + ratio**2)[:, None]
@@ -112,16 +112,16 @@ class LinearReconstruction:
 
     @property
     def matrix(self) -> Inexact[Array, "m M"]:
-        """The full reconstruction matrix (m, M), zero in the columns of masked channels."""
+        """Full reconstruction matrix (m, M), zero in the columns of masked channels."""
         weights = self.weights if self.mixing is None else self.mixing @ self.weights
         full = jnp.zeros((self.num_measurements, weights.shape[1]), weights.dtype)
         full = full.at[self.second].add(self.ratio[:, None] * weights)
         return full.at[self.first].add(weights).T
 
     def image(self, difference: Inexact[Array | np.ndarray, "*frames M"]) -> Inexact[Array, "*frames m"]:
-        """Change of conductivity in every cell, for one difference of frames (M,) in volts or many (F, M).
+        """Change of conductivity in every cell, for one difference of frames (M,) or several (F, M), in volts.
 
-        Raises `ValueError` for another number of channels.
+        Raises `ValueError` for another number of channels, and for NaN or infinite voltages.
         """
         shape = np.shape(difference)
         if len(shape) not in (1, 2) or shape[-1] != self.num_measurements:
@@ -137,12 +137,11 @@ class LinearReconstruction:
         if not np.isfinite(voltages).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
         image = _product(self._parts, voltages)
-        return on_device(image) if is_forked() else _handed_over(image)
+        return on_device(image) if is_forked() else _to_jax(image)
 
     @functools.cached_property
     def _parts(self) -> tuple[Any, ...]:
-        """The arrays that an image needs, converted once to NumPy: converting them for every frame costs as much as a
-        product."""
+        """Arrays used by `image`, converted to NumPy once, because a conversion takes as long as the product."""
         parts = (self.first, self.second, self.ratio, self.mixing, self.weights)
         return on_host(parts) if has_values(parts) else parts
 
@@ -154,14 +153,15 @@ def _product(parts, difference) -> Any:
 
 
 @jax.jit
-def _handed_over(image) -> Any:
-    """Convert a NumPy array to a JAX array in a quarter of the time of `jax.device_put`, which would be half of an
-    image's; not in forked processes, where nothing compiled runs."""
+def _to_jax(image) -> Any:
+    """Convert a NumPy array to a JAX array in a quarter of the time of `jax.device_put`, which would take half of the
+    time of an image. It cannot be used in forked processes, where compiled functions do not run."""
     return image
 
 
 def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Channels to add before the product: pairs tied by reciprocity whose columns are proportional, others alone."""
+    """Channels `first` and `second` to add before the product, and the `ratio` of their columns: reciprocal pairs with
+    proportional columns, and all other channels alone, with ratio 0."""
     size = np.linalg.norm(matrix, axis=0)
     alone = size > 0
     pairs, _ = model.protocol.reciprocal_pairs()
@@ -192,18 +192,21 @@ def one_step(
 ) -> LinearReconstruction:
     """Reconstruction matrix of the linearised problem, R = (JᵀWJ + λ²Q)⁻¹JᵀW, at a background conductivity.
 
-    `prior`: `Noser()` unless given. `hyperparameter`: λ itself, or the rule that chooses it, one of
-    `jeit.inverse.RULES`, or a `Choice`; rules that look at data need `difference`, the change of voltages (M,) to be
-    imaged.
-    `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
-    other). `mask`: True for the channels to use. Raises `ValueError` for arguments that do not fit.
+    - `prior`: default `Noser()`.
+    - `hyperparameter`: λ, a rule in `jeit.inverse.RULES` that chooses it, or a `Choice`.
+    - `difference`: change of voltages (M,) to be imaged, required by rules that use data.
+    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
+      other).
+    - `mask`: True for the channels to use.
 
-    A complex `conductivity` is an admittivity σ + iωε, S/m (2-D: S); its image is complex, and so are the voltages that
-    it takes. Both parts have the same prior, and `noise` is that of each part. Complex voltages about a real background
-    are imaged part by part.
+    Raises `ValueError` for arguments that do not fit together.
 
-    Differentiable, with a number for λ, in all that has a gradient: `jax.grad`, `jax.vmap` and `jax.jit` go through it
-    and through the image. Choices that depend on values, a rule for λ or a mask, have to be made outside.
+    A complex `conductivity` is an admittivity σ + iωε, S/m (2-D: S); voltages and image are then complex. Both parts
+    have the same prior, and `noise` is the standard deviation of each part. With a real background, real and imaginary
+    part of complex voltages are imaged separately.
+
+    If λ is a number, the function and the image are differentiable and work inside `jax.grad`, `jax.vmap` and
+    `jax.jit`. A rule for λ or a mask depends on values and must be evaluated outside.
 
     Computed in data space: R = ΓJᵀ(JΓJᵀ + λ²W⁻¹)⁻¹ with Γ = Q⁻¹; see `jeit.inverse.prior.priors` for a Q with a null
     space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.
@@ -220,7 +223,7 @@ def one_step(
     found = choice.hyperparameter, choice.rule, method, choice
     if isinstance(linear.spectrum, Spectrum) and has_values(choice.hyperparameter):
         factors = linear.factors(choice.hyperparameter)
-        del linear  # of a large body there is no room for both
+        del linear  # frees memory, which would not hold both for a large body
         return LinearReconstruction.of_factors(model, factors, *found)
     return LinearReconstruction.create(model, linear.matrix(choice.hyperparameter), *found)
 
@@ -235,15 +238,14 @@ def back_projection(
 ) -> LinearReconstruction:
     """Back-projection of voltage differences along the bands between equipotential lines of every drive.
 
-    Every channel's relative change is spread over the cells whose potential, under that channel's drive, lies
-    between the potentials of its measuring electrodes, and a cell takes the mean over the channels that reach it
-    (Barber and Brown, J. Phys. E 17 (1984) 723-733). The result is scaled so that a uniform change of conductivity
-    is imaged as itself.
+    The relative change of a channel is assigned to the cells whose potential, under the channel's drive, lies between
+    the potentials of its two measuring electrodes. The image of a cell is the mean over the channels that reach it
+    (Barber and Brown, J. Phys. E 17 (1984) 723-733), scaled so that a uniform change of conductivity is imaged exactly.
 
-    `filtered`: back-project filtered data F v instead, where F minimises ‖JBFv - v‖² + λ²‖JB‖²‖Fv‖², so that the image,
-    seen through the Jacobian J, gives back the data: sharper, and noisier; `hyperparameter` is λ. `mask`: True for the
-    channels to use. Raises `ValueError` for protocols whose channels have more than two electrodes, where no band is
-    defined. `conductivity`: the background, S/m (2-D: S).
+    `conductivity`: the background, S/m (2-D: S). `filtered`: back-project filtered data F v with the matrix B above,
+    where F minimises ‖JBFv - v‖² + λ²‖JB‖²‖Fv‖², so that the Jacobian J maps the image to nearly the data; the image is
+    sharper but noisier. `hyperparameter`: λ. `mask`: True for the channels to use. Raises `ValueError` for protocols
+    whose measurements use more than two electrodes, where no band is defined.
     """
     check_model(model)
     instead = (
@@ -271,7 +273,7 @@ def back_projection(
     band = (potential[drive] >= ends.min(axis=0)[:, None]) & (potential[drive] < ends.max(axis=0)[:, None])
     band = (band & used[:, None]).T.astype(float)  # (m, M)
     reached = np.maximum(band.sum(axis=1), 1)
-    # A uniform relative change δ of conductivity changes every voltage by -δ: that is the scale.
+    # Scale: a uniform relative change δ of conductivity changes every voltage by the relative amount -δ.
     scale = np.broadcast_to(np.asarray(conductivity, float), (model.mesh.num_cells,))
     smear = -(scale / reached)[:, None] * band / np.where(used & (voltages != 0), voltages, np.inf)
     if not filtered:

@@ -1,10 +1,8 @@
-"""Parametrisations of the nonlinear problem: conductivity, and unknowns that are estimated along with it.
+"""Parametrisations of the nonlinear problem: the scale of the conductivity, and unknowns estimated along with it.
 
-Unknowns: further parameters that are not known exactly and can be estimated along with the conductivity.
-
-Each has a prior of zero mean and the given standard deviation, and changes the forward model or the image; its effect
-on the voltages is found by automatic differentiation. A positive quantity is estimated by its logarithm and reported as
-itself.
+Unknowns are further parameters that are not known exactly. Each has a normal prior of mean zero and a given standard
+deviation, and changes the forward model or the image. Its effect on the voltages is computed by automatic
+differentiation. Positive quantities are estimated through their logarithm.
 """
 
 import abc
@@ -27,7 +25,7 @@ from jeit_solvers.engines import has_values, namespace
 
 
 class AbstractUnknown(eqx.Module):
-    """Base of all unknowns: `size` values with prior standard deviation `deviation`."""
+    """Base of all unknowns, which consist of `size` values with prior standard deviation `deviation`."""
 
     deviation: eqx.AbstractVar[Float[Array, " k"]]
 
@@ -37,37 +35,39 @@ class AbstractUnknown(eqx.Module):
         return self.deviation.shape[0]
 
     def fits(self, model: ForwardModel) -> bool:
-        """Whether it was made for a model like this one."""
+        """Whether the unknown can be used with this model."""
         return True
 
     @abc.abstractmethod
     def apply(
         self, model: ForwardModel, estimate: Float[Array, " m"], values: Float[Array, " k"]
     ) -> tuple[ForwardModel, Float[Array, " m"]]:
-        """The model and the image (on the link's scale) with these values in place of zeros."""
+        """Model and image `estimate` (on the link's scale) changed by the values of the unknown, which are zero in the
+        model and image given."""
 
     def quantity(self, model: ForwardModel, values: Float[Array, " k"]) -> Float[Array, " k"]:
-        """The estimated quantity of each value, in its unit; the values themselves by default."""
+        """Estimated quantities in their unit, computed from the values; by default the values themselves."""
         return values
 
 
 class ContactImpedance(AbstractUnknown):
-    """Every electrode's contact impedance, by the logarithm of it over the model's."""
+    """Contact impedance of every electrode; the values are logarithms of its ratio to the model's."""
 
     deviation: Float[Array, " L"]
 
     def __init__(self, model: ForwardModel, deviation: float = 0.5):
-        """`deviation`: of the logarithm. Raises `ValueError` for point electrodes, which have no contact."""
+        """`deviation`: standard deviation of the logarithm. Raises `ValueError` for point electrodes, which have no
+        contact impedance."""
         if model.electrodes.is_point:
             raise ValueError("ContactImpedance: point electrodes have no contact impedance to estimate.")
         self.deviation = _deviation("ContactImpedance", deviation, model.electrodes.num_electrodes)
 
     def fits(self, model):
-        """Whether the model has as many electrodes, with contact."""
+        """Whether the model has the same number of electrodes, with contact impedance."""
         return not model.electrodes.is_point and self.size == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
-        """z exp(values)."""
+        """Model with contact impedances z exp(values), and the unchanged image."""
         impedance = self.quantity(model, values)
         return model.with_electrodes(model.electrodes.with_contact_impedance(impedance)), estimate
 
@@ -77,16 +77,17 @@ class ContactImpedance(AbstractUnknown):
 
 
 class ElectrodePosition(AbstractUnknown):
-    """Displacement of electrodes from their places in the model, metres: along the boundary, or anywhere in a sheet.
+    """Displacement of electrodes from their positions in the model, in metres.
 
-    One value for each electrode on the boundary, counter-clockwise; for discs in a sheet two, x of all and then y.
+    Electrodes on the boundary have one value each, along the boundary and positive counter-clockwise; discs in a sheet
+    have two, first x of all discs and then y.
     """
 
     deviation: Float[Array, " k"]
     direction: Float[Array, "L a 2"]
 
     def __init__(self, model: ForwardModel, deviation: float):
-        """`deviation`: metres. Raises `ValueError` for electrodes of other kinds."""
+        """`deviation`: standard deviation in metres. Raises `ValueError` for electrodes that cannot be moved."""
         electrodes = model.electrodes
         if not isinstance(electrodes, AbstractMovableElectrodes):
             raise ValueError(
@@ -97,12 +98,12 @@ class ElectrodePosition(AbstractUnknown):
         self.deviation = _deviation("ElectrodePosition", deviation, direction.shape[0] * direction.shape[1])
 
     def fits(self, model):
-        """Whether the model has as many electrodes, of a kind that can move."""
+        """Whether the model has the same number of electrodes, of a kind that can be moved."""
         movable = isinstance(model.electrodes, AbstractMovableElectrodes)
         return movable and self.direction.shape[0] == model.electrodes.num_electrodes
 
     def apply(self, model, estimate, values):
-        """Move the positions."""
+        """Model with displaced electrodes, and the unchanged image."""
         shift = jnp.einsum("al,lad->ld", values.reshape(self.direction.shape[1], -1), self.direction)
         electrodes: Any = model.electrodes
         moved = eqx.tree_at(lambda e: e.position, electrodes, electrodes.position + shift)
@@ -110,9 +111,9 @@ class ElectrodePosition(AbstractUnknown):
 
 
 class Background(AbstractUnknown):
-    """One value added to the image everywhere, on the link's scale (Log: the logarithm of a factor).
+    """Constant added to the image, on the link's scale (`Log`: the logarithm of a factor).
 
-    Raises `ValueError` for a deviation that is not positive.
+    Raises `ValueError` if the standard deviation is not positive.
     """
 
     deviation: Float[Array, " 1"]
@@ -121,14 +122,14 @@ class Background(AbstractUnknown):
         self.deviation = _deviation("Background", deviation, 1)
 
     def apply(self, model, estimate, values):
-        """Add a constant to the image."""
+        """Unchanged model, and the image plus the constant."""
         return model, estimate + values[0]
 
 
 class Scale(AbstractUnknown):
-    """A factor on all voltages, by its logarithm: a current or a gain that is not known.
+    """Factor on all voltages, such as an unknown current or gain; the value is its logarithm.
 
-    Raises `ValueError` for a deviation that is not positive.
+    Raises `ValueError` if the standard deviation is not positive.
     """
 
     deviation: Float[Array, " 1"]
@@ -137,12 +138,12 @@ class Scale(AbstractUnknown):
         self.deviation = _deviation("Scale", deviation, 1)
 
     def apply(self, model, estimate, values):
-        """Multiply the currents by exp(value)."""
+        """Model with all currents multiplied by exp(value), and the unchanged image."""
         drive = model.protocol.drive * self.quantity(model, values)[0]
         return eqx.tree_at(lambda m: m.protocol.drive, model, drive), estimate
 
     def quantity(self, model, values):
-        """The factor, exp(value)."""
+        """Factor exp(value)."""
         return jnp.exp(values)
 
 
@@ -153,80 +154,80 @@ def _deviation(name: str, deviation, size: int) -> Float[Array, " k"]:
     return jnp.broadcast_to(jnp.asarray(values), (size,))
 
 
-# Share of the background that is the least conductivity where nothing else keeps it from zero.
+# Minimum conductivity relative to the mean background, where no bound keeps it from zero.
 _LEAST = 1e-6
 
 
 class AbstractLink(eqx.Module):
-    """Base of all links between the estimated quantity x and conductivity σ, increasing and smooth."""
+    """Base of all links σ(x) between the estimated quantity x and conductivity σ, which are increasing and smooth."""
 
     @abc.abstractmethod
     def conductivity(self, estimate: Float[Array, " m"]) -> Float[Array, " m"]:
-        """σ(x), S/m (2-D: S)."""
+        """Conductivity σ(x), S/m (2-D: S)."""
 
     @abc.abstractmethod
     def slope(self, estimate: Float[Array, " m"]) -> Float[Array, " m"]:
-        """dσ/dx at x."""
+        """Derivative dσ/dx at x."""
 
     @abc.abstractmethod
     def estimate(self, conductivity: Float[Array, " m"]) -> Float[Array, " m"]:
-        """x(σ), the inverse of `conductivity`. Raises `ValueError` for conductivities that no x gives.
-
-        σ in S/m (2-D: S).
-        """
+        """Inverse x(σ) of `conductivity`, σ in S/m (2-D: S). Raises `ValueError` for conductivities outside the link's
+        range."""
 
     def ends(self, lower: float, upper: float, reference: Float[Array, " m"]) -> tuple[float, float]:
-        """The values of x for two bounds on σ, in an image about `reference`. Raises `ValueError` for a link that takes
-        none."""
+        """Values of x for two bounds on σ, in an image with reference `reference`. Raises `ValueError` if the link does
+        not allow bounds."""
         raise ValueError(f"bounds: link {type(self).__name__} takes none; take Log() or Linear().")
 
 
 class Linear(AbstractLink):
-    """σ = x. Nothing keeps conductivity positive; a step that leads below zero is refused and shortened."""
+    """Linear link σ = x. It does not keep the conductivity positive; a step that leads below zero is shortened."""
 
     def conductivity(self, estimate):
-        """x."""
+        """Conductivity x."""
         return estimate
 
     def slope(self, estimate):
-        """1."""
+        """Ones."""
         return namespace(estimate).ones_like(estimate)
 
     def estimate(self, conductivity):
-        """σ. In S/m (2-D: S)."""
+        """Estimate x = σ, in S/m (2-D: S)."""
         return conductivity
 
     def ends(self, lower, upper, reference):
-        """The bounds themselves, and no less than a millionth of the background."""
+        """The bounds themselves, the lower at least a millionth of the mean background."""
         return namespace(lower, reference).maximum(lower, _LEAST * reference.mean()), upper
 
 
 class Log(AbstractLink):
-    """σ = exp(x): always positive, and a ratio of conductivities counts alike on either side of one."""
+    """Logarithmic link σ = exp(x): conductivity is positive, and the prior treats a ratio of conductivities and its
+    inverse alike."""
 
     def conductivity(self, estimate):
-        """exp(x)."""
+        """Conductivity exp(x)."""
         return namespace(estimate).exp(estimate)
 
     def slope(self, estimate):
-        """exp(x)."""
+        """Derivative exp(x)."""
         return namespace(estimate).exp(estimate)
 
     def estimate(self, conductivity):
-        """log(σ). σ in S/m (2-D: S). Raises `ValueError` unless it is positive."""
+        """Estimate log(σ), σ in S/m (2-D: S). Raises `ValueError` unless σ is positive."""
         _check_inside(conductivity, 0, np.inf)
         return namespace(conductivity).log(conductivity)
 
     def ends(self, lower, upper, reference):
-        """Their logarithms: zero is no bound at all."""
+        """Logarithms of the bounds; a lower bound of zero gives -∞, which is no bound."""
         with np.errstate(divide="ignore"):
             return namespace(lower).log(lower), namespace(upper).log(upper)
 
 
 class Bounded(AbstractLink):
-    """σ = lower + (upper - lower) / (1 + exp(-x)): strictly between `lower` and `upper`, S/m (2-D: S).
+    """Logistic link σ = lower + (upper - lower) / (1 + exp(-x)), which keeps σ strictly between `lower` and `upper`,
+    S/m (2-D: S).
 
-    Raises `ValueError` unless 0 ≤ lower < upper, finite.
+    Raises `ValueError` unless 0 ≤ lower < upper, both finite.
     """
 
     lower: float
@@ -237,23 +238,23 @@ class Bounded(AbstractLink):
             raise ValueError(f"Bounded: give 0 ≤ lower < upper, finite; they are {self.lower} and {self.upper}.")
 
     def conductivity(self, estimate):
-        """The logistic function between the bounds."""
+        """Logistic function of x between the bounds."""
         return self.lower + (self.upper - self.lower) * _logistic(estimate)
 
     def slope(self, estimate):
-        """Derivative of the logistic function, largest half way between the bounds."""
+        """Derivative of the logistic function, largest halfway between the bounds."""
         share = _logistic(estimate)
         return (self.upper - self.lower) * share * (1 - share)
 
     def estimate(self, conductivity):
-        """The logit of σ's place between the bounds. Raises `ValueError` outside them."""
+        """Logit of (σ - lower) / (upper - lower). Raises `ValueError` for σ outside the bounds."""
         _check_inside(conductivity, self.lower, self.upper)
         share = (conductivity - self.lower) / (self.upper - self.lower)
         xp = namespace(share)
         return xp.log(share) - xp.log1p(-share)
 
     def ends(self, lower, upper, reference):
-        """Not available: the link has bounds of its own. Raises `ValueError`."""
+        """Not available, because the link has bounds of its own. Raises `ValueError`."""
         raise ValueError("bounds: the link is bounded already; give bounds or link=Bounded(lower, upper), not both.")
 
 
@@ -281,7 +282,7 @@ def _tuple(unknowns) -> tuple[AbstractUnknown, ...]:
 
 
 def as_parametrisation(given: "Parametrisation | None") -> "Parametrisation":
-    """The parametrisation given, or the default one. Raises `ValueError` for something else."""
+    """The given parametrisation, or the default for None. Raises `ValueError` for any other object."""
     if given is None:
         return Parametrisation()
     check_kind("parametrisation", given, Parametrisation, "a Parametrisation, such as Parametrisation(link=Log())")
@@ -289,19 +290,19 @@ def as_parametrisation(given: "Parametrisation | None") -> "Parametrisation":
 
 
 class Parametrisation(eqx.Module):
-    """Parametrisation of an image: the quantity that is estimated.
+    """Parametrisation of an image: the quantities that are estimated.
 
-    - `link`: the scale on which the prior acts, `Log()` unless given.
-    - `bounds`: least and greatest conductivity, S/m (2-D: S), held exactly; for solvers that keep bounds, with priors
-      that have a precision matrix, or total variation.
-    - `regions` (m,): integers, cells that share one value; -1 for cells held at the background. See
-      `jeit.inverse.prior.bases.pixels`.
-    - `unknowns`: what else to estimate, see `jeit.inverse.nonlinear.parametrisation`.
-    - `informative`: images consist of those combinations of the prior's shapes whose signal at the background exceeds
-      this, in standard deviations of the noise for one of the prior; 0 takes all shapes. None leaves the choice to the
-      caller: `reconstruct` takes all, an `Imager` those above 0.03.
+    - `link`: scale on which the prior acts, `Log()` by default.
+    - `bounds`: minimum and maximum conductivity, S/m (2-D: S), satisfied exactly. They require a solver that keeps
+      bounds and a prior that has a precision matrix, or total variation.
+    - `regions` (m,): integer label of each cell; cells of the same label share one value, and cells labelled -1 are
+      held at the background. See `jeit.inverse.prior.bases.pixels`.
+    - `unknowns`: further parameters to estimate, see `jeit.inverse.nonlinear.parametrisation`.
+    - `informative`: minimum signal, in standard deviations of the noise, of a combination of the prior's shapes with
+      prior amplitude of one standard deviation, linearised at the background. Images consist of the combinations above
+      it; 0 takes all shapes. None is 0 in `reconstruct` and 0.03 in an `Imager`.
 
-    Raises `ValueError` for what does not fit.
+    Raises `ValueError` for invalid values.
     """
 
     link: AbstractLink = eqx.field(default_factory=Log)
@@ -323,20 +324,20 @@ class Parametrisation(eqx.Module):
             raise ValueError(f"informative must lie between 0 and 1; it is {self.informative}.")
 
     def check_model(self, model: ForwardModel) -> None:
-        """Raises `ValueError` for unknowns that were made for another model."""
+        """Raises `ValueError` if an unknown was made for another model."""
         for one in self.unknowns:
             if not one.fits(model):
                 name = type(one).__name__
                 raise ValueError(f"unknowns: this {name} was made for another model; make it with the one given here.")
 
     def regions_of(self, mesh: Mesh) -> Regions | None:
-        """The regions of this mesh, if there are any. Raises `ValueError` for labels that do not fit it."""
+        """Regions on this mesh, or None. Raises `ValueError` for labels that do not fit the mesh."""
         return None if self.regions is None else Regions.create(mesh, self.regions)
 
     def box(self, background: Float[Array, " m"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-        """The bounds on the coefficients, one for each cell and then those of the unknowns, which have none.
+        """Lower and upper bounds (n,) on the coefficients of the cells, then infinite ones for the unknowns.
 
-        Raises `ValueError` for a link that takes no bounds, and a background beyond them.
+        Raises `ValueError` if the link does not allow bounds or the background lies outside them.
         """
         lower, upper = (0.0, np.inf) if self.bounds is None else self.bounds
         reference = self.link.estimate(background)

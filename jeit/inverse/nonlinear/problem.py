@@ -1,9 +1,8 @@
-"""The nonlinear problem, checks of its arguments, and implicit derivatives of its solution.
+"""The nonlinear least squares problem, checks of its arguments, and its reduction to informed shapes.
 
-Informed shapes are the combinations of a prior's shapes, some dozens, that the data resolve; they replace the full set.
-
-They are the right singular vectors of the whitened Jacobian at the background, kept in single precision, which alters
-an image by a millionth.
+Informed shapes are the combinations of a prior's shapes, a few dozen, that the data resolve. They are right singular
+vectors of the whitened Jacobian at the background, stored in single precision, which changes an image by a relative
+1e-6.
 """
 
 from __future__ import annotations
@@ -35,9 +34,9 @@ from jeit_solvers.engines import either_engine, has_values, host, namespace, on_
 
 
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
-    """Voltages as an array with zeros for what is left out, and which channels are used; raises `ValueError`.
+    """Voltages (M,) with zeros in channels that the mask leaves out, and the mask as booleans.
 
-    Values of tracers are not checked.
+    Raises `ValueError` for invalid voltages or masks. Values of traced voltages are not checked.
     """
     check_model(model)
     check_mask(mask)
@@ -69,7 +68,7 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
 
 
 def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
-    """The background per cell; raises `ValueError` for what is not one positive number or one for each cell."""
+    """Background conductivity per cell; raises `ValueError` unless it is one positive number or one per cell."""
     background = _array(background)
     if background.dtype.kind not in "biuf" or background.shape not in ((), (model.mesh.num_cells,)):
         raise ValueError(
@@ -85,7 +84,7 @@ def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
 
 
 def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
-    """Standard deviation of every channel, volts (1 where left out); raises `ValueError`."""
+    """Standard deviation of every channel in volts, 1 in channels left out; raises `ValueError` for invalid noise."""
     given = np.zeros(()) if noise is None else _array(noise)
     if given.shape not in ((), measured.shape) or given.dtype.kind not in "iuf":
         raise ValueError(
@@ -99,19 +98,19 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
 
 
 def _array(values):
-    """A NumPy copy of an array that has values."""
+    """A NumPy copy, or a JAX array if it is traced."""
     return host.array(values) if has_values(values) else jnp.asarray(values)
 
 
 def check_steps(name: str, steps) -> int:
-    """A whole number from 1. Raises `ValueError` otherwise."""
+    """`steps` as an integer. Raises `ValueError` unless it is a whole number from 1."""
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
         raise ValueError(f"{name} must be a whole number from 1; it is {steps!r}.")
     return int(steps)
 
 
 def check_tolerance(name: str, tolerance) -> float:
-    """A number from 0 up to, but not including, 1. Raises `ValueError` otherwise."""
+    """`tolerance` as a float. Raises `ValueError` unless 0 ≤ tolerance < 1."""
     if not isinstance(tolerance, (int, float, np.number)) or not 0 <= tolerance < 1:
         raise ValueError(f"{name} must be a number from 0 and less than 1; it is {tolerance!r}.")
     return float(tolerance)
@@ -125,9 +124,10 @@ def independent_data(
     *,
     at_once: bool,
 ) -> tuple[ForwardModel, Data]:
-    """The model of the independent channels among those used, and their voltages.
+    """Forward model of the independent channels among those used, and their voltages.
 
-    `deviation` (M,) of the noise, volts. `at_once`: in NumPy, if the model works that way.
+    `deviation` (M,): standard deviation of the noise, volts. `at_once`: whether to return NumPy arrays if the model
+    supports it.
     """
     kept = np.flatnonzero(used)
     observed = model if used.all() else model.with_protocol(model.protocol.subset(kept))
@@ -135,18 +135,18 @@ def independent_data(
     small = observed
     if has_values(observed.protocol):
         small = observed.with_protocol(observed.protocol.subset(np.asarray(channels.index)))
-    # For a solid body compiled programs would hold the Jacobian several times over.
+    # For a solid body, compiled programs would hold several copies of the Jacobian.
     if at_once and (model.at_once or model.mesh.dimension == 3) and has_values(small):
         small, channels = on_host((small, channels))  # and so is everything computed from them
     return small, channels.weigh(deviation[kept]).combine(measured[kept])
 
 
 def informed(inversion: Inversion, least: float, persistence: float = 0.0) -> Inversion:
-    """The problem reduced to the shapes whose signal exceeds `least`, in standard deviations of the noise for one of
-    the prior. The shapes' variances are those expected before a frame when the share `persistence` of the last image
-    persists.
+    """Reduce a problem to the combinations of shapes that the data resolve; the penalty must be standard normal.
 
-    The rest of the image stays at the reference. For penalties that are standard normal.
+    `least`: minimum signal of a shape of prior standard deviation, in standard deviations of the noise. `persistence`:
+    fraction of the last image that is expected in the next one; the variances of the shapes are those before a frame in
+    the steady state of the Kalman filter.
     """
     squares, rows = (np.asarray(values) for values in _singular_values(inversion))
     kept = squares > max(least**2, 1e-12 * squares[-1])
@@ -158,8 +158,8 @@ def informed(inversion: Inversion, least: float, persistence: float = 0.0) -> In
 
 @either_engine
 def _singular_values(inversion: Inversion):
-    """Singular values, squared, of the image's whitened Jacobian at the background, and its right singular vectors
-    times them."""
+    """Squared singular values of the whitened Jacobian at the background with respect to the image's coefficients, and
+    its right singular vectors multiplied by the singular values."""
     xp = namespace(inversion)
     start = xp.zeros(inversion.num_coefficients)
     rows = inversion.data.whiten(inversion.linearise(start)[1])[:, : inversion.basis.num_coefficients]
@@ -168,7 +168,8 @@ def _singular_values(inversion: Inversion):
 
 
 def _expected_variance(strength, persistence: float):
-    """Variance of a coefficient before its frame comes, p = a² p / (1 + s p) + 1 - a², for data of `strength` s."""
+    """Steady-state variance p of a coefficient before a frame, p = a² p / (1 + s p) + 1 - a², where a is the
+    persistence and s the `strength` of the data, the squared singular value."""
     fresh = 1 - persistence**2
     half = fresh * (1 - strength) / 2
     root = np.sqrt(half**2 + strength * fresh)
@@ -176,11 +177,11 @@ def _expected_variance(strength, persistence: float):
 
 
 class Inversion(eqx.Module):
-    """The c that minimises ½ rᵀ G r + penalty(c), r = w (v(σ) - ŷ), σ = link(x₀ + S c).
+    """Minimisation of ½ rᵀ G r + penalty(c) over c, with r = w (v(σ) - ŷ) and σ = link(x₀ + S c).
 
-    **Fields**: `model` of the independent channels; `data` with ŷ, w and G; `link`; `reference` x₀ (m,), on the link's
-    scale; `basis` S, with the hyperparameter in it; `penalty`; `unknowns`, estimated along with the conductivity: their
-    values are the last of the coefficients.
+    **Fields**: `model`: forward model of the independent channels; `data`: holds ŷ, w and G; `link`; `reference` (m,):
+    x₀, on the link's scale; `basis`: S, scaled with the hyperparameter; `penalty`; `unknowns`: parameters estimated
+    along with the conductivity, whose values are the last of the coefficients.
     """
 
     model: ForwardModel
@@ -193,43 +194,43 @@ class Inversion(eqx.Module):
 
     @property
     def runs_at_once(self) -> bool:
-        """Whether the problem can be solved in NumPy: all of its values are known and no derivative is needed."""
+        """Whether the problem can be solved in NumPy: nothing is traced and there are no unknowns."""
         in_pieces = self.model.at_once or namespace(self.model) is np
         return in_pieces and not self.unknowns and has_values(self)
 
     @property
     def num_coefficients(self) -> int:
-        """Number of coefficients n, those of the unknowns included."""
+        """Number of coefficients n, including those of the unknowns."""
         return self.basis.num_coefficients + sum(unknown.size for unknown in self.unknowns)
 
     def conductivity(self, coefficients: Float[Array, " n"]) -> Float[Array, " m"]:
-        """σ per cell, S/m (2-D: S)."""
+        """Conductivity σ per cell, S/m (2-D: S)."""
         return self.link.conductivity(self.estimate(coefficients))
 
     def estimate(self, coefficients: Float[Array, " n"]) -> Float[Array, " m"]:
-        """x per cell, on the link's scale."""
+        """Image x per cell, on the link's scale."""
         return self._situation(*self._parts(coefficients))[1]
 
     def applied(self, model: ForwardModel, coefficients: Float[Array, " n"]) -> ForwardModel:
-        """`model` with the estimated contact impedances, positions ... put in."""
+        """`model` with the estimated unknowns, such as contact impedances or electrode positions."""
         for unknown, values in zip(self.unknowns, self.values(coefficients), strict=True):
             model, _ = unknown.apply(model, self.reference, values)
         return model
 
     def values(self, coefficients: Float[Array, " n"]) -> tuple[Float[Array, " k"], ...]:
-        """The estimated values of every unknown, as `AbstractUnknown.apply` takes them."""
+        """Estimated values of every unknown, as used by `AbstractUnknown.apply`."""
         return self._parts(coefficients)[1]
 
     def voltages(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:
-        """Voltages of the independent channels that the model predicts, volts."""
+        """Predicted voltages of the independent channels, volts."""
         return self._predict(*self._parts(coefficients))
 
     def residual(self, coefficients: Float[Array, " n"]) -> Float[Array, " r"]:
-        """w (v(σ) - ŷ), with covariance `data.covariance`."""
+        """Residual w (v(σ) - ŷ), whose covariance is `data.covariance`."""
         return self.data.weight * (self.voltages(coefficients) - self.data.voltages)
 
     def linearise(self, coefficients: Float[Array, " n"]) -> tuple[Float[Array, " r"], Float[Array, "r n"]]:
-        """`residual`, and its Jacobian with respect to the coefficients."""
+        """Residual, and its Jacobian with respect to the coefficients."""
         shapes, values = self._parts(coefficients)
         model, estimate = self._situation(shapes, values)
         conductivity = self.link.conductivity(estimate)
@@ -246,26 +247,26 @@ class Inversion(eqx.Module):
             along = jax.jacfwd(lambda values: self._predict(shapes, values))(values)
             columns += [block * unknown.deviation for block, unknown in zip(along, self.unknowns, strict=True)]
         weight, xp = self.data.weight, namespace(voltages, jacobian)
-        # A factorisation may go well though some conductivities are below zero; no descent is to end there.
+        # A factorisation may succeed although some conductivities are negative; NaN makes a descent reject the point.
         residual = xp.where((conductivity > 0).all(), weight * (voltages - self.data.voltages), xp.nan)
         jacobian = xp.concatenate(columns, axis=1) if self.unknowns else jacobian
         if xp is np:
-            jacobian *= weight[:, None]  # in place: there may be no room for a second
+            jacobian *= weight[:, None]  # in place, to save the memory of a copy
             return residual, jacobian
         return residual, weight[:, None] * jacobian
 
     def cost(self, coefficients: Float[Array, " n"]) -> Float[Array, ""]:
-        """½ rᵀ G r + penalty."""
+        """Objective ½ rᵀ G r + penalty(c)."""
         residual = self.residual(coefficients)
         return 0.5 * residual @ self.data.precision @ residual + self.penalty.cost(coefficients)
 
     def quadratic_model(self, coefficients: Float[Array, " n"]) -> QuadraticModel:
-        """The cost and its step, for `jeit_solvers.Descent`."""
+        """Objective and the function that computes a step, for `jeit_solvers.Descent`."""
         residual, jacobian = self.linearise(coefficients)
         return self.penalty.model(residual, jacobian, coefficients, self.data)
 
     def _parts(self, coefficients):
-        """Coefficients of the image, and the values of every unknown."""
+        """Coefficients of the image, and values of every unknown."""
         values, start = [], self.basis.num_coefficients
         for unknown in self.unknowns:
             values.append(unknown.deviation * coefficients[start : start + unknown.size])
@@ -273,7 +274,7 @@ class Inversion(eqx.Module):
         return coefficients[: self.basis.num_coefficients], tuple(values)
 
     def _situation(self, shapes, values) -> tuple[ForwardModel, Float[Array, " m"]]:
-        """The model with the unknowns put in, and the estimate x, S c included."""
+        """Model changed by the unknowns, and the image x."""
         model, estimate = self.model, self.reference + self.basis.expand(shapes)
         for unknown, value in zip(self.unknowns, values, strict=True):
             model, estimate = unknown.apply(model, estimate, value)

@@ -1,4 +1,4 @@
-"""`reconstruct`: the conductivity that explains a frame of voltages, by nonlinear least squares."""
+"""Nonlinear least squares estimate of the conductivity from a frame of voltages (`reconstruct`)."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ from jeit_solvers.engines import as_array, either_engine, has_values, namespace,
 
 
 class Reconstruction(eqx.Module):
-    """Result of `reconstruct`, of any solver.
+    """Result of `reconstruct`.
 
-    **Fields**: `conductivity` (m,), S/m (2-D: S); `voltages` (M,), what the model predicts for it; `misfit`, root mean
-    square of predicted - measured over the channels used, in standard deviations (1: as good as the noise lets it be);
-    `costs`, the objective at every accepted iterate, the start first (only at start and end where a solver keeps no
-    record); `iterations`; `outcome`, the `Status.number` of how the solver ended, and `reason`, in a sentence; `choice`
-    of the hyperparameter λ; `inversion` and `coefficients`, the problem solved and its solution, for warm starts and
-    uncertainty; `model`, with the unknowns estimated along with the image put in.
+    **Fields**: `conductivity` (m,): S/m (2-D: S); `voltages` (M,): predicted voltages; `misfit`: root mean square of
+    predicted - measured over the channels used, in standard deviations (about 1 if only noise is left); `costs`:
+    objective at the start and at every accepted iterate (only at start and end if a solver keeps no record);
+    `iterations`: number of iterations; `outcome`: `Status.number` of how the solver ended; `reason`: the same in a
+    sentence; `choice`: choice of the hyperparameter λ; `inversion`, `coefficients`: the problem solved and its
+    solution, for warm starts and uncertainty; `model`: forward model with the estimated unknowns.
     """
 
     conductivity: Float[Array, " m"]
@@ -62,18 +62,18 @@ class Reconstruction(eqx.Module):
     def status(self) -> Status:
         """How the solver ended: "converged", "step limit", "stalled" or "failed".
 
-        Raises `ValueError` inside `jax.jit`, where that is not known yet, and for a batch: see `converged`.
+        Raises `ValueError` inside `jax.jit`, where the outcome is not known yet, and for a batch; see `converged`.
         """
         return Status.of_number(self.outcome)
 
     @property
     def converged(self) -> Bool[Array, ""]:
-        """Whether the solver converged; inside `jax.jit` and of a batch, too."""
+        """Whether the solver converged; also available inside `jax.jit` and for a batch."""
         return jnp.asarray(self.outcome) == Status.CONVERGED.number
 
     @property
     def hyperparameter(self) -> Float[Array, ""]:
-        """λ."""
+        """Hyperparameter λ."""
         return self.choice.hyperparameter
 
     @property
@@ -83,10 +83,10 @@ class Reconstruction(eqx.Module):
 
     @property
     def unknowns(self) -> dict[str, Float[Array, " k"]]:
-        """Values estimated along with the conductivity, by the name of the unknown's class.
+        """Quantities estimated along with the conductivity, by the class name of the unknown.
 
-        `ContactImpedance`: (L,), ohm·m² (2-D: ohm·m); `ElectrodePosition`: how far from the model's, metres; `Scale`:
-        the factor; `Background`: what is added to the image, on the link's scale.
+        `ContactImpedance`: (L,), ohm·m² (2-D: ohm·m); `ElectrodePosition`: displacement, metres; `Scale`: factor;
+        `Background`: constant added to the image, on the link's scale.
         """
         model, values = self.inversion.model, self.inversion.values(self.coefficients)
         return {
@@ -110,24 +110,25 @@ def reconstruct(
 ) -> Reconstruction:
     """Estimate the conductivity per cell that explains measured `voltages` (M,), in volts: an absolute image.
 
-    - `background`: what the prior expects, one number or (m,), S/m (2-D: S), see `calibrate`; and where to start.
-    - `prior`: `Noser()` unless given; `TotalVariation()` for images of few pieces.
-    - `hyperparameter`: λ, the prior's weight, or a rule in `jeit.inverse.RULES`, used on the problem linearised at the
-      background; "noise-figure" unless given. Total variation takes a number, 300 unless given.
-    - `noise`: standard deviation of the channels in volts, one number or (M,); 1 % of their size unless given.
+    - `background`: prior mean and starting point, one number or (m,), S/m (2-D: S); see `calibrate`.
+    - `prior`: `Noser()` by default; `TotalVariation()` for piecewise constant images.
+    - `hyperparameter`: weight λ of the prior, or a rule in `jeit.inverse.RULES`, which is applied to the problem
+      linearised at the background; default "noise-figure". Total variation takes a number, default 300.
+    - `noise`: standard deviation of the channels in volts, one number or (M,); default 1 % of the voltages, see
+      `relative_noise`.
     - `mask`: True for the channels to use.
-    - `solver`: one of `jeit.inverse.nonlinear`, such as `LevenbergMarquardt(max_steps=60)`, its name, or any
-      least-squares solver of optimistix (not with total variation). `GaussNewton()` unless given; where there are
-      bounds, `LBFGSB()`.
-    - `parametrisation`: what is estimated: the link, bounds, regions of one value, further unknowns.
+    - `solver`: a solver of `jeit.inverse.nonlinear`, such as `LevenbergMarquardt(max_steps=60)`, its name, or a
+      least-squares solver of optimistix (not with total variation). Default `GaussNewton()`; with bounds `LBFGSB()`.
+    - `parametrisation`: the quantities estimated: link, bounds, regions of one value, further unknowns.
     - `start`: an earlier reconstruction of the same kind, to start from.
 
-    Raises `ValueError` for arguments that do not fit; a solver that fails says so in the result's `status`.
+    Raises `ValueError` for arguments that do not fit together; a failure of the solver is reported in the result's
+    `status`.
 
-    With a number for λ it goes through `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`, in everything that has a
-    gradient: voltages, background, noise, λ, the prior's settings, and all fields of the model. Derivatives are those
-    of the minimum, by the implicit function theorem with the full Hessian, however few steps were taken; where bounds
-    are active, of the minimum with the same bounds active, so on one side only where a bound is just reached. See
+    If λ is a number, `reconstruct` works inside `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`, with respect to
+    voltages, background, noise, λ, the prior's settings and all fields of the model. Derivatives are those of the
+    minimum by the implicit function theorem with the full Hessian, even if the solver stopped early. With bounds, they
+    are derivatives at fixed active bounds, so they are one-sided where a bound is just reached. See
     docs/differentiable-images.md.
 
     Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Nocedal and Wright, Numerical Optimization (2006), ch. 10.
@@ -151,7 +152,11 @@ def reconstruct(
         instead = "leave it out, and take all shapes"
         check_has_values("informative: the problem", inversion, "shapes that the data support come from", instead)
         inversion = informed(inversion, parametrisation.informative)
-    first = as_array(np.zeros(inversion.num_coefficients)) if start is None else _continued(start, inversion, choice)
+    first = (
+        as_array(np.zeros(inversion.num_coefficients))
+        if start is None
+        else _start_coefficients(start, inversion, choice)
+    )
     found = solver.minimise(inversion, first, box)
     coefficients, status, reason = found.coefficients, found.status, found.reason
     fitted, conductivity = inversion.applied(model, coefficients), _conductivity(inversion, coefficients)
@@ -191,7 +196,7 @@ def _check_protocol(model: ForwardModel, used) -> None:
 
 
 def _solver_for(solver, prior: AbstractPrior, parametrisation: Parametrisation) -> AbstractSolver:
-    """The solver asked for, or one that suits the problem. Raises `ValueError` for one that does not."""
+    """The given solver, or the default for the problem. Raises `ValueError` if the solver does not suit the problem."""
     bounded = parametrisation.bounds is not None
     if solver is None:
         return LBFGSB() if bounded else GaussNewton()
@@ -218,9 +223,10 @@ def pose(
     *,
     per_cell: bool = False,
 ) -> tuple[Inversion, Choice]:
-    """The problem for a `model` of independent channels and their `data`, and the choice of its λ.
+    """Set up the problem for a `model` of independent channels and their `data`, and choose λ.
 
-    `per_cell`: every coefficient is a cell's value, as bounds need it. Raises `ValueError` for what does not fit.
+    `per_cell`: whether every coefficient must be the value of a cell, as bounds require. Raises `ValueError` for
+    arguments that do not fit together.
     """
     mesh, link = model.mesh, parametrisation.link
     reference, regions = link.estimate(background), parametrisation.regions_of(mesh)
@@ -244,7 +250,8 @@ def pose(
 
 
 def _whitened(model: ForwardModel, data: Data, background, slope):
-    """Voltages of the background, the whitened Jacobian there on the link's scale, and the data, in NumPy if known."""
+    """Voltages of the background, whitened Jacobian with respect to the link's variable there, and the data; as NumPy
+    arrays unless traced."""
     if not has_values(model, data, background, slope):
         voltages, jacobian = model.voltages_and_jacobian(background)
         return voltages, data.whiten(data.weight[:, None] * jacobian * slope), data
@@ -258,11 +265,12 @@ def _whitened(model: ForwardModel, data: Data, background, slope):
     return channel_voltages(protocol, impedance), seen, known
 
 
-def _continued(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"]:
-    """The coefficients of an earlier reconstruction, on this λ. Raises `ValueError` for another kind of problem."""
+def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"]:
+    """Coefficients of an earlier reconstruction, rescaled to this λ. Raises `ValueError` if its problem is of another
+    kind."""
     if not isinstance(start, Reconstruction):
         raise ValueError(f"start must be what reconstruct has returned, not {type(start).__name__}.")
-    if start.coefficients.shape != (inversion.num_coefficients,) or not _alike(start.inversion, inversion):
+    if start.coefficients.shape != (inversion.num_coefficients,) or not _same_kind(start.inversion, inversion):
         raise ValueError(
             f"start has {start.coefficients.size} coefficients of another kind of problem; this one has "
             f"{inversion.num_coefficients}. Give a reconstruction of the same model, prior and link."
@@ -272,7 +280,7 @@ def _continued(start, inversion: Inversion, choice: Choice) -> Float[Array, " n"
     return start.coefficients.at[:size].multiply(scale)
 
 
-def _alike(one: Inversion, other: Inversion) -> bool:
+def _same_kind(one: Inversion, other: Inversion) -> bool:
     """Whether the coefficients of two problems have the same meaning."""
 
     def kinds(inversion):
@@ -282,7 +290,7 @@ def _alike(one: Inversion, other: Inversion) -> bool:
 
 
 def _mismatch(model: ForwardModel, measured, background, kept) -> str:
-    """A hint where voltages and background are of different size or sign: units, or polarity."""
+    """Hint at wrong units or polarity if measured voltages and those of the background differ in size or sign."""
     expected = model.voltages(background)[kept]
     ratio = float(jnp.vdot(measured, expected) / jnp.vdot(expected, expected))
     if 0.1 < ratio < 10:

@@ -1,6 +1,6 @@
-"""Solvers of the nonlinear problem, as small objects that hold their settings and state what they can do.
+"""Solvers of the nonlinear problem: objects that hold settings and declare which problems they can solve.
 
-`SOLVERS` has them by name, and `as_solver` turns a name into an object.
+`SOLVERS` lists the solvers by name, and `as_solver` converts a name to an object.
 """
 
 from __future__ import annotations
@@ -31,16 +31,17 @@ _REASONS = {
 }
 
 _ROUNDED = "The next step would change the objective by less than its rounding."
-# Rounding error of the objective, a sum over all channels, in units of its last place.
+# Rounding error of the objective, which is a sum over all channels, in units of its machine precision.
 _ROUNDINGS = 100.0
 _TRACED = "It was solved inside a transformation of JAX; the status says how that ended."
 
 
 class Solved(NamedTuple):
-    """Result of a solver: coefficients (n,), iterations, the objective at the accepted iterates, the status and its
-    reason.
+    """Result of a solver.
 
-    For a traced problem, `costs` are those of start and end, and `status` is a status's number.
+    **Fields**: `coefficients` (n,); `iterations`: number of iterations; `costs`: objective at the start and at every
+    accepted iterate, for a traced problem only at start and end; `status`: how the solver ended, for a traced problem
+    its number; `reason`: the same in a sentence.
     """
 
     coefficients: Float[Array, " n"]
@@ -51,49 +52,50 @@ class Solved(NamedTuple):
 
 
 class AbstractSolver(eqx.Module):
-    """Base of all solvers of `reconstruct` and `Imager`. A new one is a class with `minimise`,
-    and an entry in `SOLVERS`."""
+    """Base of all solvers of `reconstruct` and `Imager`. A new solver is a subclass with `minimise` and an entry in
+    `SOLVERS`."""
 
     name: ClassVar[str]
 
     @property
     def keeps_bounds(self) -> bool:
-        """Whether it minimises between bounds, one coefficient for each cell."""
+        """Whether the solver minimises between bounds, with one coefficient per cell."""
         return False
 
     @property
     def needs_squares(self) -> bool:
-        """Whether the objective must be a sum of squares, which total variation is not."""
+        """Whether the solver requires an objective that is a sum of squares, unlike total variation."""
         return False
 
     @property
     def is_linear(self) -> bool:
-        """Whether it takes a single step from the background, the same matrix for every frame."""
+        """Whether the solver takes one step from the background, with the same matrix for every frame."""
         return False
 
     @abc.abstractmethod
     def minimise(self, inversion: Inversion, start: Float[Array, " n"], box) -> Solved:
-        """The coefficients of least cost, from `start`; between the ends of `box`, (n,) each, if it keeps bounds."""
+        """Minimise the objective from `start`. A solver that keeps bounds minimises between the lower and upper bounds
+        `box`, (n,) each."""
 
     def for_frames(self, max_steps: int | None = None, rtol: float | None = None) -> "AbstractSolver":
-        """The solver with these settings where it has none of its own, for an `Imager`. Raises `ValueError` if it is
-        not one that images a frame in a bounded time."""
+        """The solver for an `Imager`, with these settings as defaults for settings that are None. Raises `ValueError`
+        if it does not image a frame in a bounded time."""
         raise ValueError(
             f"solver: {self.name} does not image frames in a bounded time; take one of {', '.join(frame_solvers())}."
         )
 
     def descent(self, max_steps: int, rtol: float) -> Descent:
-        """The solver's steps, for optimistix; the arguments are used where it has no settings of its own. Keeps the
-        cost of the start and of `max_steps` steps. Raises `ValueError` if it takes other steps."""
+        """Descent method that optimistix runs, with the arguments as defaults for settings that are None. It records
+        the cost at the start and after each of `max_steps` steps. Raises `ValueError` if the solver works otherwise."""
         raise ValueError(f"solver: {self.name} does not descend along quadratic models.")
 
 
 class GaussNewton(AbstractSolver):
-    """Gauss-Newton steps with a backtracking line search; total variation by lagged diffusivity.
+    """Gauss-Newton method with a backtracking line search; total variation is treated by lagged diffusivity.
 
-    `max_steps`: 30 unless given, for an `Imager` 4; a step that leads too far counts, and so does the shorter one tried
-    in its place. `rtol`: the iteration ends when the next step would change the objective by less than rtol times
-    itself, or times ½, what one voltage costs that is a standard deviation off; 1e-6 unless given, with total variation
+    `max_steps`: default 30, for an `Imager` 4; rejected steps and the shorter steps tried in their place both count.
+    `rtol`: the iteration ends when the next step would change the objective by less than rtol times the objective or
+    rtol times ½, the misfit of one voltage that is wrong by a standard deviation; default 1e-6, with total variation
     1e-4, for an `Imager` 1e-3.
     """
 
@@ -109,19 +111,19 @@ class GaussNewton(AbstractSolver):
         return _descend(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
-        """The solver itself."""
+        """The solver, with these settings as defaults."""
         return GaussNewton(_first(self.max_steps, max_steps), _first(self.rtol, rtol))
 
     def descent(self, max_steps, rtol):
-        """Steps without damping."""
+        """Descent without damping."""
         return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol))
 
 
 class LevenbergMarquardt(AbstractSolver):
-    """Levenberg-Marquardt: Gauss-Newton steps, damped while they lead too far.
+    """Levenberg-Marquardt method: Gauss-Newton steps, whose damping is increased when a step is rejected.
 
-    `max_steps`, `rtol`: as for `GaussNewton`. `damping`: that of the first step, relative to the prior. Raises
-    `ValueError` for settings that make no step.
+    `max_steps`, `rtol`: as for `GaussNewton`. `damping`: damping of the first step, relative to the prior. Raises
+    `ValueError` for invalid settings.
     """
 
     name: ClassVar[str] = "levenberg-marquardt"
@@ -139,16 +141,17 @@ class LevenbergMarquardt(AbstractSolver):
         return _descend(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
-        """The solver itself."""
+        """The solver, with these settings as defaults."""
         return LevenbergMarquardt(_first(self.max_steps, max_steps), _first(self.rtol, rtol), self.damping)
 
     def descent(self, max_steps, rtol):
-        """Steps with damping."""
+        """Descent with damping."""
         return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol), self.damping)
 
 
 class LBFGSB(AbstractSolver):
-    """L-BFGS-B between bounds. `tolerance`: of a step along the projected gradient, coefficients scaled to size one."""
+    """L-BFGS-B method between bounds. `tolerance`: maximum change of a scaled coefficient in a step along the projected
+    gradient at convergence; see `minimise_between`."""
 
     name: ClassVar[str] = "l-bfgs-b"
     max_steps: int = eqx.field(static=True, default=1000)
@@ -168,7 +171,7 @@ class LBFGSB(AbstractSolver):
 
 
 class ProjectedGradient(AbstractSolver):
-    """Accelerated projected gradients between bounds. `tolerance`: as for `LBFGSB`."""
+    """Accelerated projected gradient method between bounds. `tolerance`: as for `LBFGSB`."""
 
     name: ClassVar[str] = "projected-gradient"
     max_steps: int = eqx.field(static=True, default=1000)
@@ -188,7 +191,7 @@ class ProjectedGradient(AbstractSolver):
 
 
 class LeastSquares(AbstractSolver):
-    """Any least-squares `solver` of optimistix, with its own tolerances; not for total variation."""
+    """A least-squares `solver` of optimistix, with its own tolerances; not for total variation."""
 
     name: ClassVar[str] = "a solver of optimistix"
     solver: optx.AbstractLeastSquaresSolver
@@ -218,7 +221,7 @@ class LeastSquares(AbstractSolver):
 
 
 class OneStep(AbstractSolver):
-    """The linear image, one Gauss-Newton step from the background: for an `Imager`."""
+    """Linear images for an `Imager`: one Gauss-Newton step from the background."""
 
     name: ClassVar[str] = "one-step"
 
@@ -232,7 +235,7 @@ class OneStep(AbstractSolver):
         raise ValueError("solver: linear images are those of one_step, or of an Imager; take another solver.")
 
     def for_frames(self, max_steps=None, rtol=None):
-        """The solver itself."""
+        """The solver, with these settings as defaults."""
         return self
 
 
@@ -243,15 +246,15 @@ SOLVERS: dict[str, type[AbstractSolver]] = {
 
 
 def frame_solvers() -> tuple[str, ...]:
-    """Names of those that image frames in a bounded time, for an `Imager`."""
+    """Names of the solvers that image a frame in a bounded time, for an `Imager`."""
     return tuple(name for name, one in SOLVERS.items() if one.for_frames is not AbstractSolver.for_frames)
 
 
 def as_solver(
     solver: "AbstractSolver | optx.AbstractLeastSquaresSolver | str", *, frames: bool = False
 ) -> AbstractSolver:
-    """A solver itself, or the one meant by a name in `SOLVERS` or by a solver of optimistix. Raises `ValueError` for
-    others, and says which there are: of frames, or else of reconstructions."""
+    """Convert a name in `SOLVERS` or a least-squares solver of optimistix to a solver; solvers are returned unchanged.
+    Raises `ValueError` for anything else, and lists the solvers for frames if `frames`, else for reconstructions."""
     names = frame_solvers() if frames else tuple(name for name, one in SOLVERS.items() if not one().is_linear)
     if isinstance(solver, str):
         if solver not in SOLVERS:
@@ -265,7 +268,7 @@ def as_solver(
 
 
 def counted_iterations(iterations: int, shortened: int = 0) -> str:
-    """The numbers of iterations and of shortened steps, in words."""
+    """Numbers of iterations and of shortened steps, in words."""
     said = counted(iterations, "iteration")
     if not shortened:
         return said
@@ -277,12 +280,12 @@ def _reason(status: Status, iterations: int, shortened: int = 0) -> str:
 
 
 def expand(coefficients: Float[Array, " n"], inversion: Inversion):
-    """Cost and step of a problem at these coefficients: the option `expand` of `jeit_solvers.Descent`."""
+    """Objective and step of a problem at these coefficients, for the option `expand` of `jeit_solvers.Descent`."""
     return inversion.quadratic_model(coefficients)
 
 
 def residual(coefficients: Float[Array, " n"], inversion: Inversion):
-    """Residuals of data and prior, each of unit variance: the function of optimistix's least squares."""
+    """Residuals of data and prior, each of unit variance, for the least-squares solvers of optimistix."""
     return inversion.data.whiten(inversion.residual(coefficients)), coefficients
 
 
@@ -303,8 +306,8 @@ def _least_squares(inversion: Inversion, start, solver, max_steps: int, options:
 
 
 def _steps(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
-    """Settings for this many steps, with room for the start. `atol` ends the iteration where the objective itself goes
-    to zero, as for an undisturbed frame, so that no change is small relative to it."""
+    """Descent of `max_steps` steps, with a history that also holds the start. `atol` ends the iteration when the
+    objective tends to zero, as for an undisturbed frame, where no change is small relative to it."""
     return Descent(rtol=rtol, atol=0.5 * rtol, damping=damping, history=max_steps + 1)
 
 
@@ -329,7 +332,7 @@ def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
 
 
 def _traced(inversion: Inversion, start, found, iterations, status, box=None) -> Solved:
-    """Result of a solver for a traced problem: `found` gets the derivatives of the minimum."""
+    """Result of a solver for a traced problem, with derivatives of the minimum attached to `found`."""
     found = as_solution(found, inversion, box)
     costs = jnp.stack([_cost(inversion, start), _cost(inversion, found)])
     return Solved(found, iterations, costs, status, _TRACED)
@@ -362,12 +365,12 @@ def minimise_between(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """The coefficients of least cost between two bounds, by `jeit_solvers.lbfgsb` or `projected_gradient`.
+    """Minimise the objective between bounds with `minimise`, which is `jeit_solvers.lbfgsb` or `projected_gradient`.
 
-    Converged: a step along the projected gradient, scaled by each coefficient's own curvature, changes none by more
-    than `tolerance`.
+    Coefficients are divided by a scale from the curvature of the objective. The iteration has converged when a step
+    along the projected gradient changes no scaled coefficient by more than `tolerance`.
     """
-    # All coefficients are scaled to one size: conditioning decides how many steps a gradient method takes.
+    # Coefficients are scaled to similar curvature, because the number of steps depends on the conditioning.
     _, jacobian = inversion.linearise(start)
     scale = jax.lax.rsqrt(jnp.sum(jacobian**2, axis=0) + inversion.penalty.diagonal(start))
     unit = inversion.cost(start)
@@ -384,8 +387,8 @@ def minimise_between(
 
 @eqx.filter_jit
 def _is_within_rounding(inversion: Inversion, coefficients):
-    """Whether a Gauss-Newton step would lower the objective by no more than its rounding error: solvers that accept
-    steps by the gain stall there, before they reach tolerances near the square root of the precision."""
+    """Whether a Gauss-Newton step would lower the objective by no more than its rounding error. Solvers that accept
+    steps by the decrease of the objective stall there, before they reach very small tolerances."""
     cost, step = inversion.quadratic_model(coefficients)
     _, slope, curvature = step(0.0)
     return abs(slope + 0.5 * curvature) <= _ROUNDINGS * jnp.finfo(cost.dtype).eps * cost

@@ -1,7 +1,7 @@
-"""Bases: images as combinations of shapes, x = x₀ + S c, that a prior makes independent and of unit variance.
+"""Bases S of images x = x₀ + S c, whose coefficients c are independent with unit variance under a prior.
 
-With covariance Γ = S Sᵀ the prior energy (x - x₀)ᵀ Γ⁻¹ (x - x₀) is ‖c‖². A diagonal S keeps every cell on its own; a
-narrow one (a covariance of low rank) keeps the images that the prior allows and leaves out the rest.
+With prior covariance Γ = S Sᵀ, the prior energy (x - x₀)ᵀ Γ⁻¹ (x - x₀) is ‖c‖². The columns of S are called shapes. A
+diagonal S has one independent coefficient per cell; an S with few columns approximates Γ by a low-rank matrix.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ class AbstractBasis(eqx.Module):
 
     @abc.abstractmethod
     def expand(self, coefficients: Float[Array, " n"]) -> Float[Array, " m"]:
-        """S c."""
+        """Product S c."""
 
     @abc.abstractmethod
     def restrict(self, rows: Float[Array, "M m"]) -> Float[Array, "M n"]:
-        """Rows times S."""
+        """Product of `rows` with S."""
 
     def restrict_blocks(self, blocks: Iterable[tuple[slice, Any]]) -> Any:
-        """Rows (M, m) times S, given some cells after others, in NumPy: an array (M, n) of its own."""
+        """Product with S of rows (M, m) given as blocks of cells, in NumPy; a new array (M, n)."""
         cells, columns = zip(*blocks, strict=True)
         whole: Any = np.empty((len(columns[0]), cells[-1].stop), columns[0].dtype)
         for where, block in zip(cells, columns, strict=True):
@@ -47,19 +47,19 @@ class AbstractBasis(eqx.Module):
 
     @abc.abstractmethod
     def variance(self) -> Float[Array, " m"]:
-        """Prior variance of every cell: the diagonal of S Sᵀ, and the variance that the shapes leave out."""
+        """Prior variance of every cell: the diagonal of S Sᵀ plus the variance that the shapes leave out."""
 
     @abc.abstractmethod
     def scaled(self, factor) -> "AbstractBasis":
-        """S times a number."""
+        """Basis whose S is multiplied by a number."""
 
     @abc.abstractmethod
     def pooled(self, regions: "Regions") -> "AbstractBasis":
-        """S with the rows of every region replaced by their mean, and by zero where the image is held fixed."""
+        """Basis whose rows are replaced by their mean over each region, and by zero where the image is held fixed."""
 
 
 class DiagonalBasis(AbstractBasis):
-    """Every cell on its own: S = diag(`deviation`), (m,)."""
+    """Diagonal basis S = diag(`deviation`), with one coefficient per cell and `deviation` (m,)."""
 
     deviation: Float[Array, " m"]
 
@@ -73,11 +73,11 @@ class DiagonalBasis(AbstractBasis):
         return self.deviation * coefficients
 
     def restrict(self, rows):
-        """Columns times the deviations."""
+        """Columns multiplied by the deviations."""
         return rows * self.deviation
 
     def restrict_blocks(self, blocks):
-        """Columns times the deviations."""
+        """Columns multiplied by the deviations."""
         found: list[np.ndarray] = []
         for cells, block in blocks:
             if not found:
@@ -90,19 +90,19 @@ class DiagonalBasis(AbstractBasis):
         return self.deviation**2
 
     def scaled(self, factor):
-        """Deviations times a number."""
+        """Basis with the deviations multiplied by a number."""
         return DiagonalBasis(self.deviation * factor)
 
     def pooled(self, regions):
-        """One coefficient for each region, with the mean variance of its cells."""
+        """Basis with one coefficient per region, whose variance is the mean over its cells."""
         return RegionBasis(regions, namespace(regions).sqrt(regions.mean(self.deviation**2)))
 
 
 class DenseBasis(AbstractBasis):
-    """Shapes in the columns of a matrix: S = `shapes` (m, n).
+    """Basis whose shapes are the columns of a dense matrix, S = `shapes` (m, n).
 
-    Products are taken in the shapes' own precision: single, where a millionth does not matter and time does.
-    `left_out` (m,): variance of cells that the shapes are known to leave out; none unless given.
+    Products are computed in the precision of `shapes`, which may be single. `left_out` (m,): prior variance of the
+    cells that the shapes do not represent, or None.
     """
 
     shapes: Float[Array, "m n"]
@@ -114,39 +114,40 @@ class DenseBasis(AbstractBasis):
         return self.shapes.shape[1]
 
     def expand(self, coefficients):
-        """The shapes, weighted and added."""
+        """Sum of the shapes weighted with the coefficients."""
         return (self.shapes @ coefficients.astype(self.shapes.dtype)).astype(coefficients.dtype)
 
     def restrict(self, rows):
-        """Rows times the matrix."""
+        """Product of `rows` with the matrix."""
         return (rows.astype(self.shapes.dtype) @ self.shapes).astype(rows.dtype)
 
     def restrict_blocks(self, blocks):
-        """Rows times the matrix, added up."""
+        """Sum over the blocks of their products with the matrix."""
         total = sum(block.astype(self.shapes.dtype) @ self.shapes[cells] for cells, block in blocks)
         return np.asarray(total, float)
 
     def variance(self):
-        """Sums of the shapes' squares, and what they leave out."""
+        """Sum of the squared shapes, plus the variance left out."""
         xp = namespace(self)
         within = xp.einsum("mn,mn->m", self.shapes, self.shapes)
         return within if self.left_out is None else within + self.left_out
 
     def scaled(self, factor):
-        """The matrix times a number."""
+        """Basis with the matrix multiplied by a number."""
         kind = self.shapes.dtype
         left_out = None if self.left_out is None else self.left_out * factor**2
         return DenseBasis((self.shapes * factor).astype(kind), left_out)
 
     def pooled(self, regions):
-        """Shapes that are constant in every region."""
+        """Basis of the shapes averaged over every region."""
         return DenseBasis(regions.spread(regions.mean(self.shapes)))
 
 
 class NodalBasis(AbstractBasis):
-    """One coefficient for each node, of which a cell has the mean: S c of P1 functions c at the cells' centres.
+    """Basis with one coefficient per node; a cell has the mean of its nodes, which is the value at its centre of the
+    piecewise linear function with these nodal values.
 
-    **Fields**: `cells` (m, k) of the mesh; `number` of its nodes.
+    **Fields**: `cells` (m, k): nodes of the mesh's cells; `number`: number of nodes.
     """
 
     cells: Int[Array, "m k"]
@@ -158,18 +159,18 @@ class NodalBasis(AbstractBasis):
         return self.number
 
     def expand(self, coefficients):
-        """Means over the cells' nodes."""
+        """Mean of the coefficients over the nodes of each cell."""
         return gather(coefficients, self.cells).mean(axis=1)
 
     def restrict(self, rows):
-        """Columns, in equal parts, to the cells' nodes."""
+        """Distribute each column in equal parts over the nodes of its cell."""
         parts = rows.T / self.cells.shape[1]
         shape = self.number, len(rows)
         corners = [sum_into(shape, self.cells[:, k], parts) for k in range(self.cells.shape[1])]
         return functools.reduce(operator.add, corners).T
 
     def restrict_blocks(self, blocks):
-        """As `restrict`, for rows given block by block."""
+        """Like `restrict`, for rows given as blocks of cells."""
         total: Any = np.zeros(0)
         count = self.cells.shape[1]
         for cells, block in blocks:
@@ -182,7 +183,7 @@ class NodalBasis(AbstractBasis):
         return np.ascontiguousarray(total.T)
 
     def variance(self):
-        """Variance of cells as means of independent nodes."""
+        """Variance of the mean of independent nodes, for every cell."""
         return namespace(self).full(len(self.cells), 1 / self.cells.shape[1])
 
     def scaled(self, factor):
@@ -195,10 +196,10 @@ class NodalBasis(AbstractBasis):
 
 
 class Regions(eqx.Module):
-    """Cells that share one value: pixels of a grid, the layers of a skin; and cells whose value is known.
+    """Regions of cells that share one value, such as pixels of a grid or layers of a skin.
 
-    **Fields**: `label` (m,), the region of every cell from 0, or -1 where the image is held at the background;
-    `measure` (m,), the cells' area (3-D: volume); `number` of regions.
+    **Fields**: `label` (m,): number of each cell's region, from 0, or -1 if the cell is held at the background;
+    `measure` (m,): area (3-D: volume) of the cells; `number`: number of regions.
     """
 
     label: Int[Array, " m"]
@@ -207,7 +208,11 @@ class Regions(eqx.Module):
 
     @classmethod
     def create(cls, mesh: Mesh, label) -> "Regions":
-        """Raises `ValueError` for labels that are not one integer for each cell, from -1 with none left out."""
+        """Create regions of a mesh from labels.
+
+        Raises `ValueError` unless `label` has one integer per cell, from -1, and uses all numbers from 0 to the
+        largest.
+        """
         label = np.asarray(label)
         number = int(label.max(initial=-1)) + 1
         if label.shape != (mesh.num_cells,) or label.dtype.kind not in "iu" or number == 0 or label.min() < -1:
@@ -220,29 +225,33 @@ class Regions(eqx.Module):
         empty = np.setdiff1d(np.arange(number), label)
         if empty.size:
             raise ValueError(f"regions: no cell has the label {empty[0]}; use all from 0 to {number - 1}.")
-        return cls(host.array(label), host.asarray(measures(mesh)), number)  # a copy: labels are the user's
+        return cls(
+            host.array(label), host.asarray(measures(mesh)), number
+        )  # copied, so that the user's array can change
 
     def total(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
-        """Sums of cells' values over every region."""
+        """Sum of the cells' values over each region."""
         where = namespace(self.label).where(self.label < 0, self.number, self.label)
         return sum_into((self.number + 1, *values.shape[1:]), where, values)[:-1]
 
     def mean(self, values: Float[Array, "m *k"]) -> Float[Array, "p *k"]:
-        """Means over every region, weighted by area."""
+        """Mean of the cells' values over each region, weighted by area (3-D: volume)."""
         xp = namespace(self, values)
         total = self.spread(self.total(self.measure))  # zero where the image is held fixed
         weight = xp.where(self.label < 0, 0, self.measure / xp.where(self.label < 0, 1, total))
         return self.total(values * xp.expand_dims(weight, tuple(range(1, values.ndim))))
 
     def spread(self, values: Float[Array, "p *k"]) -> Float[Array, "m *k"]:
-        """Regions' values at the cells, zero where the image is held fixed."""
+        """Value of its region for each cell; zero where the image is held fixed."""
         xp = namespace(self, values)
         fixed = xp.expand_dims(self.label < 0, tuple(range(1, values.ndim)))
         return xp.where(fixed, 0, values[xp.maximum(self.label, 0)])
 
 
 def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
-    """Labels for `Regions`: the pixels of a grid (rows, columns) over the mesh that hold the centre of any cell.
+    """Labels for `Regions` that group cells into the pixels of a grid over the mesh; empty pixels are not numbered.
+
+    `shape`: numbers of rows and columns of the grid.
 
     Raises `ValueError` for a shape that is not two whole numbers from 1.
     """
@@ -257,7 +266,7 @@ def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
 
 
 class RegionBasis(AbstractBasis):
-    """One value for each region: S c is `deviation` (p,) times c, at all cells of the region."""
+    """Basis with one coefficient per region; all cells of a region have its `deviation` (p,) times its coefficient."""
 
     regions: Regions
     deviation: Float[Array, " p"]
@@ -272,17 +281,17 @@ class RegionBasis(AbstractBasis):
         return self.regions.spread(self.deviation * coefficients)
 
     def restrict(self, rows):
-        """Columns added up over every region."""
+        """Columns summed over each region and multiplied by its deviation."""
         return self.regions.total(rows.T).T * self.deviation
 
     def variance(self):
-        """Squares of the regions' deviations."""
+        """Squared deviation of its region, for every cell."""
         return self.regions.spread(self.deviation**2)
 
     def scaled(self, factor):
-        """Deviations times a number."""
+        """Basis with the deviations multiplied by a number."""
         return RegionBasis(self.regions, self.deviation * factor)
 
     def pooled(self, regions):
-        """Not available twice. Raises `ValueError`."""
+        """Not available, because the basis has regions already. Raises `ValueError`."""
         raise ValueError("This basis has regions already.")

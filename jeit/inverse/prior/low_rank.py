@@ -1,15 +1,13 @@
-"""Low-rank factors of the covariance of many cells, computed on grids where bodies are large.
+"""Approximations of the covariance of many cells: low-rank factors, and products by way of a regular grid.
 
-Covariances of low rank: Γ ≈ S Sᵀ with far fewer columns than cells, by a pivoted Cholesky factorisation.
+A pivoted Cholesky factorisation gives Γ ≈ S Sᵀ with far fewer columns than cells. Columns are added one by one, each at
+the largest diagonal entry of Γ - S Sᵀ, until the trace of Γ - S Sᵀ is below a given fraction of that of Γ. Harbrecht,
+Peters and Schneider, Appl. Numer. Math. 62 (2012) 428-440.
 
-One column after the other, where the diagonal of Γ - S Sᵀ is largest, until its sum is below a share of that of Γ.
-Harbrecht, Peters and Schneider, Appl. Numer. Math. 62 (2012) 428-440.
-
-A Gaussian covariance between many places without a matrix of pairs of them, by way of a regular grid.
-
-Γ = P G Pᵀ: G is the covariance on a grid of a third of the correlation length, which is a product of one along x, one
-along y and one along z and is applied axis by axis; P is cubic interpolation from four grid points along each axis,
-which is off by some thousandths at that spacing.
+A Gaussian covariance between many points is approximated by Γ = P G Pᵀ without a matrix over all pairs. G is the
+covariance on a grid with a spacing of a third of the correlation length; it is a product of covariances along x, y and
+z and is applied axis by axis. P is cubic interpolation from four grid points along each axis, with an error of some
+thousandths at that spacing.
 """
 
 from __future__ import annotations
@@ -22,8 +20,8 @@ import numpy as np
 import scipy.sparse
 from jaxtyping import Array, Float
 
-# Relative difference within which diagonal entries count as equal, as in symmetric meshes; the first is taken, so that
-# rounding does not decide.
+# Diagonal entries of at least this fraction of the largest count as equal to it, as in symmetric meshes. The first of
+# them is the pivot, so that rounding errors do not decide.
 _AS_LARGE = 1 - 1e-4
 
 
@@ -32,7 +30,7 @@ def pivoted_cholesky(
 ) -> np.ndarray:
     """S (m, n) with Γ ≈ S Sᵀ, for a covariance Γ given by its diagonal (m,) and a function that returns a column.
 
-    `tolerance`: the share of the diagonal's sum that may be left out.
+    `tolerance`: fraction of the trace of Γ that may be left out.
     """
     left = np.array(diagonal, float)
     enough = tolerance * left.sum()
@@ -49,10 +47,10 @@ def pivoted_cholesky(
 
 
 def traced_pivoted_cholesky(scaled: Float[Array, "m d"], *, tolerance: float, max_rank: int) -> Float[Array, "m k"]:
-    """The same of Γ = exp(-|x_i - x_j|²) for points `scaled` that are traced: k = min(m, max_rank) columns, those that
-    are not needed zero.
+    """`pivoted_cholesky` of Γ = exp(-|x_i - x_j|²) for traced points `scaled`. Returns k = min(m, max_rank) columns;
+    columns that are not needed are zero.
 
-    Its derivative is that of Γ[:, P] L⁻ᵀ, Γ[P, P] = L Lᵀ, for the pivots P as they are: exact but where they change.
+    The derivative is that of Γ[:, P] L⁻ᵀ with Γ[P, P] = L Lᵀ for fixed pivots P: exact except where the pivots change.
     """
     size = min(max_rank, len(scaled))
     pivots, rank = _pivots(jax.lax.stop_gradient(scaled), tolerance, size)
@@ -69,7 +67,7 @@ def _squared_distances(one, other):
 
 
 def _pivots(scaled, tolerance: float, size: int):
-    """Indices of the points that are pivots (size,), and the number of them that are needed."""
+    """Indices (size,) of the pivots, and how many of them are needed."""
     enough = tolerance * len(scaled)
 
     def go_on(state):
@@ -89,18 +87,19 @@ def _pivots(scaled, tolerance: float, size: int):
     return pivots, rank
 
 
-# Grid points per correlation length, and points of a cubic along an axis.
+# Grid points per correlation length; number of grid points along an axis from which the cubic interpolates.
 _PER_LENGTH, _CUBIC = 3, 4
-# Numbers of grid points, for every place and in all, beyond which a grid does not pay; all pairs of places cost far
-# more than that.
+# Limits within which a grid is worthwhile: maximum number of grid points per point, and in total.
 _EACH, _MOST = 8, 500_000
-# Columns at a time, for all on the grid at once would take more memory than the places do.
+# Number of columns processed at a time, which limits the memory of the grid.
 _COLUMNS = 64
 
 
 class GriddedGaussian:
-    """Γ_ij = exp(-|x_i - x_j|² / 2 length²) between `places` (m, d), metres; `length` in metres.
-    `variance` (m,): its diagonal, one but for what interpolation takes off."""
+    """Covariance Γ_ij = exp(-|x_i - x_j|² / 2 length²) between points `places` (m, d), approximated on a grid.
+
+    `places` and `length` in metres. `variance` (m,): diagonal of the approximation, one except for interpolation error.
+    """
 
     def __init__(self, places: Float[np.ndarray, "m d"], length: float):
         spacing = length / _PER_LENGTH
@@ -116,7 +115,7 @@ class GriddedGaussian:
 
     @staticmethod
     def suits(places: Float[np.ndarray, "m d"], length: float) -> bool:
-        """Whether the grid would be small beside the pairs of places."""
+        """Whether the grid has few enough points to be worthwhile."""
         extent = np.ptp(places, axis=0) / length * _PER_LENGTH + 5
         return bool(np.prod(extent) < min(_EACH * len(places), _MOST))
 
@@ -133,14 +132,14 @@ class GriddedGaussian:
 
 
 def _weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
-    """Weights of Lagrange's cubics through the two grid points on either side, along every axis."""
+    """Weights of cubic Lagrange interpolation from the two grid points on either side, along every axis."""
     t = place - np.floor(place) + 1
     nodes = np.arange(_CUBIC)
     return np.stack([np.prod([(t - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)
 
 
 def _cubic(place: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
-    """Weights (m, grid points) of Lagrange's cubics at places in units of the grid."""
+    """Sparse matrix (m, grid points) that interpolates from the grid to points `place`, in units of the spacing."""
     first, nodes, along = np.floor(place).astype(int) - 1, np.arange(_CUBIC), _weights(place)
     weight, index = np.ones((len(place), 1)), np.zeros((len(place), 1), int)
     for axis, count in enumerate(shape):

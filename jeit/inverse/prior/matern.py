@@ -1,13 +1,14 @@
-"""The Matérn prior, and priors by name.
+"""The Matérn prior, and the table of priors by name.
 
-(κ² - Δ) x = white noise has, in all of space, the Matérn correlation of smoothness ν = 2 - d / 2,
+In unbounded space, the solution of (κ² - Δ) x = white noise has the Matérn correlation of smoothness ν = 2 - d / 2,
 
-    d = 2:  κr K₁(κr),    d = 3:  exp(-κr),
+    d = 2:  κr K₁(κr),    d = 3:  exp(-κr).
 
-so that the covariance of the nodes is A⁻¹ M A⁻¹, with A = κ²M + K of mass M and stiffness K: sparse systems, where the
-covariance itself would be a matrix of all pairs of cells. Lindgren, Rue and Lindström, J. R. Stat. Soc. B 73 (2011)
-423-498. The wall reflects the field, which raises its variance there; a Robin condition, ∂x/∂n = -κx / 1.42, takes most
-of that off (Roininen, Huttunen and Lasanen, Inverse Probl. Imaging 8 (2014) 561-586), and what is left is divided out.
+The covariance of the nodal values is A⁻¹ M A⁻¹ with A = κ²M + K, mass matrix M and stiffness matrix K. Products with it
+take sparse solves; the covariance itself would be a dense matrix over all pairs of cells. Lindgren, Rue and Lindström,
+J. R. Stat. Soc. B 73 (2011) 423-498. The domain's wall reflects the field and raises its variance there. The Robin
+condition ∂x/∂n = -κx / 1.42 removes most of this (Roininen, Huttunen and Lasanen, Inverse Probl. Imaging 8 (2014)
+561-586), and the nodes are scaled to unit variance to remove the rest.
 """
 
 from __future__ import annotations
@@ -27,21 +28,22 @@ from jeit.mesh import Mesh, gradients, measures
 from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, host, on_host
 
-# Distance beyond the wall over which the field continues to fall, in units of 1/κ.
+# Length scale of the Robin condition at the wall, in units of 1/κ.
 _ROBIN = 1.42
-# Number of nodes up to which variances are computed exactly; beyond, they are estimated from this many fields.
+# Number of nodes up to which variances are computed exactly; number of random fields from which they are estimated on
+# larger meshes.
 _FEW, _FIELDS = 3000, 400
-# Fields at a time.
+# Number of fields processed at a time.
 _AT_ONCE = 50
 
 
 class Matern(AbstractPrior):
-    """Matérn smoothness: a random field of unit variance that a differential equation correlates over `length` metres.
+    """Matérn prior: a smooth random field of unit variance with correlation length `length`, in metres.
 
-    The correlation falls to 0.14 at twice the `length`, as that of `Gaussian(length)` does, but it falls from distance
-    zero on: its images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. Cells much larger
-    than the length do not resolve it. Takes memory and time in proportion to the nodes, about. Raises `ValueError` for
-    a length that is not positive.
+    The correlation falls to 0.14 at twice the `length`, as for `Gaussian(length)`, but decreases from distance zero on,
+    so images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. The cells must not be much
+    larger than the length. Memory and time are roughly proportional to the number of nodes. Raises `ValueError` if the
+    length is not positive.
     """
 
     length: float
@@ -51,7 +53,7 @@ class Matern(AbstractPrior):
             raise ValueError(f"length must be positive, in metres; it is {self.length}.")
 
     def covariance_product(self, mesh, jacobian):
-        """Γ Jᵀ, by two sparse solves."""
+        """Γ Jᵀ, computed by two sparse solves."""
         field = self._field(mesh, jacobian)
         columns: Any = np.asarray(on_host(jacobian)).T
         if np.iscomplexobj(columns):
@@ -66,11 +68,11 @@ class Matern(AbstractPrior):
         )
 
     def basis(self, mesh, jacobian):
-        """A shape for each node: the response of the cells to white noise at that node."""
+        """One shape for each node: the response of the cells to white noise at that node."""
         return DenseBasis(host.asarray(self._field(mesh, jacobian).shapes()))
 
     def informed_basis(self, mesh, jacobian):
-        """Informed shapes as of any prior, from one field."""
+        """Informed shapes (`informed_shapes`) of this prior."""
         field = self._field(mesh, jacobian)
         return informed_shapes(np.asarray(jacobian), field.product, field.variance())
 
@@ -83,8 +85,12 @@ class Matern(AbstractPrior):
 
 
 class _Field(NamedTuple):
-    """**Fields**: `means` of cells over their nodes (m, n); `solve`, with A; `mass` of the nodes (n,); `scale` (n,)
-    that makes their variances one; `fields` (n, k) whose products with each other are about its covariance."""
+    """Matérn field on the nodes of a mesh.
+
+    **Fields**: `means` (m, n): matrix that averages nodal values over each cell; `solve`: solves systems with A; `mass`
+    (n,): lumped mass of the nodes; `scale` (n,): factors that give every node unit variance; `fields` (n, k): F, where
+    F Fᵀ approximates the covariance of the nodes.
+    """
 
     means: scipy.sparse.csr_array
     solve: Solve
@@ -128,7 +134,8 @@ class _Field(NamedTuple):
 
 
 def _fields(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
-    """F with F Fᵀ = A⁻¹ M A⁻¹: of a large mesh about, and on its diagonal, from random fields of that covariance."""
+    """F with F Fᵀ = A⁻¹ M A⁻¹. For a large mesh the columns are random fields of that covariance, which approximate
+    the diagonal of F Fᵀ."""
     if len(mass) <= _FEW:
         return solve(np.diag(np.sqrt(mass)))
     noise = np.random.default_rng(0).standard_normal((len(mass), _FIELDS)) / np.sqrt(_FIELDS)
@@ -136,13 +143,13 @@ def _fields(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n
 
 
 PRIOR = Noser()
-"""Of `one_step` and `reconstruct`: needs no length, and serves where nothing is known of a body."""
+"""Default prior of `one_step` and `reconstruct`: it needs no length and suits bodies of which nothing is known."""
 MEASURED = "gaussian"
-"""Of images of measured data, in `PRIORS`; streams take it too."""
+"""Name in `PRIORS` of the default prior for measured data and streams."""
 
 
 def smooth_prior(size: float) -> Gaussian:
-    """The smooth prior that worked on measured tanks and skins, for a body of this size: its longer side, metres."""
+    """Smooth prior that worked on measured tanks and skins; `size`: longest side of the body, metres."""
     return Gaussian(0.085 * size)
 
 
@@ -158,4 +165,4 @@ PRIORS: dict[str, Callable[[float], AbstractPrior]] = {
     "gaussian": smooth_prior,
     "matern": _matern,
 }
-"""Quadratic priors by name, made for a body of a given size: its longer side, metres."""
+"""Quadratic priors by name: functions of the size of the body, its longest side in metres."""

@@ -1,4 +1,4 @@
-"""Matrices between the nodes of a mesh, solved by the direct solver, and images of cells as means over their nodes."""
+"""Sparse matrices over the nodes of a mesh, solved directly, and averages of nodal values over cells."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from jeit.mesh import Mesh
 from jeit_solvers import Factor, FactorisationPlan, SparsityPattern, analyse, factorise, on_cores, solve
 from jeit_solvers.engines import on_host
 
-# Columns solved for at a time: with more, fronts exceed the caches, and all at once take the memory of several images.
+# Number of columns solved for at a time: with more, the fronts exceed the caches and memory grows.
 _AT_ONCE = 32
 
 Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
-"""What solves a system for columns."""
+"""Function that solves a linear system for columns (n, k)."""
 
 
 class NodalSystem(NamedTuple):
-    """Places of the entries of a matrix between neighbouring nodes, and the plan of its factorisation.
+    """Structure of sparse matrices whose entries couple the nodes of a cell.
 
-    **Fields**: `mesh`, in NumPy; `pattern`; `plan`; `means` (m, n), of cells over their nodes.
+    **Fields**: `mesh`: mesh with NumPy arrays; `pattern`: sparsity pattern; `plan`: plan of the factorisation; `means`
+    (m, n): matrix that averages nodal values over each cell.
     """
 
     mesh: Mesh
@@ -34,7 +35,7 @@ class NodalSystem(NamedTuple):
 
     @classmethod
     def create(cls, mesh: Mesh) -> "NodalSystem":
-        """Create for a mesh that has values."""
+        """Create for a mesh whose arrays are not traced."""
         mesh = on_host(mesh)
         cells, count = np.asarray(mesh.cells), mesh.cells.shape[1]
         pattern = SparsityPattern.from_elements([cells], size=mesh.num_points)
@@ -48,14 +49,16 @@ class NodalSystem(NamedTuple):
     def assemble(
         self, elements: Float[np.ndarray, "..."], diagonal: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " e"]:
-        """Entries, in the pattern's order, of a matrix of the cells' `elements` (m, k, k) and a `diagonal` (n,)."""
+        """Assemble the element matrices `elements` (m, k, k) and add `diagonal` (n,); entries in the pattern's
+        order."""
         given: Any = elements
         values = np.array(self.pattern.assemble(given))
         values[: self.pattern.size] += diagonal
         return values
 
     def inverse(self, values: Any) -> Solve:
-        """Function that solves A X = B for columns (n, k), A having these entries, in the pattern's order."""
+        """Factorise the matrix A whose entries in the pattern's order are `values`; return a function that solves
+        A X = B for columns B (n, k)."""
         factor = factorise(self.plan, values)
         return lambda columns: in_columns(solve, self.plan, factor, columns)
 
@@ -63,15 +66,15 @@ class NodalSystem(NamedTuple):
 def in_columns(
     how: Callable[[FactorisationPlan, Factor, Any], Any], plan: FactorisationPlan, factor: Factor, columns: Any
 ) -> Any:
-    """`solve` or `half_solve` of columns (n, k); of NumPy's some at a time, on every core."""
+    """Apply `how`, which is `solve` or `half_solve`, to columns (n, k). NumPy arrays are split over all cores."""
     if not isinstance(columns, np.ndarray):
         return how(plan, factor, columns)
     return by_columns(functools.partial(how, plan, factor), columns, plan.size if how is solve else plan.num_pivots)
 
 
 def by_columns(function: Callable[[Any], Any], columns: Any, rows: int) -> Any:
-    """Apply `function` to columns (n, k) of a NumPy array, some at a time on every core; returns (rows, k). `function`
-    may itself call `by_columns` with as many columns as it is given."""
+    """Apply `function` to blocks of the columns of a NumPy array (n, k), in parallel on all cores; returns (rows, k).
+    `function` may itself call `by_columns` with all columns it is given."""
     number = columns.shape[1]
     found = np.empty((rows, number), columns.dtype)
 

@@ -1,7 +1,7 @@
-"""Penalties of coefficients, which nonlinear images minimise together with the misfit, and their normal distributions.
+"""Penalties of coefficients, minimised together with the data misfit, and the normal distributions they correspond to.
 
-A penalty that is, or from above touches, ½ cᵀQc up to what is linear in c stands for a normal distribution of precision
-Q. Its covariance Q⁻¹ is never there as a matrix.
+A penalty ½ cᵀQc, up to terms linear in c, corresponds to a normal distribution of precision Q. A penalty that is not
+quadratic is replaced by the quadratic that touches it from above. The covariance Q⁻¹ is never formed as a matrix.
 """
 
 from __future__ import annotations
@@ -29,49 +29,50 @@ from jeit_solvers import (
 )
 from jeit_solvers.engines import host, namespace
 
-# Added to a precision with a null space, relative to its largest entry, where an inverse need not be exact.
+# Multiple of the identity, relative to the largest entry, added to a precision that has a null space before it is
+# inverted approximately.
 _LITTLE = 1e-6
 
 
 class AbstractPenalty(eqx.Module):
-    """Base of all penalties of coefficients c, those of further unknowns last."""
+    """Base of all penalties of coefficients c; those of further unknowns come last."""
 
     @property
     def is_standard_normal(self) -> bool:
-        """Whether the coefficients are independent and of unit variance, ½‖c‖²: then the objective is a sum of squares,
-        and the posterior is nearly Gaussian."""
+        """Whether the penalty is ½‖c‖², so that the coefficients are independent with unit variance, the objective is a
+        sum of squares and the posterior is nearly Gaussian."""
         return False
 
     @property
     def tolerance(self) -> float:
-        """Relative change of the objective that ends a descent, unless another is given."""
+        """Default tolerance: relative change of the objective that ends a descent."""
         return 1e-6
 
     @abc.abstractmethod
     def cost(self, coefficients: Float[Array, " n"]) -> Float[Array, ""]:
-        """The penalty, dimensionless."""
+        """Value of the penalty at c, dimensionless."""
 
     @abc.abstractmethod
     def diagonal(self, coefficients: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Diagonal of the penalty's quadratic form at c, which scales a gradient method."""
+        """Diagonal of the penalty's quadratic form at c, used to scale gradient methods."""
 
     @abc.abstractmethod
     def inverse_hessian(self, coefficients: Float[Array, " n"], free, columns: Float[Array, "n k"]) -> Array:
-        """Approximate inverse of the penalty's Hessian at c, of the coefficients that are `free` (n,), times columns
-        that are zero for the others. It preconditions the derivatives of a minimum, and need not be exact."""
+        """Approximate inverse of the penalty's Hessian at c, restricted to the coefficients marked in `free` (n,),
+        times columns that are zero elsewhere. It preconditions the computation of a minimum's derivatives."""
 
     def normal(self, coefficients: Float[Array, " n"]) -> AbstractNormal | None:
-        """The normal distribution that the penalty stands for near c; None where the posterior is not nearly
-        Gaussian."""
+        """Normal distribution that corresponds to the penalty near c; None if the posterior is not nearly Gaussian."""
         return None
 
     @abc.abstractmethod
     def model(self, residual, jacobian, coefficients, data: Data) -> QuadraticModel:
-        """The whole cost at c and its `step`, for `jeit_solvers.Descent`."""
+        """Objective at c (data misfit plus penalty) and the function that computes a step, for
+        `jeit_solvers.Descent`."""
 
 
 class Ridge(AbstractPenalty):
-    """½ ‖c‖²: coefficients of unit variance."""
+    """Ridge penalty ½ ‖c‖², for independent coefficients of unit variance."""
 
     @property
     def is_standard_normal(self) -> bool:
@@ -91,16 +92,17 @@ class Ridge(AbstractPenalty):
         return columns
 
     def normal(self, coefficients):
-        """The standard one."""
+        """Standard normal distribution."""
         return StandardNormal()
 
     def model(self, residual, jacobian, coefficients, data):
-        """Gauss-Newton's, in the space of data or of coefficients."""
+        """Quadratic model of the objective for a Gauss-Newton step, in data space or coefficient space."""
         return ridge_model(residual, jacobian, coefficients, data.covariance, data.precision)
 
 
 class QuadraticForm(AbstractPenalty):
-    """½ cᵀQc with a sparse precision Q: entries `value` (k,) at (`row`, `column`); a unit ridge on further unknowns."""
+    """Penalty ½ cᵀQc with sparse precision Q, whose entries at (`row`, `column`) are `value` (k,); further unknowns
+    have a unit ridge penalty."""
 
     row: Int[Array, " k"]
     column: Int[Array, " k"]
@@ -110,7 +112,7 @@ class QuadraticForm(AbstractPenalty):
 
     @classmethod
     def create(cls, row, column, value, hyperparameter, size: int) -> "QuadraticForm":
-        """λ² times a matrix of these entries."""
+        """Create with Q = λ² times the matrix with these entries, for λ = `hyperparameter`."""
         is_diagonal = len(row) == size and np.array_equal(row, column)
         return cls(row, column, hyperparameter**2 * value, size, bool(is_diagonal))
 
@@ -125,7 +127,7 @@ class QuadraticForm(AbstractPenalty):
         return jnp.concatenate([own, jnp.ones(coefficients.size - self.size)])
 
     def inverse_hessian(self, coefficients, free, columns):
-        """(Q + a little)⁻¹, dense unless Q is diagonal."""
+        """Inverse of Q plus a small multiple of the identity; a dense matrix unless Q is diagonal."""
         image, rest = columns[: self.size], columns[self.size :]
         if self.is_diagonal:
             return jnp.concatenate([image / self.value[:, None], rest])
@@ -143,7 +145,7 @@ class QuadraticForm(AbstractPenalty):
 
 
 class AbstractNormal(eqx.Module):
-    """Base of normal distributions of coefficients c (n,), those of further unknowns last."""
+    """Base of normal distributions of coefficients c (n,); those of further unknowns come last."""
 
     @abc.abstractmethod
     def covariance_product(self, columns: Float[Array, "n k"]) -> Float[Array, "n k"]:
@@ -151,26 +153,26 @@ class AbstractNormal(eqx.Module):
 
     @abc.abstractmethod
     def variance(self, basis: AbstractBasis) -> Float[Array, " m"]:
-        """Variance of the image's cells: the diagonal of S Q⁻¹ Sᵀ, and the variance that the shapes leave out."""
+        """Variance of the image in every cell: the diagonal of S Q⁻¹ Sᵀ plus the variance left out by the shapes."""
 
     @abc.abstractmethod
     def num_draws(self, num_coefficients: int) -> int:
-        """Number of independent standard normal numbers that make a sample of n coefficients."""
+        """Number of independent standard normal numbers needed to draw a sample of n coefficients."""
 
     @abc.abstractmethod
     def drawn(self, numbers: Float[Array, "d k"]) -> Float[Array, "n k"]:
-        """Samples, less their mean, made of `num_draws` standard normal numbers each."""
+        """Samples (n, k) of mean zero, computed from standard normal `numbers` with d = `num_draws`."""
 
 
 class StandardNormal(AbstractNormal):
-    """Independent coefficients of unit variance, Q = 1."""
+    """Standard normal distribution, Q = I."""
 
     def covariance_product(self, columns):
         """The columns themselves."""
         return columns
 
     def variance(self, basis):
-        """The basis'."""
+        """Prior variance of the basis."""
         return basis.variance()
 
     def num_draws(self, num_coefficients):
@@ -183,7 +185,8 @@ class StandardNormal(AbstractNormal):
 
 
 class SparseNormal(AbstractNormal):
-    """A sparse Q, factorised, of the first coefficients, those of cells or nodes; the rest are standard normal."""
+    """Normal distribution with a sparse, factorised precision Q for the coefficients of cells or nodes, which come
+    first; further unknowns are standard normal."""
 
     pattern: SparsityPattern
     plan: FactorisationPlan
@@ -196,8 +199,7 @@ class SparseNormal(AbstractNormal):
         return namespace(columns, solved).concatenate([solved, columns[size:]])
 
     def variance(self, basis):
-        """Variance from the entries of Q⁻¹ between neighbours, which suffice for cells, and for means over their
-        nodes."""
+        """Variance of the cells, from those entries of Q⁻¹ that lie in the sparsity pattern of Q."""
         entries = inverse_entries(self.plan, self.factor)
         if isinstance(basis, DiagonalBasis):
             return basis.deviation**2 * entries[: self.plan.size]
@@ -206,11 +208,11 @@ class SparseNormal(AbstractNormal):
         return host.where(row == column, 1.0, 2.0) @ between / basis.cells.shape[1] ** 2
 
     def num_draws(self, num_coefficients):
-        """Number of draws: one for each pivot of the factor, padding included, and for each of the rest."""
+        """Number of draws: one for each pivot of the factor, padding included, and one for each further unknown."""
         return num_coefficients - self.plan.size + self.plan.num_pivots
 
     def drawn(self, numbers):
-        """Samples by half a solve."""
+        """Samples, computed with one triangular factor of Q."""
         number = self.plan.num_pivots
         image = inverse_root(self.plan, self.factor, numbers[:number])
         return namespace(numbers, image).concatenate([image, numbers[number:]])

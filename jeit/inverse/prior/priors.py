@@ -1,8 +1,8 @@
-"""Priors of conductivity: quadratic energies xᵀQx of an image, with precision Q.
+"""Priors of conductivity: quadratic energies xᵀQx of an image x, with precision matrix Q.
 
-A linear image minimises ‖W^½ (J x - v)‖² + λ² xᵀQx. With M measurements and m ≫ M cells it is found in data space,
-from products of the prior covariance Γ = Q⁻¹ with Jᵀ alone; where Q has a null space (Laplace: the constant), Γ is
-any generalised inverse and the null space is estimated from the data without penalty.
+A linear image minimises ‖W^½ (J x - v)‖² + λ² xᵀQx. With M measurements and m ≫ M cells it is computed in data space,
+which takes only products of the prior covariance Γ = Q⁻¹ with Jᵀ. If Q has a null space (Laplace: constant images), Γ
+is any generalised inverse and the null space is estimated from the data without penalty.
 """
 
 from __future__ import annotations
@@ -46,37 +46,38 @@ _WANTED = "an object of jeit.inverse: Noser(), Gaussian(length in metres), Lapla
 
 
 def check_prior(prior: Any) -> None:
-    """Raise `ValueError` for what is no prior: names of priors are the command line's and `ImagingSettings`' only."""
+    """Raise `ValueError` unless `prior` is a prior object. Names of priors are accepted only by the command line and
+    `ImagingSettings`."""
     check_kind("prior", prior, AbstractPrior, _WANTED)
 
 
-# Rows of a dense covariance at a time.
+# Number of rows of a dense covariance computed at a time.
 _BLOCK = 512
-# Share of a Gaussian prior's variance that its shapes may leave out, and their greatest number.
+# Fraction of a Gaussian prior's variance that its shapes may leave out; maximum number of shapes.
 _LEFT_OUT, _MOST_SHAPES = 1e-3, 2000
-# Number of cells beyond which images are made only of the shapes that the data resolve, and neighbours are those of
-# nodes; variance of a shape, relative to the largest, below which the data do not resolve it.
+# Number of cells above which images consist only of shapes that the data resolve, and the Laplace prior couples nodes
+# in place of cells; squared signal of a shape, relative to the largest, below which the data do not resolve it.
 _MANY, _NOTHING = 30_000, 1e-12
-# Precision given to the constant image where it would have none, relative to a step between neighbouring cells.
+# Term added to the diagonal of a precision matrix that has constant images in its null space.
 _FREEDOM = 1e-6
 
 
 class AbstractPrior(eqx.Module):
     """Base of all priors on an image of one value per cell.
 
-    A new quadratic prior is a class with `covariance_product`, `precision` and `basis`; one whose energy is not xᵀQx
-    overrides `penalty`, and raises `ValueError` in the methods that do not apply. Both parts of a complex image have
-    the same prior; a complex Jacobian is given conjugated.
+    A new quadratic prior is a subclass with `covariance_product`, `precision` and `basis`. A prior whose energy is not
+    xᵀQx overrides `penalty` and raises `ValueError` in the methods that do not apply. Real and imaginary part of a
+    complex image have the same prior; methods take the complex conjugate of a complex Jacobian.
     """
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether the energy is xᵀQx, of a Gaussian, as linear images, rules for λ and memories require."""
+        """Whether the energy is xᵀQx, as linear images, rules for λ and an `Imager` with memory require."""
         return True
 
     @property
     def default_hyperparameter(self) -> float | str:
-        """λ for `reconstruct` unless given, or the rule that chooses it."""
+        """Default λ of `reconstruct`, or the name of the rule that chooses it."""
         return RULE
 
     def penalty(
@@ -89,12 +90,13 @@ class AbstractPrior(eqx.Module):
         regions: Regions | None = None,
         per_cell: bool = False,
     ) -> tuple[AbstractBasis, AbstractPenalty]:
-        """The shapes S of which an image x = `reference` + S c is made, and what c costs, weighted with λ.
+        """Basis S of an image x = `reference` + S c, and the penalty of its coefficients c, weighted with λ.
 
-        `jacobian`: of the whitened data, on the link's scale. `regions`: cells that share a value. `per_cell`: every
-        coefficient is a cell's value, as bounds need it. Raises `ValueError` for what does not go together.
+        `jacobian`: Jacobian of the whitened data with respect to the link's variable. `regions`: cells that share a
+        value. `per_cell`: whether every coefficient must be the value of a cell, as bounds require. Raises `ValueError`
+        for arguments that do not fit together.
         """
-        assert jacobian is not None  # a quadratic prior may look at it
+        assert jacobian is not None  # a quadratic prior may depend on it
         if not per_cell:
             many = mesh.num_cells > _MANY and has_values(mesh, jacobian, self)
             basis = (self.informed_basis if many else self.basis)(mesh, jacobian).scaled(1 / hyperparameter)
@@ -106,48 +108,49 @@ class AbstractPrior(eqx.Module):
 
     @abc.abstractmethod
     def covariance_product(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> Float[Array, "m M"]:
-        """Γ Jᵀ, one column per measurement."""
+        """Product Γ Jᵀ of the prior covariance with the transposed Jacobian, one column per measurement."""
 
     @abc.abstractmethod
     def precision(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> scipy.sparse.sparray:
-        """Q (m, m), sparse."""
+        """Precision matrix Q (m, m), sparse."""
 
     def entries(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> tuple[Any, Any, Any]:
-        """The entries of Q that are not zero: their rows, columns and values, (k,) each."""
+        """Rows, columns and values of the nonzero entries of Q, (k,) each."""
         found = scipy.sparse.coo_array(self.precision(mesh, jacobian))
         return found.row, found.col, found.data
 
     @abc.abstractmethod
     def basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
-        """S with Γ = S Sᵀ, for nonlinear reconstructions; where Q has a null space, a wide prior stands for none."""
+        """Basis S with Γ = S Sᵀ, for nonlinear reconstruction. If Q has a null space, images in it have a large but
+        finite variance."""
 
     def informed_basis(self, mesh: Mesh, jacobian: Float[Array, "M m"]) -> AbstractBasis:
-        """A smaller basis in place of S where there are many cells: see `informed_shapes`."""
+        """Smaller basis that replaces S on meshes of many cells; see `informed_shapes`."""
         return self.basis(mesh, jacobian)
 
     def null_space(self, mesh: Mesh) -> Float[Array, "m p"]:
-        """Basis of the images of zero energy; none unless a prior defines one."""
+        """Basis (m, p) of the images of zero energy; empty by default."""
         return host.zeros((mesh.num_cells, 0))
 
 
 class Tikhonov(AbstractPrior):
-    """Zeroth-order Tikhonov: Q = I. Every cell on its own, pulled to the background."""
+    """Zeroth-order Tikhonov prior, Q = I: cells are independent, and deviations from the background are penalised."""
 
     def covariance_product(self, mesh, jacobian):
         """Jᵀ."""
         return jacobian.T
 
     def precision(self, mesh, jacobian) -> scipy.sparse.sparray:
-        """The identity."""
+        """Identity matrix."""
         return scipy.sparse.csr_array(scipy.sparse.eye_array(mesh.num_cells))
 
     def basis(self, mesh, jacobian):
-        """Every cell on its own."""
+        """Diagonal basis with one coefficient per cell."""
         return DiagonalBasis(host.ones(mesh.num_cells))
 
 
 class Noser(AbstractPrior):
-    """NOSER: Q = diag(JᵀJ)^exponent, which evens out the sensitivity between the edge and the centre.
+    """NOSER prior, Q = diag(JᵀJ)^exponent, which balances the sensitivity between the edge and the centre.
 
     Cheney, Isaacson, Newell, Simske and Goble, Int. J. Imaging Syst. Technol. 2 (1990) 66-75. `exponent`: 0.5 by
     default; 1 penalises relative to full sensitivity, 0 is `Tikhonov`.
@@ -156,7 +159,7 @@ class Noser(AbstractPrior):
     exponent: float = 0.5
 
     def covariance_product(self, mesh, jacobian):
-        """Jᵀ, its rows divided by the diagonal of Q."""
+        """Jᵀ with its rows divided by the diagonal of Q."""
         return jacobian.T / (abs(jacobian) ** 2).sum(axis=0)[:, None] ** self.exponent
 
     def precision(self, mesh, jacobian):
@@ -164,25 +167,26 @@ class Noser(AbstractPrior):
         return scipy.sparse.diags_array(np.asarray(self.entries(mesh, jacobian)[2])).tocsr()
 
     def entries(self, mesh, jacobian):
-        """The diagonal, which follows the Jacobian into a derivative."""
+        """Entries on the diagonal of Q, differentiable with respect to the Jacobian."""
         cells = host.arange(mesh.num_cells)
         return cells, cells, (abs(jacobian) ** 2).sum(axis=0) ** self.exponent
 
     def basis(self, mesh, jacobian):
-        """Every cell on its own."""
+        """Diagonal basis with one coefficient per cell."""
         return DiagonalBasis((abs(jacobian) ** 2).sum(axis=0) ** (-self.exponent / 2))
 
 
 class Laplace(AbstractPrior):
-    """Laplace smoothness: Q = 2 × graph Laplacian of face-neighbouring cells, xᵀQx = 2 Σ (x_i - x_j)².
+    """Laplace prior, a smoothness prior: xᵀQx = 2 Σ (x_i - x_j)² over cells that share a facet, so Q is twice the graph
+    Laplacian.
 
-    Unweighted by geometry, as is usual in EIT; a constant image costs nothing. Of a solid body of more than 30,000
-    cells, whose graph has no factor of a size to keep, neighbours are nodes that share an edge, and a cell has their
-    mean.
+    Differences are not weighted by geometry, as is usual in EIT, and a constant image has no penalty. In a solid body
+    of more than 30,000 cells, where the factor of Q would be too large, differences are taken between nodes that share
+    an edge, and a cell has the mean of its nodes.
     """
 
     def covariance_product(self, mesh, jacobian):
-        """Γ Jᵀ with the generalised inverse that grounds cell 0, or node 0."""
+        """Γ Jᵀ, where Γ is the generalised inverse of Q with cell 0, or node 0, grounded."""
         check_cells(mesh)
         if mesh.dimension == 3 and mesh.num_cells > _MANY and has_values(mesh, jacobian):
             return host.asarray(_between_nodes(mesh, np.asarray(jacobian).T, 0.0))
@@ -196,7 +200,7 @@ class Laplace(AbstractPrior):
         return solve(plan, factor, columns.real) + 1j * solve(plan, factor, columns.imag)
 
     def precision(self, mesh, jacobian):
-        """The Laplacian matrix Q."""
+        """Precision matrix Q, twice the graph Laplacian."""
         check_cells(mesh)
         pairs, _ = interior_facets(mesh)
         size = mesh.num_cells
@@ -205,28 +209,29 @@ class Laplace(AbstractPrior):
         return 2 * (scipy.sparse.diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency).tocsr()
 
     def basis(self, mesh, jacobian):
-        """A root of Q's inverse, dense, with the constant image nearly free."""
+        """Dense basis from a Cholesky factor of Q, with a very small penalty on constant images."""
         precision = self.precision(mesh, jacobian).toarray()
         precision[np.diag_indices_from(precision)] += _FREEDOM
         lower = scipy.linalg.cholesky(precision, lower=True)
         return DenseBasis(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
 
     def informed_basis(self, mesh, jacobian):
-        """Informed shapes as of any prior, with the constant image nearly free."""
+        """Informed shapes (`informed_shapes`) in a solid, with a very small penalty on constant images; in a sheet,
+        `basis`."""
         if mesh.dimension != 3:
             return self.basis(mesh, jacobian)
         free = partial(_between_nodes, mesh, freedom=_FREEDOM)
         return informed_shapes(np.asarray(jacobian), free, None)
 
     def null_space(self, mesh):
-        """The constant image."""
+        """Constant image (m, 1)."""
         return host.ones((mesh.num_cells, 1))
 
 
 class Gaussian(AbstractPrior):
-    """Gaussian smoothness: a random field with covariance Γ = exp(-|x_i - x_j|² / 2 length²) between cell centres.
+    """Gaussian prior: a smooth random field with covariance Γ_ij = exp(-|x_i - x_j|² / 2 length²) between cell centres.
 
-    Does not depend on the mesh. `length`: correlation length in metres. Raises `ValueError` for a length that is not
+    It does not depend on the mesh. `length`: correlation length in metres. Raises `ValueError` if the length is not
     positive.
     """
 
@@ -237,7 +242,7 @@ class Gaussian(AbstractPrior):
             raise ValueError(f"length must be positive, in metres; it is {self.length}.")
 
     def covariance_product(self, mesh, jacobian):
-        """Γ Jᵀ, a block of rows at a time, for Γ is dense and is not kept; of many cells by way of a grid."""
+        """Γ Jᵀ, computed in blocks of rows so that the dense Γ is never stored; on a grid if there are many cells."""
         scaled = centroids(mesh) / (np.sqrt(2) * self.length)
         if not has_values(scaled, jacobian):
             return _traced_product(jnp.asarray(scaled), jnp.asarray(jacobian))
@@ -248,9 +253,9 @@ class Gaussian(AbstractPrior):
         return host.concatenate([np.exp(-cdist(row, scaled, "sqeuclidean")) @ np.asarray(jacobian).T for row in rows])
 
     def basis(self, mesh, jacobian):
-        """The shapes that hold all but a thousandth of the variance: fewer than cells where `length` spans many.
+        """Shapes that represent all but a thousandth of the variance: fewer than cells if `length` spans many cells.
 
-        Where the length or the mesh's points are traced, as many as cells, the others zero: the image is the same.
+        If the length or the mesh's points are traced, the basis is padded with zero shapes; the image is the same.
         """
         centres = centroids(mesh)
         if not has_values(centres, self.length):
@@ -265,7 +270,7 @@ class Gaussian(AbstractPrior):
         return DenseBasis(host.asarray(pivoted_cholesky(ones, column, tolerance=_LEFT_OUT, max_rank=_MOST_SHAPES)))
 
     def informed_basis(self, mesh, jacobian):
-        """Informed shapes as of any prior, computed on a grid, or where that would be too large, from all shapes."""
+        """Informed shapes (`informed_shapes`), computed on a grid; `basis` if the grid would be too large."""
         places = np.asarray(centroids(mesh))
         if not GriddedGaussian.suits(places, float(self.length)):
             return self.basis(mesh, jacobian)
@@ -285,8 +290,11 @@ def informed_shapes(
     covariance: Callable[[Float[np.ndarray, "m M"]], Any],
     variance: Float[np.ndarray, " m"] | None,
 ) -> DenseBasis:
-    """ΓJᵀ(JΓJᵀ)^-½, no more shapes than data, from a function that multiplies with Γ; `variance`: its diagonal, where
-    that is known. In single precision, which alters an image by a millionth."""
+    """Basis of the shapes that data resolve, ΓJᵀ(JΓJᵀ)^-½, which are no more than the data.
+
+    `covariance`: function that multiplies with Γ; `variance`: diagonal of Γ, if known. Shapes are in single precision,
+    which changes an image by a relative 1e-6.
+    """
     product = np.asarray(covariance(jacobian.T))
     inner = jacobian @ product
     size, vectors = np.linalg.eigh((inner + inner.T) / 2)
@@ -299,8 +307,8 @@ def informed_shapes(
 
 
 def _between_nodes(mesh: Mesh, columns: Float[np.ndarray, "m k"], freedom: float) -> Float[np.ndarray, "m k"]:
-    """Γ times columns for twice the graph Laplacian of nodes that share an edge, node 0 grounded, or with a little
-    `freedom` for all."""
+    """Γ times columns, where Γ is the inverse of twice the graph Laplacian of nodes that share an edge, averaged over
+    cells. `freedom` is added to the diagonal; if it is 0, node 0 is grounded."""
     system = NodalSystem.create(mesh)
     neighbours = system.pattern.to_scipy(np.ones(system.pattern.num_entries))
     diagonal = 2 * (np.asarray(neighbours.sum(axis=1)).ravel() - 1) + freedom
@@ -314,7 +322,7 @@ def _between_nodes(mesh: Mesh, columns: Float[np.ndarray, "m k"], freedom: float
 
 @jax.jit
 def _traced_product(scaled, jacobian):
-    """Γ Jᵀ from cell centres over √2 length, in blocks of rows that a derivative works out anew."""
+    """Γ Jᵀ from cell centres divided by √2 length, in blocks of rows, which derivatives recompute to save memory."""
 
     @jax.checkpoint
     def rows(block):
@@ -326,14 +334,14 @@ def _traced_product(scaled, jacobian):
 
 
 def check_cells(mesh: Mesh) -> None:
-    """Raise `ValueError` for a mesh whose cells are traced: which are neighbours has to be known."""
+    """Raise `ValueError` if the mesh's cells are traced, because the prior must know which cells are neighbours."""
     instead = "close over the mesh, and put into it what varies: eqx.tree_at(lambda m: m.points, mesh, points)"
     check_has_values("mesh: its cells", mesh.cells, "the prior's neighbours are found from", instead)
 
 
 def cell_factorisation(mesh: Mesh, groups) -> tuple[SparsityPattern, FactorisationPlan]:
-    """Pattern and factorisation plan of matrices between cells that are made of entries between `groups` of them. Works
-    where the mesh's points are traced, too."""
+    """Sparsity pattern and factorisation plan of matrices over cells whose entries couple the cells of each of
+    `groups`. The mesh's points may be traced."""
     centres = centroids(mesh)
     with jax.ensure_compile_time_eval():
         pattern = SparsityPattern.from_elements(groups, size=mesh.num_cells)

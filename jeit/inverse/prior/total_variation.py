@@ -1,18 +1,16 @@
-"""Total variation of conductivities of cells and of nodes.
+"""Total variation prior, for images that are piecewise constant: the penalty of an edge grows with its length and
+height, not with its sharpness.
 
-Total variation of solid bodies: of images that are linear between nodes, a fifth as many as there are cells.
+In a sheet, and in a solid with bounds, the image has one value per cell. The energy is λ Σ_f l_f √(d_f² + β²) over the
+facets between cells, where d_f is the jump of the image across facet f and l_f is the facet's length divided by the
+size of the body (3-D: its area divided by the squared size). It is not quadratic. Lagged diffusivity replaces it at
+every iterate by the quadratic form ½ dᵀ diag(λ l_f / √(d_f² + β²)) d, which touches it there and lies above it
+elsewhere. A step is then as cheap as with a smooth prior and lowers the energy itself. Vogel and Oman, SIAM J. Sci.
+Comput. 17 (1996) 227-238; for EIT, Borsic, Graham, Adler and Lionheart, IEEE Trans. Med. Imaging 29 (2010) 44-54.
 
-The energy λ ∫ √(|∇x|² + (β/h)²) dV, h the cell's size and lengths in units of the body's, is what
-`jeit.inverse.prior.total_variation` sums over facets, and is lowered like it, by lagged diffusivity; but the quadratic
-form that touches it is a stiffness matrix of the nodes.
-
-Total variation: images of few pieces, whose edges cost by their length and height, not by their sharpness.
-
-The energy λ Σ_f l_f √(d_f² + β²) over the facets between cells, l_f the facet's measure relative to the body's and d_f
-the jump of the image across it, is not quadratic. Lagged diffusivity replaces it at every image by the quadratic form
-that touches it there and lies above it everywhere else, ½ dᵀ diag(λ l_f / √(d_f² + β²)) d, so each step is as cheap as
-a smooth prior's, and lowers the true cost. Vogel and Oman, SIAM J. Sci. Comput. 17 (1996) 227-238; for EIT, Borsic,
-Graham, Adler and Lionheart, IEEE Trans. Med. Imaging 29 (2010) 44-54.
+In a solid without bounds the image is linear between nodes, which are about a fifth as many as the cells. The energy is
+λ/s² ∫ √(|∇x|² + (β/h)²) dV with the cell size h and the size s of the body. The quadratic form of lagged diffusivity is
+then a stiffness matrix of the nodes.
 """
 
 from __future__ import annotations
@@ -45,11 +43,12 @@ from jeit_solvers.engines import gather, has_values, host, namespace, on_host, s
 
 
 class NodalTotalVariation(AbstractPenalty):
-    """Σ weight √(|∇x|² + level²) + ½ Σ pull c², x being reference + c; with a unit ridge on further unknowns.
+    """Penalty Σ weight √(|∇x|² + steepness²) + ½ Σ pull c² of the nodal image x = reference + c; further unknowns have
+    a unit ridge penalty.
 
-    **Fields**: `cells` (m, 4); `slope` (m, 4, 3), gradients of the basis functions, 1/m; `weight` (m,); `steepness`
-    (m,), below which a slope costs by its square, 1/m; `pull` (n,) to the background; `reference` (n,); `pattern` and
-    `plan` of matrices between nodes.
+    **Fields**: `cells` (m, 4); `slope` (m, 4, 3): gradients of the basis functions, 1/m; `weight` (m,); `steepness`
+    (m,): gradient below which the penalty is nearly quadratic, 1/m; `pull` (n,): weight of the deviation from the
+    background; `reference` (n,); `pattern`, `plan`: sparsity pattern and factorisation plan of matrices over the nodes.
     """
 
     cells: Int[Array, "m k"]
@@ -65,8 +64,8 @@ class NodalTotalVariation(AbstractPenalty):
     def create(
         cls, mesh: Mesh, reference: Float[Array, " m"], hyperparameter, smoothing, pull: float
     ) -> tuple[NodalBasis, "NodalTotalVariation"]:
-        """The basis of an image and its energy, for a mesh and a `reference` per cell; `pull` relative to an edge's
-        price."""
+        """Create the nodal basis and the penalty for a mesh and a `reference` per cell; `pull` is relative to the
+        hyperparameter."""
         mesh = on_host(mesh)
         cells, size = np.asarray(mesh.cells), mesh.num_points
         pattern = SparsityPattern.from_elements([cells], size=size)
@@ -90,24 +89,25 @@ class NodalTotalVariation(AbstractPenalty):
 
     @property
     def tolerance(self) -> float:
-        """Relative change of the objective that ends a descent: lagged diffusivity converges linearly, and its last
-        steps change nothing visible."""
+        """Relative change of the objective that ends a descent. It is larger than for other penalties, because lagged
+        diffusivity converges linearly and its last steps do not change the image visibly."""
         return 1e-4
 
     def cost(self, coefficients):
-        """The energy."""
+        """Value of the penalty."""
         image, rest = self._parts(coefficients)
         edges = (self.weight * self._height(image)).sum()
         return edges + 0.5 * (self.pull * image**2).sum() + 0.5 * rest @ rest
 
     def diagonal(self, coefficients):
-        """Diagonal of the form that touches the energy at c."""
+        """Diagonal of the quadratic form that touches the energy at c."""
         image, rest = self._parts(coefficients)
         own = (self.slope**2).sum(axis=-1) * (self.weight / self._height(image))[:, None]
         return jnp.concatenate([self.pull + sum_into(self.pull.shape, self.cells, own), jnp.ones_like(rest)])
 
     def inverse_hessian(self, coefficients, free, columns):
-        """Approximate inverse of the energy's own Hessian, which is zero across steep slopes."""
+        """Approximate inverse of the energy's Hessian; its stiffness is the Hessian's along the gradient, which
+        vanishes where the gradient is large."""
         image, _ = self._parts(coefficients)
         size = self.pull.shape[0]
         mine = free[:size]
@@ -118,14 +118,15 @@ class NodalTotalVariation(AbstractPenalty):
         return jnp.concatenate([solved, columns[size:]])
 
     def normal(self, coefficients):
-        """Normal distribution of the form that touches the energy at c, as in `jeit.inverse.prior.total_variation`."""
+        """Normal distribution whose precision is the quadratic form that touches the energy at c, as in
+        `TotalVariationPenalty.normal`."""
         image, _ = self._parts(coefficients)
         factor = self._factor(self._elements(self.weight / self._height(image)), self.pull)
         return SparseNormal(self.pattern, self.plan, factor)
 
     def model(self, residual, jacobian, coefficients, data):
-        """Gauss-Newton for the data, lagged diffusivity for the energy, in data space; as of
-        `jeit.inverse.prior.total_variation`."""
+        """Objective and step: Gauss-Newton for the data, lagged diffusivity for the energy, in data space, as in
+        `TotalVariationPenalty.model`."""
         image, rest = self._parts(coefficients)
         weighted = data.precision @ residual
         cost = 0.5 * residual @ weighted + self.cost(coefficients)
@@ -138,7 +139,7 @@ class NodalTotalVariation(AbstractPenalty):
             gradient = self.pull * image + self._divergence(flux)
             factor = self._factor(self._elements(stiffness), self.pull)
             columns = xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
-            # Products with Γ take half a solve each, and the direction is one more.
+            # Products with Γ are formed from half solves; the direction takes one more full solve.
             half = in_columns(half_solve, self.plan, factor, columns)
             products = half.T @ half
             further = jacobian[:, size:]
@@ -157,17 +158,17 @@ class NodalTotalVariation(AbstractPenalty):
         return cost, step
 
     def _elements(self, stiffness):
-        """Element matrices of the form Σ stiffness |∇x|², (m, k, k)."""
+        """Element matrices (m, k, k) of the quadratic form Σ stiffness |∇x|²."""
         return namespace(self, stiffness).einsum("mid,mjd,m->mij", self.slope, self.slope, stiffness)
 
     def _factor(self, elements, diagonal) -> Factor:
-        """Factorise form + diagonal."""
+        """Factorise the matrix assembled from `elements`, plus `diagonal`."""
         values = self.pattern.assemble(elements)
         xp = namespace(self, values)
         return factorise(self.plan, values + xp.concatenate([diagonal, xp.zeros(len(values) - len(diagonal))]))
 
     def _gradient(self, image):
-        """Gradient of an image of the nodes, in every cell, (m, d) 1/m."""
+        """Gradient (m, d) of a nodal image in every cell, 1/m."""
         return (self.slope * gather(image, self.cells)[:, :, None]).sum(axis=1)
 
     def _divergence(self, flux):
@@ -183,17 +184,17 @@ class NodalTotalVariation(AbstractPenalty):
         return namespace(self, image).sqrt(squared + self.steepness**2)
 
 
-# Pull to the background, relative to the price of an edge: it determines the image where the data do not.
+# Weight of the deviation from the background relative to λ: it determines the image where the data do not.
 _LEVEL = 1e-3
 
 
 class TotalVariation(AbstractPrior):
-    """The prior of `reconstruct` for images of few pieces.
+    """Total variation prior of `reconstruct`, for images that are piecewise constant.
 
-    In a solid body the image is linear between its nodes, and a cell has their mean; in a sheet every cell has its own.
-    `smoothing` β: jumps below it, on the link's scale (`Log()`: relative), cost by their square. Its energy is not
-    quadratic, so linear images and the rules that choose λ cannot use it: λ is a number, 300 unless given. Raises
-    `ValueError` for a smoothing that is not positive.
+    In a solid body the image is linear between nodes and a cell has the mean of its nodes; in a sheet every cell has
+    its own value. `smoothing` β: jump below which the penalty is nearly quadratic, on the link's scale (`Log()`:
+    relative). The energy is not quadratic, so linear images and the rules that choose λ cannot use it; λ is a number,
+    300 by default. Raises `ValueError` if the smoothing is not positive.
     """
 
     smoothing: float = 0.01
@@ -209,7 +210,7 @@ class TotalVariation(AbstractPrior):
 
     @property
     def default_hyperparameter(self) -> float:
-        """The price of an edge."""
+        """Default λ, `EDGE_PRICE`."""
         return EDGE_PRICE
 
     def covariance_product(self, mesh, jacobian) -> NoReturn:
@@ -225,8 +226,8 @@ class TotalVariation(AbstractPrior):
         _refuse("basis of independent shapes")
 
     def penalty(self, mesh, reference, hyperparameter, *, jacobian=None, regions=None, per_cell=False):
-        """Every cell on its own, and the energy, weighted with λ: what an edge as long as the body is wide costs per
-        unit of jump. Raises `ValueError` for `regions`."""
+        """Basis with one coefficient per cell (or node of a solid), and the penalty weighted with λ. An edge as long as
+        the body is wide has the penalty λ per unit of jump. Raises `ValueError` if `regions` are given."""
         if regions is not None:
             raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
         check_cells(mesh)
@@ -265,9 +266,13 @@ def _refuse(what: str) -> NoReturn:
 
 
 class TotalVariationPenalty(AbstractPenalty):
-    """Σ weight √(d² + β²) + ½ Σ level c², d the jumps of reference + c; with a unit ridge on further unknowns.
+    """Penalty Σ weight √(d² + β²) + ½ Σ level c², where d are the jumps of the image reference + c between neighbouring
+    cells; further unknowns have a unit ridge penalty.
 
-    `between_bounds`: it is for solvers that keep bounds.
+    **Fields**: `pairs` (f, 2): neighbouring cells; `weight` (f,): λ times relative length of the facets; `level` (m,):
+    weight of the deviation from the background; `smoothing`: β; `reference` (m,): image at c = 0; `pattern`, `plan`:
+    sparsity pattern and factorisation plan of matrices over the cells; `between_bounds`: whether the penalty is used by
+    a solver that keeps bounds.
     """
 
     pairs: Int[Array, "f 2"]
@@ -281,26 +286,26 @@ class TotalVariationPenalty(AbstractPenalty):
 
     @property
     def tolerance(self) -> float:
-        """Relative change of the objective that ends a descent: lagged diffusivity converges linearly, and its last
-        steps change nothing visible."""
+        """Relative change of the objective that ends a descent. It is larger than for other penalties, because lagged
+        diffusivity converges linearly and its last steps do not change the image visibly."""
         return 1e-4
 
     def cost(self, coefficients):
-        """The energy."""
+        """Value of the penalty."""
         image, rest = self._parts(coefficients)
         edges = (self.weight * self._height(image)).sum()
         return edges + 0.5 * (self.level * image**2).sum() + 0.5 * rest @ rest
 
     def diagonal(self, coefficients):
-        """Diagonal of the form that touches the energy at c."""
+        """Diagonal of the quadratic form that touches the energy at c."""
         image, rest = self._parts(coefficients)
         stiffness = self.weight / self._height(image)
         own = self.level.at[self.pairs[:, 0]].add(stiffness).at[self.pairs[:, 1]].add(stiffness)
         return jnp.concatenate([own, jnp.ones_like(rest)])
 
     def inverse_hessian(self, coefficients, free, columns):
-        """Approximate inverse of the energy's own Hessian, with β² / (d² + β²) of the touching form's weights: zero
-        across high edges."""
+        """Approximate inverse of the energy's Hessian, whose weights are β² / (d² + β²) times those of the touching
+        quadratic form and vanish across large jumps."""
         image, _ = self._parts(coefficients)
         mine = free[: self.level.shape[0]]
         bend = self.weight * self.smoothing**2 / self._height(image) ** 3
@@ -313,18 +318,18 @@ class TotalVariationPenalty(AbstractPenalty):
         return jnp.concatenate([solve(self.plan, factor, image_columns), other])
 
     def normal(self, coefficients):
-        """Normal distribution of the form that touches the energy at c: each jump is normal with variance √(d² + β²) /
-        weight, as if where the edges are, and how high, were known. None between bounds."""
+        """Normal distribution whose precision is the quadratic form that touches the energy at c. Each jump is normal
+        with variance √(d² + β²) / weight, as if position and height of the edges were known. None with bounds."""
         if self.between_bounds:
             return None
         image, _ = self._parts(coefficients)
         return SparseNormal(self.pattern, self.plan, self._factor(self.weight / self._height(image)))
 
     def model(self, residual, jacobian, coefficients, data):
-        """Gauss-Newton for the data, lagged diffusivity for the energy, in data space.
+        """Objective and step: Gauss-Newton for the data, lagged diffusivity for the energy, in data space.
 
-        With Q the touching quadratic form, g the gradient of the energy, and Γ = Q⁻¹ / (1 + damping),
-        δ = -Γg - ΓJᵀ (JΓJᵀ + C)⁻¹ (r - JΓg).
+        The step is δ = -Γg - ΓJᵀ (JΓJᵀ + C)⁻¹ (r - JΓg), with the matrix Q of the touching quadratic form,
+        Γ = Q⁻¹ / (1 + damping), and the gradient g of the energy.
         """
         image, rest = self._parts(coefficients)
         weighted = data.precision @ residual
@@ -351,11 +356,11 @@ class TotalVariationPenalty(AbstractPenalty):
         return cost, step
 
     def _solve(self, stiffness, columns):
-        """Q⁻¹ columns, Q the touching form of these weights of jumps."""
+        """Q⁻¹ times columns, for the touching quadratic form with weights `stiffness` of the squared jumps."""
         return solve(self.plan, self._factor(stiffness), columns)
 
     def _factor(self, stiffness) -> Factor:
-        """Factorise Q."""
+        """Factorise Q for weights `stiffness` of the squared jumps."""
         link = stiffness[:, None, None] * np.array([[1.0, -1.0], [-1.0, 1.0]])
         return factorise(self.plan, self.pattern.assemble(link, self.level[:, None, None]))
 

@@ -1,4 +1,4 @@
-"""Shape reconstruction: bodies described by few parameters, for voltages that do not determine a full image."""
+"""Shape reconstruction: inclusions described by few parameters, for voltages that do not determine a full image."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""Base classes of bodies on a mesh, of any form: conductivity computed from the bodies' coefficients.
+"""Base classes of bodies, the inclusions of a domain: conductivity of the mesh as a function of their coefficients.
 
-    log σ/σ₀ = drift + Σ_bodies mixture(share of a cell that a body covers, ± contrast),
+    log σ/σ₀ = drift + Σ_bodies mixture(share, ± contrast),
 
-± contrast where it covers all. Everything is estimated in units of its prior's standard deviation, so that the penalty
-is ½‖coefficients‖².
+where `share` is the fraction of a cell that a body covers; a cell that is covered completely has ± contrast. Every
+coefficient is in units of its prior standard deviation, so the penalty is ½‖coefficients‖².
 """
 
 from __future__ import annotations
@@ -19,22 +19,23 @@ from jaxtyping import Bool, Float, Int
 
 from jeit.arguments import describe, is_number
 
-# Fields of `Bodies` with one value for every body, besides its start.
+# Fields of `Bodies` that hold one value per body, except `start`.
 _OF_EACH = ("sign", "other", "alike")
 
 
 @dataclass(frozen=True)
 class BodyPrior(abc.ABC):
-    """Prior of bodies, as standard deviations; lengths are in units of the longer side of the whole body.
+    """Normal prior of bodies. Lengths are in units of the longest side of the domain.
 
-    - `modes`: number of modes of a body's form; 1 makes disks and balls.
-    - `place`: of the centre about where the search starts. `radius` with the spread of its logarithm.
-    - `roughness`: deviation of the form from round.
-    - `drift`: of the logarithm of the bath's conductivity between the two frames.
-    - `apart`: over the share of the whole body by which two bodies overlap, its standard deviation. Without it two of
-      opposite sign may lie on each other and cancel.
+    - `modes`: number of modes that describe a body's form; 1 gives disks and balls.
+    - `place`: standard deviation of each coordinate of a body's centre about its start.
+    - `radius`, `radius_spread`: median of the mean radius, and standard deviation of its logarithm.
+    - `roughness`: standard deviation of the coefficients that make the form depart from round.
+    - `drift`: standard deviation of the change of the bath's log conductivity between the two frames.
+    - `apart`: reciprocal of the standard deviation of the overlap of two bodies, as a fraction of the domain. Without
+      this term two bodies of opposite sign could lie on each other and cancel.
 
-    Raises `ValueError` for what is not positive.
+    Raises `ValueError` if a value is not positive.
     """
 
     modes: int
@@ -54,32 +55,42 @@ class BodyPrior(abc.ABC):
 
     @property
     def _numbers(self) -> dict[str, Any]:
-        """Values that have to be positive."""
+        """Fields whose values must be positive."""
         return vars(self)
 
     @property
     def is_of_one_kind(self) -> bool:
-        """Whether bodies can be of one of the two kinds only."""
+        """Whether the prior admits only one of the two kinds of bodies."""
         return False
 
     @property
     @abc.abstractmethod
     def size(self) -> int:
-        """Coefficients of a body: centre, log radius, contrast, and those of its form."""
+        """Number of coefficients of a body: centre, log radius, contrast and form."""
 
     @abc.abstractmethod
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
-        """Standard deviations of a body's values, 1 of its contrast; `span` of the whole body, metres."""
+        """Prior standard deviations of a body's parameters; 1 for its contrast, whose scale `contrast_of` applies.
+
+        `span`: longest side of the domain, metres.
+        """
 
     @abc.abstractmethod
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
-        """Contrast of log σ of a body, of the `other` kind or not, positive, and its derivative."""
+        """Contrast of a body in log σ, without its sign, and its derivative with respect to the coefficient.
+
+        `other`: whether the body is of the form's other kind.
+        """
 
 
 class BodyImage(NamedTuple):
-    """**Fields**: `image` (m,), log σ/σ₀; its derivatives `slopes`, by the drift in all cells, then by every body's
-    coefficients in the cells that it reaches; `overlap` of every two bodies, in units of the whole measure, and its
-    derivative `overlap_slope`."""
+    """Image of bodies and its derivatives.
+
+    **Fields**: `image` (m,): log σ/σ₀; `slopes`: pairs of cells and derivatives of the image there, first with respect
+    to the drift in all cells (None), then with respect to each body's coefficients in the cells that it reaches;
+    `overlap`: overlap of every pair of bodies, as a fraction of the domain; `overlap_slope`: derivatives of the overlap
+    with respect to the drift and the coefficients of every body.
+    """
 
     image: Float[np.ndarray, " m"]
     slopes: Sequence[tuple[Any, Float[np.ndarray, "k q"]]]
@@ -88,8 +99,11 @@ class BodyImage(NamedTuple):
 
 
 class Covered(NamedTuple):
-    """The `cells` (c,) that a body reaches, the `share` (c,) of each that it covers, and the derivative of that by the
-    body's coefficients, `slope` (c, q)."""
+    """Coverage of cells by a body.
+
+    **Fields**: `cells` (c,): indices of the cells that the body reaches; `share` (c,): fraction of each that it covers;
+    `slope` (c, q): derivatives of `share` with respect to the body's coefficients.
+    """
 
     cells: Any
     share: Float[np.ndarray, " c"]
@@ -98,13 +112,13 @@ class Covered(NamedTuple):
 
 @dataclass(frozen=True)
 class Bodies(abc.ABC):
-    """Bodies of one form. Coefficients: the drift, then body by body: centre, log radius, contrast, and the form's own.
+    """Bodies of one form. Their coefficients are the drift, then for each body centre, log radius, contrast and form.
 
-    **Fields**: `prior` of every body; `weight` (m,), every cell's share of the whole measure; `span`, the longest side
-    of the whole body; `start` (k, d), metres, and `sign` (k,) of every body; `other` (k,), whether it is of the form's
-    other kind: weak among stars, a column among ellipsoids; `alike` (k,), whether it is of one material with all others
-    of its sign that are: they share the contrast of the first of them, and their own coefficients of contrast have no
-    effect.
+    **Fields**: `prior`: prior of every body; `weight` (m,): measure of each cell as a fraction of the domain; `span`:
+    longest side of the domain, metres; `start` (k, d): starting centres, metres; `sign` (k,): +1 for bodies more
+    conductive than the bath, -1 for less; `other` (k,): whether a body is of the form's other kind (weak for stars, a
+    column for ellipsoids); `alike` (k,): whether a body is of the same material as all other `alike` bodies of its
+    sign. Bodies of the same material share the contrast coefficient of the first; those of the others have no effect.
     """
 
     prior: Any
@@ -118,32 +132,34 @@ class Bodies(abc.ABC):
     @property
     @abc.abstractmethod
     def odds(self) -> float:
-        """Logarithm of the prior odds against bodies of their kinds."""
+        """Logarithm of the prior odds against the kinds that the bodies have."""
 
     @property
     @abc.abstractmethod
     def num_splits(self) -> int:
-        """Number of axes, from the longest, along which a body is tentatively split in two."""
+        """Number of axes along which splitting a body in two is tried, the longest first."""
 
     @abc.abstractmethod
     def otherwise(self, some: Any, coefficients: Float[np.ndarray, " n"]) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The same bodies with `some` of them of the other kind, with about the same effect."""
+        """The bodies with those of indices `some` changed to the other kind, with nearly the same effect on the
+        voltages; and their coefficients."""
 
     @abc.abstractmethod
     def mixture(self, share: Float[np.ndarray, " c"], contrast: float) -> tuple[Any, Any, Any]:
-        """log σ/σ₀ (c,) of cells of which a body of a `contrast`, + or -, covers a `share`; its derivatives by both."""
+        """log σ/σ₀ (c,) of cells of which a body with signed `contrast` covers the fraction `share`; and its
+        derivatives with respect to `share` and `contrast`."""
 
     @abc.abstractmethod
     def covered(self, k: int, row: Float[np.ndarray, " q"]) -> Covered:
-        """The cells that body k, of these coefficients, covers."""
+        """Coverage of cells by body k, whose coefficients are `row`."""
 
     @abc.abstractmethod
     def axis(self, k: int, row: Float[np.ndarray, " q"], number: int) -> Float[np.ndarray, " d"]:
-        """Unit vector along an axis of body k, the longest first."""
+        """Unit vector along axis `number` of body k, counted from the longest."""
 
     @abc.abstractmethod
     def body(self, k: int, coefficients: Float[np.ndarray, " n"], rise: float = np.nan) -> Any:
-        """Body k, as far as it lies in the whole one."""
+        """Description of body k; its area or volume is that of the part inside the domain."""
 
     @property
     def dimension(self) -> int:
@@ -152,20 +168,21 @@ class Bodies(abc.ABC):
 
     @property
     def first(self) -> Int[np.ndarray, " k"]:
-        """Index of the body whose contrast each body has: itself, or the first of the same material."""
+        """For each body, index of the body whose contrast coefficient it uses: itself, or the first of its material."""
         order, first = np.arange(len(self.sign)), np.arange(len(self.sign))
         for one in (self.alike & (self.sign == sign) for sign in (-1, 1)):
             first[one] = order[one].min(initial=len(order))
         return first
 
     def rows(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, "k q"]:
-        """Coefficients of every body."""
+        """Coefficients of every body, one row each, with shared contrasts filled in."""
         rows = coefficients[1:].reshape(len(self.sign), self.prior.size).copy()
         rows[:, self.dimension + 1] = rows[self.first, self.dimension + 1]
         return rows
 
     def by_coefficients(self, by_rows: Float[np.ndarray, "r n"]) -> Float[np.ndarray, "r n"]:
-        """Derivatives by the coefficients from those by the drift and every body's row."""
+        """Convert derivatives with respect to the drift and the rows of `rows` to those with respect to the
+        coefficients, in which bodies of the same material share a contrast."""
         by_rows, order = by_rows.copy(), np.arange(len(self.sign))
         contrast = 1 + order * self.prior.size + self.dimension + 1
         for k in order[self.first != order]:
@@ -174,40 +191,43 @@ class Bodies(abc.ABC):
         return by_rows
 
     def of_radii(self, radii) -> Float[np.ndarray, " n"]:
-        """Coefficients of disks or balls, metres, at the start."""
+        """Coefficients of disks or balls at the starting centres; `radii` in metres."""
         rows = np.zeros((len(self.sign), self.prior.size))
         relative = np.log(np.asarray(radii, float) / (self.prior.radius * self.span)) / self.prior.radius_spread
         rows[:, self.dimension] = np.clip(relative, -2, 2)
         return np.append(0, rows)
 
     def centre(self, k: int, row: Float[np.ndarray, " q"]) -> Float[np.ndarray, " d"]:
-        """Centre of body k, metres."""
+        """Centre of body k in metres."""
         return self.start[k] + self.prior.place * self.span * row[: self.dimension]
 
     def log_radius(self, row: Float[np.ndarray, " q"]) -> float:
-        """Logarithm of the mean radius of a body, metres."""
+        """Logarithm of the mean radius of a body in metres."""
         return np.log(self.prior.radius * self.span) + self.prior.radius_spread * row[self.dimension]
 
     def contrast(self, k: int, row: Float[np.ndarray, " q"]) -> tuple[float, float]:
-        """Contrast of log σ of body k, positive, and its derivative by the coefficient."""
+        """Contrast of body k in log σ, without its sign, and its derivative with respect to the coefficient."""
         return self.prior.contrast_of(row[self.dimension + 1], bool(self.other[k]))
 
     def shown(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
-        """log σ/σ₀ (m,) for pictures."""
+        """log σ/σ₀ (m,) for display."""
         return self.image(coefficients).image
 
     def only(self, some) -> Self:
-        """A subset of the bodies."""
+        """The bodies with indices `some`."""
         some = np.asarray(some, int)
         return replace(self, **{name: getattr(self, name)[some] for name in ("start", *_OF_EACH)})
 
     def without(self, k: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The others, and their coefficients."""
+        """All bodies except body k, and their coefficients."""
         others = self.only(np.delete(np.arange(len(self.sign)), k))
         return others, np.append(coefficients[0], np.delete(self.rows(coefficients), k, axis=0))
 
     def split(self, k: int, coefficients, number: int) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """Two round ones in place of body k, last, of half its measure each, that lie side by side along an axis."""
+        """Replace body k by two round bodies of half its area or volume each, side by side along axis `number`.
+
+        Returns the bodies, the two new ones last, and their coefficients.
+        """
         others, remaining = self.without(k, coefficients)
         row, d = self.rows(coefficients)[k], self.dimension
         half = np.zeros(self.prior.size)
@@ -215,14 +235,14 @@ class Bodies(abc.ABC):
         half[d] -= np.log(2) / d / self.prior.radius_spread
         step = np.exp(self.log_radius(half)) * self.axis(k, row, number)
         if d == 3:
-            step = step * 2 ** (-1 / 3)  # as far out as the middles of the two halves, and some more
+            step = step * 2 ** (-1 / 3)  # somewhat farther out than the centroids of the two halves
         middle = self.centre(k, row)
         start = np.concatenate([others.start, [middle + step, middle - step]])
         each = {name: np.append(getattr(others, name), [getattr(self, name)[k]] * 2) for name in _OF_EACH}
         return replace(self, start=start, **each), np.concatenate([remaining, half, half])
 
     def with_modes(self, modes: int, coefficients) -> tuple[Self, Float[np.ndarray, " n"]]:
-        """The same bodies with more modes, or fewer."""
+        """The bodies with another number of modes, and their coefficients; added modes start at zero."""
         new = replace(self, prior=replace(self.prior, modes=modes))
         rows = np.zeros((len(self.sign), new.prior.size))
         kept = min(new.prior.size, self.prior.size)
@@ -230,7 +250,7 @@ class Bodies(abc.ABC):
         return new, np.append(coefficients[0], rows)
 
     def image(self, coefficients) -> BodyImage:
-        """log σ/σ₀ per cell, how far the bodies overlap, and the derivatives of both."""
+        """log σ/σ₀ per cell, the overlaps of the bodies, and the derivatives of both."""
         size, d = len(self.weight), self.dimension
         rows = self.rows(coefficients)
         parts = [self.covered(k, row) for k, row in enumerate(rows)]

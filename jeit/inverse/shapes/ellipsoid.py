@@ -1,9 +1,10 @@
-"""Bodies in solids as ellipsoids and columns, and how certain their contrasts are.
+"""Ellipsoids and columns as bodies in a solid, and the standard deviations of their contrasts.
 
-A column stands through the whole height of a body: the same along x and y alone, of the area π r².
+An ellipsoid is the image of the unit ball under r exp(S), with a symmetric S of zero trace. A column extends through
+the whole height of the domain; its cross-section is an ellipse of area π r².
 
-Contrasts, and what they make of the conductivity, are those of `jeit.inverse.shapes.bodies`. The derivative of a
-matrix's exponential by its eigenvectors: Higham, Functions of Matrices (SIAM 2008), section 3.2.
+`jeit.inverse.shapes.bodies` describes contrast and conductivity. The derivative of the matrix exponential is computed
+from eigenvectors: Higham, Functions of Matrices (SIAM 2008), section 3.2.
 """
 
 from __future__ import annotations
@@ -19,18 +20,21 @@ from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh, measures
 
-# Least difference of log evidence between the two kinds of body, or between one material and several, for which only
-# the likelier is reported. Steps of the fit of an alternative, and its tolerance.
+# Difference of log evidence above which only the likelier of two descriptions is reported (ellipsoid or column, one
+# material or several); maximum number of steps when an alternative is fitted; tolerance of that fit.
 _UNDECIDED, _STEPS, _ROUGHLY = 4.0, 8, 1e-2
-# Contribution of the mesh to the deviation of a solid body's contrast, of log σ: balls of three times the bath's
-# conductivity are estimated at 3.87, 3.59 and 3.31 times where edges on their surfaces are 0.7, 0.5 and 0.35 of the
-# radius, and as 3.1 to 3.2 times where they are 0.25.
+# Contribution of the mesh to the standard deviation of a contrast in log σ, in a solid. Balls of three times the bath's
+# conductivity are estimated as 3.87, 3.59 and 3.31 times as conductive if edges on their surfaces are 0.7, 0.5 and 0.35
+# of the radius, and as 3.1 to 3.2 times if they are 0.25 of it.
 _BY_THE_MESH = 0.1
 
 
 def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> list[float]:
-    """Standard deviations of the contrasts of bodies. Where the data do not determine that bodies are of one material,
-    theirs are large enough to include the contrasts of `each`, the fit with a material for every body."""
+    """Standard deviations of the contrasts of bodies, in log σ.
+
+    `each`: fit in which every body has its own material. If the data do not rule it out, the standard deviations are
+    enlarged to include its contrasts.
+    """
     contrast, deviation = _contrasts(problem, fitted)
     if each and problem.surprise(each) - each.bodies.odds < problem.surprise(fitted) - fitted.bodies.odds + _UNDECIDED:
         own, its = _contrasts(problem, each)
@@ -39,7 +43,7 @@ def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = N
 
 
 def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-    """Contrasts of bodies, and their standard deviations by Laplace's approximation."""
+    """Contrasts of bodies, and their standard deviations from Laplace's approximation."""
     bodies = fitted.bodies
     contrasts = [bodies.contrast(k, row) for k, row in enumerate(bodies.rows(fitted.coefficients))]
     contrast, slope = np.array(contrasts).reshape(-1, 2).T
@@ -47,8 +51,8 @@ def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " 
 
 
 def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | None, float]]:
-    """Bodies of the other kind, columns for ellipsoids and ellipsoids for columns, where they explain the data about as
-    well, whichever is more likely beforehand; and the deviations of their contrasts."""
+    """For each body, the body of the other kind (ellipsoid or column) that explains the data about as well, and the
+    standard deviation of its contrast; None and NaN if there is none. The prior odds of the kinds are ignored."""
     bodies, number = fitted.bodies, len(fitted.bodies.sign)
     if not number or bodies.prior.is_of_one_kind or not isinstance(bodies, Ellipsoids):
         return [(None, np.nan)] * number
@@ -63,24 +67,24 @@ def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | N
 
 
 KINDS = ("either", "ellipsoids", "columns")
-"""Of bodies that there may be in a solid: balls and the like, those through its whole height, or either."""
+"""Kinds of bodies that a solid may contain: ellipsoids, columns through its whole height, or either."""
 
-# Barycentric weights of the twenty points at which a cell is sampled; each stands for an equal part of it.
+# Barycentric weights of the twenty points at which a cell is sampled; each represents an equal part of the cell.
 _SAMPLES = np.array([[2 * n + 1 for n in one] for one in np.ndindex(4, 4, 4, 4) if sum(one) == 3]) / 10
-# Width of the blur of a surface, in units of a cell's size: enough to be differentiable, but small, since blurred
-# bodies are fitted as smaller and stronger ones.
+# Width of the blur of a surface, in units of the cell size: large enough for the coverage to be differentiable, but
+# small, because blurred bodies are estimated too small and too strong.
 _BLUR = 0.1
-# Exponents of the power means in cells on a surface, for bodies more and less conductive than the bath. With them the
-# change of voltages of balls, 0.1 to 12 times as conductive, is that of meshes cut along them to 1 to 5 % where edges
-# are half the radius; with one for both, 0.15, those of 12 times changed 13 to 19 % too much, with the first order of
-# the edges.
+# Exponents of the power mean in cells on a surface, for bodies more (1) and less (-1) conductive than the bath. With
+# edges of half the radius, the change of voltages due to balls 0.1 to 12 times as conductive as the bath then agrees
+# within 1 to 5 % with that on meshes whose facets follow the surface. A single exponent of 0.15 made the change due to
+# balls of 12 times the conductivity 13 to 19 % too large, an error proportional to the edge length.
 _POWERS = {1: -1.0, -1: 0.5}
-# Distance from a surface within which edges are short, in units of the least half axis; and the least value of that
-# axis that is used, in units of the mean radius.
+# Distance from a surface within which cells are refined, in units of the shortest half axis; lower limit of that half
+# axis, in units of the geometric mean of the three.
 _BAND, _LEAST_AXIS = 0.1, 0.6
-# Widths of the blur from a surface beyond which a cell's share is less than 1e-8.
+# Distance from a surface, in widths of the blur, beyond which the covered share of a cell is less than 1e-8.
 _REACH = 20
-# Orthonormal directions of S.
+# Orthonormal basis of the symmetric matrices S of zero trace.
 _STRETCHES = np.array(
     [
         np.diag([1, -1, 0]) / np.sqrt(2),
@@ -90,19 +94,24 @@ _STRETCHES = np.array(
         np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]]) / np.sqrt(2),
     ]
 )
-# The directions that are level, and have no trace along x and y.
+# 1 for the elements of that basis that stretch a column: those within the x-y plane and without trace there.
 _LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
 class EllipsoidPrior(BodyPrior):
-    """Prior of ellipsoids: `modes` 2, or 1 for balls; `roughness`, of the logarithm of the axes' ratios; `contrast` of
-    log σ and the spread of its logarithm; `odds_for_columns`, how many times as likely as an ellipsoid a column is
-    beforehand: most tanks hold columns; `odds_for_one_material`, how many times as likely all bodies of a sign, more or
-    less conductive than the bath, are of the same as each of its own; `kinds` of bodies that there may be, one of
-    `KINDS`. Smooth images of solids locate bodies well, so `place` is small. The rest as of `BodyPrior`.
+    """Prior of ellipsoids and columns. Fields that are not listed are described in `BodyPrior`.
 
-    Raises `ValueError` for what is not positive, and for other kinds.
+    - `modes`: 2, or 1 for balls.
+    - `place`: small, because smooth images of solids locate bodies well.
+    - `roughness`: standard deviation of the five coefficients of S, the log stretches.
+    - `contrast`, `contrast_spread`: median of the contrast in log σ, and standard deviation of its logarithm.
+    - `odds_for_columns`: prior odds of a column relative to an ellipsoid; most tanks hold columns.
+    - `odds_for_one_material`: prior odds that all bodies more conductive than the bath (or all less conductive) are of
+      the same material, relative to a material of its own for each.
+    - `kinds`: kinds of bodies considered, one of `KINDS`.
+
+    Raises `ValueError` if a number is not positive or `kinds` is not in `KINDS`.
     """
 
     modes: int = 2
@@ -123,33 +132,36 @@ class EllipsoidPrior(BodyPrior):
 
     @property
     def is_of_one_kind(self) -> bool:
-        """Whether it is known beforehand whether bodies are columns."""
+        """Whether only one kind of body is considered."""
         return self.kinds != KINDS[0]
 
     @property
     def size(self) -> int:
-        """Coefficients of a body: centre, log radius, contrast, and five of its stretches."""
+        """Number of coefficients of a body: centre, log radius, contrast and, unless it is a ball, five stretches."""
         return 5 + 5 * (self.modes > 1)
 
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
-        """Standard deviations of a body's values, 1 of its contrast; `span` of the whole body, metres."""
+        """Prior standard deviations of a body's parameters, 1 for its contrast; `span`: longest side of the domain,
+        metres."""
         first = [self.place * span] * 3 + [self.radius_spread, 1.0]
         return np.concatenate([first, np.full(self.size - 5, self.roughness)])
 
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
-        """Contrast of log σ of a body of either kind, positive, and its derivative."""
+        """Contrast in log σ, without its sign, and its derivative with respect to the coefficient; the same for both
+        kinds."""
         contrast = self.contrast * np.exp(self.contrast_spread * coefficient)
         return contrast, self.contrast_spread * contrast
 
 
 class Ellipsoid(eqx.Module):
-    """A body found in a solid, an ellipsoid or a column.
+    """Ellipsoid or column found in a solid.
 
-    **Fields**: `sign`, +1 conductive or -1 resistive; `centre` (3,) metres; `axes` (3, 3), half axes as rows, metres,
-    the longest first; `volume` m³ and `centroid` (3,) metres, of the part that lies in the whole body; `contrast` of
-    log σ, positive; `column`, whether it is no ellipsoid, but stands through the whole height, half of which is one of
-    the half axes then; `alike`, whether it is taken to be of one material with the others of its sign; `rise`, the
-    factor by which the least objective grows without this body, which distinguishes a body from a ghost.
+    **Fields**: `sign`: +1 if more conductive than the bath, -1 if less; `centre` (3,): metres; `axes` (3, 3): half axes
+    as rows, metres, the longest first; `volume`, `centroid` (3,): volume in m³ and centroid in metres of the part
+    inside the domain; `contrast`: contrast in log σ, without its sign; `column`: whether the body is a column, one of
+    whose half axes is half the domain's height; `alike`: whether the body is assumed to be of the same material as
+    others of its sign; `rise`: factor by which the minimum of the objective increases without this body, small for a
+    ghost.
     """
 
     sign: int
@@ -164,16 +176,16 @@ class Ellipsoid(eqx.Module):
 
     @property
     def measure(self) -> float:
-        """The volume, m³."""
+        """Volume, m³."""
         return self.volume
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether the contrast is determined by the data: true of every ellipsoid."""
+        """Whether the data determine the contrast: True for all ellipsoids and columns."""
         return True
 
     def holds(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
-        """Whether points, metres, lie inside."""
+        """Whether each of `points`, in metres, lies inside the body."""
         length = (self.axes**2).sum(axis=1)
         along = (points - self.centre) @ self.axes.T / length
         if self.column:
@@ -183,10 +195,10 @@ class Ellipsoid(eqx.Module):
 
 @dataclass(frozen=True)
 class Ellipsoids(Bodies):
-    """Ellipsoids on a mesh.
+    """Ellipsoids and columns on a mesh.
 
-    **Fields**, besides those of `Bodies`: `points` (m, s, 3), where cells are sampled, metres; `width` (m,) of the
-    blur, metres; `total` volume, m³; `ends` of the height, z in metres.
+    **Fields**, besides those of `Bodies`: `points` (m, s, 3): sampling points of the cells, metres; `width` (m,): width
+    of the blur, metres; `total`: volume of the domain, m³; `ends`: lowest and highest z of the domain, metres.
     """
 
     points: Float[np.ndarray, "m s 3"]
@@ -196,7 +208,7 @@ class Ellipsoids(Bodies):
 
     @classmethod
     def create(cls, mesh: Mesh, prior: BodyPrior, start, sign) -> Ellipsoids:
-        """`start` (k, 3), metres."""
+        """Create ellipsoids for a mesh, with starting centres `start` (k, 3), metres."""
         points, volume = np.asarray(mesh.points), np.asarray(measures(mesh))
         sampled = _SAMPLES @ points[np.asarray(mesh.cells)]
         start, total = np.reshape(np.asarray(start, float), (-1, 3)), float(volume.sum())
@@ -206,8 +218,8 @@ class Ellipsoids(Bodies):
 
     @property
     def odds(self) -> float:
-        """Logarithm of the prior odds against the bodies' kinds: columns, and bodies of one material, are more
-        likely."""
+        """Logarithm of the prior odds against the bodies' kinds and materials; negative for columns and for bodies
+        that share a material, which are likelier a priori."""
         materials = len(set(self.sign[self.first != np.arange(len(self.sign))]))
         columns = 0 if self.prior.is_of_one_kind else self.other.sum()
         prior = np.log([self.prior.odds_for_columns, self.prior.odds_for_one_material])
@@ -215,13 +227,13 @@ class Ellipsoids(Bodies):
 
     @property
     def num_splits(self) -> int:
-        """One, the longest axis: merged neighbours make a long body, and every trial costs some tens of solves of a
-        solid."""
+        """1: only the longest axis, because two neighbours that were fitted as one body make it long, and each trial
+        takes tens of forward solves."""
         return 1
 
     def otherwise(self, some, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
-        """The same with `some` taken for columns, columns for ellipsoids, of the same volume, the rest of their
-        coefficients kept."""
+        """The bodies with those of indices `some` changed from ellipsoid to column or back, at the same volume; and
+        their coefficients. Stretches that the new kind does not have are set to zero."""
         rows, other = self.rows(coefficients), self.other.copy()
         for k in some:
             volume = max(self.body(k, coefficients).volume, 1e-6 * self.total) / np.pi
@@ -232,8 +244,12 @@ class Ellipsoids(Bodies):
         return replace(self, other=other), np.append(coefficients[0], rows)
 
     def of_one_material(self, sign: int, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
-        """The same with all bodies of a sign of one material, of their mean contrast, and of about the same effect:
-        volume times (ρ - 1) / (ρ + 2), of a column (ρ - 1) / (ρ + 1), ρ times as conductive as the bath."""
+        """The bodies with all those of a sign made of one material, and their coefficients.
+
+        The contrast coefficient becomes the mean. Radii are adjusted to keep the effect on the voltages, which is taken
+        as proportional to volume times (ρ - 1) / (ρ + 2), for a column (ρ - 1) / (ρ + 1), where ρ is the ratio of the
+        body's conductivity to the bath's.
+        """
         rows, some, contrast = self.rows(coefficients), np.flatnonzero(self.sign == sign), self.dimension + 1
         before = rows[:, contrast].copy()
         rows[some, contrast] = before[some].mean()
@@ -247,16 +263,16 @@ class Ellipsoids(Bodies):
         return replace(self, alike=self.alike | (self.sign == sign)), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):
-        """log(1 + share (exp(p contrast) - 1)) / p: of a conductive body and the bath the harmonic mean, p = -1, of
-        a resistive one the power mean of p = 1/2."""
+        """log(1 + share (exp(p contrast) - 1)) / p, the power mean of body and bath: harmonic (p = -1) for a conductive
+        body, p = 1/2 for a resistive one. Also its derivatives with respect to `share` and `contrast`."""
         power = _POWERS[1 if contrast > 0 else -1]
         rise = np.expm1(power * contrast)
         mean = 1 + share * rise
         return np.log(mean) / power, rise / (power * mean), share * (1 + rise) / mean
 
     def shown(self, coefficients) -> Float[np.ndarray, " m"]:
-        """log σ/σ₀ (m,) for pictures, in which it is half of a body's on its surface: of cells that are covered in part
-        the geometric mean, which is not what their voltages are those of."""
+        """log σ/σ₀ (m,) for display. Partly covered cells have the geometric mean of body and bath, so the value is
+        halfway between them on the surface; the voltages are computed with `mixture` instead."""
         image = np.full(len(self.weight), coefficients[0] * self.prior.drift)
         for k, row in enumerate(self.rows(coefficients)):
             cells, share, _ = self.covered(k, row)
@@ -264,13 +280,13 @@ class Ellipsoids(Bodies):
         return image
 
     def on(self, mesh: Mesh) -> Ellipsoids:
-        """The same on another mesh of the same solid."""
+        """The bodies on another mesh of the same domain."""
         there = Ellipsoids.create(mesh, self.prior, self.start, self.sign)
         return replace(there, other=self.other, alike=self.alike, span=self.span)
 
     def edges(self, coefficients, edge: float, corners: Float[np.ndarray, "m 4 3"]) -> Float[np.ndarray, " m"]:
-        """Greatest length of the edges of cells with these `corners`, metres: on surfaces `edge` times the least half
-        axis, infinite elsewhere."""
+        """Maximum edge length in metres of cells with these `corners`: `edge` times the shortest half axis at the
+        surface of a body, infinite elsewhere."""
         longest = np.full(len(corners), np.inf)
         for k, row in enumerate(self.rows(coefficients)):
             form, offset = self._form(k, row), (corners - self.centre(k, row)) * self._axes_of(k)
@@ -279,14 +295,14 @@ class Ellipsoids(Bodies):
             reach = np.linalg.norm(offset @ np.linalg.inv(form), axis=2)
             outside = distance - distance / np.maximum(reach, 1e-9)
             low, high = outside.min(axis=1), outside.max(axis=1)
-            holds = distance.min(axis=1) < high - low  # corners all round a body that is less than a cell
+            holds = distance.min(axis=1) < high - low  # the corners surround a body that is smaller than a cell
             near = ((low < _BAND * least) | holds) & (high > -_BAND * least)
             longest[near] = np.minimum(longest[near], edge * least)
         return longest
 
     def moved(self, coefficients, others: Bodies, after) -> bool:
-        """Whether surfaces have left the cells that were made finer for them, from some coefficients to those `after`
-        of `others`; or bodies have gone, or are of another kind."""
+        """Whether, between `coefficients` and the coefficients `after` of the bodies `others`, a surface has left the
+        cells that were refined for it, a body was removed, or a body changed kind."""
         if not np.array_equal(self.other, others.other):
             return True
         for k, (row, other) in enumerate(zip(self.rows(coefficients), others.rows(after), strict=True)):
@@ -297,27 +313,27 @@ class Ellipsoids(Bodies):
         return False
 
     def _axes_of(self, k: int) -> Float[np.ndarray, "3"]:
-        """1 for the axes along which body k ends: x, y and, unless it is a column, z."""
+        """1 for the axes along which body k is bounded: x, y and, unless it is a column, z; else 0."""
         return np.array([1.0, 1.0, 0.0 if self.other[k] else 1.0])
 
     def _form(self, k: int, row) -> Float[np.ndarray, "3 3"]:
-        """r exp(S), metres: what makes the body of the unit ball."""
+        """Matrix r exp(S), metres, which maps the unit ball to the body."""
         log_stretch, direction = np.linalg.eigh(self._stretch(k, row))
         return (direction * np.exp(self.log_radius(row) + log_stretch)) @ direction.T
 
     @staticmethod
     def _least_axis(form: Float[np.ndarray, "3 3"]) -> float:
-        """The least half axis, metres, or what is heeded of it."""
+        """Shortest half axis in metres, at least `_LEAST_AXIS` times the geometric mean of the three."""
         axes = np.linalg.eigvalsh(form)
         return float(max(axes[0], _LEAST_AXIS * np.cbrt(axes.prod())))
 
     def axis(self, k: int, row, number: int):
-        """Eigenvectors of S, that of the greatest first; of a column those that lie level."""
+        """Unit vector along axis `number` of body k, counted from the longest; for a column, of its cross-section."""
         form = self._form(k, row) * self._axes_of(k)
         return np.linalg.eigh(form)[1][:, 2 - number]
 
     def body(self, k: int, coefficients, rise: float = np.nan) -> Ellipsoid:
-        """Body k, with what lies in the whole one of it."""
+        """Description of body k; volume and centroid are those of the part inside the domain."""
         row = self.rows(coefficients)[k]
         cells, share, _ = self.covered(k, row)
         within = share * self.weight[cells]
@@ -332,7 +348,7 @@ class Ellipsoids(Bodies):
         return Ellipsoid(int(self.sign[k]), centre, axes, volume, centroid, contrast, column, alike, float(rise))
 
     def covered(self, k: int, row) -> Covered:
-        """Cells that ellipsoid k reaches."""
+        """Coverage of cells by body k, whose coefficients are `row`."""
         log_stretch, direction = np.linalg.eigh(self._stretch(k, row))
         squeeze = (direction * np.exp(-log_stretch)) @ direction.T
         centre, radius = self.centre(k, row), np.exp(min(self.log_radius(row), np.log(10 * self.span)))
@@ -344,9 +360,9 @@ class Ellipsoids(Bodies):
         distance = np.linalg.norm(offset, axis=-1)
         round_offset = offset @ squeeze
         reach = np.linalg.norm(round_offset, axis=-1)
-        # Along the line from the centre, the surface lies at radius · distance / reach.
+        # On the ray from the centre, the surface is at the distance radius · distance / reach.
         surface = radius * distance / reach
-        # The blur takes less off a convex body than it adds: reduced by the excess, the body keeps its volume.
+        # The blur of a convex surface adds more volume than it removes. Reducing the surface by `excess` compensates.
         excess = (np.pi * width) ** 2 * (axes.sum() - 1) / (6 * surface)
         inside = 0.5 * (1 + np.tanh(0.5 * (surface - excess - distance) / width))
         edge = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(surface - excess - distance)
@@ -355,24 +371,24 @@ class Ellipsoids(Bodies):
         by_offset = (edge * (grown - distance) / distance**2)[..., None] * offset
         by_centre = -(by_offset + by_reach[..., None] * (round_offset @ squeeze)).sum(axis=1)
         outer = np.einsum("cs,csi,csj->cij", by_reach, round_offset, offset)
-        stretches = (self._squeeze_slopes(log_stretch, direction) * self._kept(k)[:, None, None])[: self.prior.size - 5]
+        stretches = (self._squeeze_slopes(log_stretch, direction) * self._mask(k)[:, None, None])[: self.prior.size - 5]
         form = outer.reshape(len(cells), 9) @ stretches.reshape(-1, 9).T
         columns = [by_centre, (edge * grown).sum(axis=1)[:, None], np.zeros((len(cells), 1)), form]
         slope = np.concatenate(columns, axis=1) * self.prior.deviation(self.span)
         return Covered(cells, inside.mean(axis=1), slope)
 
-    def _kept(self, k: int) -> Float[np.ndarray, "5"]:
-        """1 for the directions of S that body k is stretched along."""
+    def _mask(self, k: int) -> Float[np.ndarray, "5"]:
+        """1 for the elements of the basis of S along which body k may be stretched, else 0."""
         return _LEVEL if self.other[k] else np.ones(5)
 
     def _stretch(self, k: int, row) -> Float[np.ndarray, "3 3"]:
-        """S."""
-        values = self.prior.roughness * row[5:] * self._kept(k)[: len(row) - 5]
+        """Log stretch S of body k."""
+        values = self.prior.roughness * row[5:] * self._mask(k)[: len(row) - 5]
         return np.tensordot(values, _STRETCHES[: len(values)], 1) if len(values) else np.zeros((3, 3))
 
     @staticmethod
     def _squeeze_slopes(log_stretch, direction) -> Float[np.ndarray, "5 3 3"]:
-        """Derivatives of exp(-S) along the directions of S."""
+        """Derivatives of exp(-S) with respect to the coefficients of S in its basis."""
         apart = log_stretch[:, None] - log_stretch
         middle = (log_stretch[:, None] + log_stretch) / 2
         # (exp(-a) - exp(-b)) / (a - b) = -exp(-(a + b) / 2) sinh(h) / h with h = (a - b) / 2.

@@ -1,9 +1,9 @@
-"""Refinement of a shape problem: the mesh is made finer on the surfaces of the bodies.
+"""Refinement of a shape problem: the mesh is refined at the surfaces of the bodies.
 
-A mesh that suffices for a smooth image resolves a body of a few cells badly: the error of its voltages is of first
-order in the edges on its surface, is not the same factor for all of them, and looks like another body. So bodies that
-were found are fitted again on a mesh that is bisected at their surfaces; everything else stays as it was, the voltages
-of the background included.
+A mesh that suffices for a smooth image resolves a body of a few cells badly. The error of the voltages is proportional
+to the edge length on the surface, differs between channels, and resembles the effect of another body. Bodies that were
+found are therefore fitted again on a mesh that is bisected at their surfaces. The rest of the problem, including the
+voltages of the background, is unchanged.
 """
 
 from __future__ import annotations
@@ -27,34 +27,39 @@ from jeit.mesh.bisection import bisected
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
-# Factor by which a finer mesh may have more nodes.
+# Ratio of the number of nodes of the refined mesh to that of the given one, below which no longer edges are tried.
 _MOST = 2.5
 
 
 class Finer(NamedTuple):
-    """**Fields**: the `problem` on the finer mesh, and the `bodies` on it; `cell` (f,), which of the given mesh's each
-    of its cells comes from."""
+    """Shape problem on a refined mesh.
+
+    **Fields**: `problem`: the problem on the refined mesh; `bodies`: the bodies on it; `cell` (f,): index of the cell
+    of the given mesh that contains each refined cell.
+    """
 
     problem: ShapeProblem
     bodies: Ellipsoids
     cell: Int[np.ndarray, " f"]
 
     def change(self, protocol: Protocol, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " M"]:
-        """Change of a protocol's voltages, volts, due to the `image` of bodies and a `field` (m,) or 0, of log σ."""
+        """Change of the voltages of `protocol`, in volts, due to the `image` of bodies (f,) and a `field`, (m,) on the
+        given mesh or 0, both in log σ."""
         model, background = self.problem.model.with_protocol(protocol), self.problem.background
         after = self.conductivity(image, field)
         return solved_fields(model, after).voltages - solved_fields(model, background).voltages
 
     def conductivity(self, image: Float[np.ndarray, " f"], field: Any) -> Float[np.ndarray, " f"]:
-        """Conductivity of the finer cells, S/m, for the `image` of bodies and a `field` (m,) or 0, of log σ."""
+        """Conductivity of the refined cells, S/m, for the `image` of bodies (f,) and a `field`, (m,) on the given mesh
+        or 0, both in log σ."""
         return self.problem.background * np.exp(image + np.broadcast_to(field, self.cell.max() + 1)[self.cell])
 
 
 def finer(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> Finer:
-    """The problem on a mesh refined on the surfaces of a fit's ellipsoids. The length of edges there, in units of the
-    least half axis, is the first of `edges` with which the mesh grows little, or the last.
+    """Refine the mesh of a problem at the surfaces of the ellipsoids of a fit.
 
-    The change that the finer mesh makes to the voltages of the background is added to the data as well.
+    `edges`: lengths of the edges there, in units of the shortest half axis; the first that does not add too many nodes
+    is used, else the last. The difference that refinement makes to the background's voltages is added to the data.
     """
     bodies, model = fit.bodies, problem.model
     assert isinstance(bodies, Ellipsoids)
@@ -72,7 +77,7 @@ def finer(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> Finer:
 
 
 def _tagged(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]]:
-    """The mesh with the facets that electrodes cover as its tags, which stay where it is divided; and their names."""
+    """The mesh with the facets that each electrode covers as tags, which bisection preserves; and the tags' names."""
     parts = electrodes.parts if isinstance(electrodes, CombinedElectrodes) else (electrodes,)
     covers = [column for part in parts if isinstance(part, FacetElectrodes) for column in np.asarray(part.covers).T]
     tags: dict[str, Any] = {str(k): np.flatnonzero(column) for k, column in enumerate(covers)}
@@ -80,7 +85,7 @@ def _tagged(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]
 
 
 def _on(mesh: Mesh, electrodes: AbstractElectrodes, names) -> AbstractElectrodes:
-    """Electrodes on the divided mesh: those that are facets by the names of these, all others by where they are."""
+    """Electrodes on the bisected mesh: those that cover facets from the tags `names`, all others unchanged."""
     if isinstance(electrodes, CombinedElectrodes):
         return CombinedElectrodes(*[_on(mesh, part, names) for part in electrodes.parts])
     if isinstance(electrodes, FacetElectrodes):

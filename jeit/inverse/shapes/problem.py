@@ -1,20 +1,22 @@
-"""The nonlinear problem of bodies and the smooth conductivity field beside them.
+"""Nonlinear least squares problem of bodies, optionally with a smooth conductivity field beside them.
 
-The smooth field represents what is in a solid besides the bodies: salt that has sunk from a ball of agar to the floor,
-a bath of uneven temperature, contacts that have changed. Bodies alone would bend to explain it.
+The smooth field represents other changes of conductivity in a solid: salt that has sunk from a ball of agar to the
+floor, a bath of uneven temperature, contacts that have changed. Without it, bodies would be distorted to explain them.
 
-    log σ/σ₀ = bodies + level · field,    field ~ N(0, Γ) as of a smooth image's prior,
+    log σ/σ₀ = bodies + level · field,    field ~ N(0, Γ), where Γ is the covariance of a smooth image's prior.
 
-so voltages that bodies do not explain have the covariance C + level² J Γ Jᵀ, J at the background; the evidence chooses
-the level. Kaipio and Somersalo, Journal of Computational and Applied Mathematics 198 (2007) 493, errors of the model as
-noise; MacKay, Neural Computation 4 (1992) 415, levels by evidence.
+The voltages that the bodies do not explain have the covariance C + level² J Γ Jᵀ, with the noise covariance C and the
+Jacobian J at the background. The level is chosen by the evidence. Kaipio and Somersalo, Journal of Computational and
+Applied Mathematics 198 (2007) 493, treat model errors as noise; MacKay, Neural Computation 4 (1992) 415, chooses levels
+by evidence.
 
-Least squares for the coefficients of bodies: ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², r = w (v(σ(c)) - ŷ).
+The coefficients c of the bodies minimise ½ rᵀ G r + ½ ‖c‖² + ½ Σ (apart · overlap)², with r = w (v(σ(c)) - ŷ), the data
+ŷ, their weights w and their precision G = C⁻¹.
 
-The evidence, the probability of the data integrated over the coefficients, measures how well bodies of any number and
-kind explain the data. By Laplace's approximation at the least cost, -log evidence = cost + ½ log det H + const, with H
-= 1 + JᵀC⁻¹J the Hessian in units of the prior: every coefficient costs more the more precisely it is determined.
-MacKay, Neural Computation 4 (1992) 415, section 2.
+The evidence is the probability of the data, integrated over the coefficients. It compares bodies of any number and
+kind. Laplace's approximation at the minimum gives -log evidence = cost + ½ log det H + const, where H = 1 + JᵀC⁻¹J is
+the Hessian in units of the prior and J the Jacobian with respect to c: a coefficient costs more, the more precisely the
+data determine it. MacKay, Neural Computation 4 (1992) 415, section 2.
 """
 
 from __future__ import annotations
@@ -36,15 +38,19 @@ from jeit.inverse.shapes.bodies import Bodies
 from jeit_solvers import Descent, QuadraticModel, ridge_model
 from jeit_solvers.engines import on_host
 
-# Tried, times the standard deviation of the smooth image's prior.
+# Levels of the smooth field that are tried, in units of the standard deviation of the smooth image's prior.
 _LEVELS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
 
 
 @dataclass(frozen=True)
 class SmoothField:
-    """**Fields**: `image` that is smooth, of the same channels; `jacobian` (r, n) of the channels of `alone` by its
-    coefficients, of unit variance, at the background; `scale` (m,), of log σ by what they are expanded to; `alone`, the
-    problem of bodies and noise and nothing else."""
+    """Smooth conductivity field beside the bodies, as a normal random field.
+
+    **Fields**: `image`: a smooth reconstruction from the same channels, whose basis the field has; `jacobian` (r, n):
+    derivatives of the channels of `alone` with respect to the field's coefficients of unit variance, at the background;
+    `scale` (m,): derivative of log σ with respect to the link's variable; `alone`: the problem of bodies without the
+    field.
+    """
 
     image: Reconstruction
     jacobian: Float[np.ndarray, "r n"]
@@ -53,7 +59,10 @@ class SmoothField:
 
     @classmethod
     def create(cls, image: Reconstruction, alone: ShapeProblem) -> SmoothField:
-        """Raises `ValueError` for what is no `image` of the same cells and channels by a smooth prior."""
+        """Create a field from a smooth reconstruction `image`, for the problem of bodies `alone`.
+
+        Raises `ValueError` unless `image` is a reconstruction of the same cells and channels with a smooth prior.
+        """
         check_kind("smooth", image, Reconstruction, "what jeit.inverse.reconstruct has returned")
         inversion = image.inversion
         if not inversion.penalty.is_standard_normal or inversion.unknowns:
@@ -72,15 +81,15 @@ class SmoothField:
         return cls(image, relative[:, None] * weighted, scale, alone)
 
     def beside(self, level: float) -> ShapeProblem:
-        """The problem of bodies with the field at a level."""
+        """The problem of bodies with the field of this level as additional noise."""
         covariance = self.alone.data.covariance + level**2 * (self.jacobian @ self.jacobian.T)
         changed = (covariance, np.linalg.inv(covariance))
         data = eqx.tree_at(lambda data: (data.covariance, data.precision), self.alone.data, changed)
         return replace(self.alone, data=data)
 
     def likeliest(self, fit: Fit) -> float:
-        """The level with the greatest evidence, given the voltages that the bodies do not explain."""
-        residual = self._left(fit)
+        """Level with the largest evidence, given the voltages that the bodies do not explain."""
+        residual = self._residual(fit)
 
         def surprise(level: float) -> float:
             problem = self.beside(level)
@@ -89,19 +98,22 @@ class SmoothField:
         return min(_LEVELS, key=surprise)
 
     def estimate(self, level: float, fit: Fit) -> Float[np.ndarray, " m"]:
-        """level · field (m,), of log σ/σ₀, that best explains the voltages that the bodies do not explain."""
+        """Posterior mean of level · field (m,), in log σ/σ₀, given the voltages that the bodies do not explain."""
         precision = self.beside(level).data.precision
-        coefficients: Any = -(level**2) * self.jacobian.T @ (precision @ self._left(fit))
+        coefficients: Any = -(level**2) * self.jacobian.T @ (precision @ self._residual(fit))
         return self.scale * np.asarray(self.image.inversion.basis.expand(coefficients))
 
-    def _left(self, fit: Fit) -> Float[np.ndarray, " r"]:
-        """Residual of the weighted voltages: those predicted for the bodies less the data."""
+    def _residual(self, fit: Fit) -> Float[np.ndarray, " r"]:
+        """Residual of the weighted voltages: predicted for the bodies minus measured."""
         return fit.rows[0][: len(self.jacobian)]
 
 
 class Fit(NamedTuple):
-    """Bodies and their `coefficients` (n,) of least `cost`, with the residual there and its Jacobian as `rows`, both of
-    the problem that was fitted, whatever its covariance."""
+    """Result of `ShapeProblem.fit`.
+
+    **Fields**: `bodies`; `coefficients` (n,): coefficients at the minimum; `cost`: objective there; `rows`: residual
+    and Jacobian of the fitted problem there, not multiplied by its precision.
+    """
 
     bodies: Bodies
     coefficients: Float[np.ndarray, " n"]
@@ -111,8 +123,11 @@ class Fit(NamedTuple):
 
 @dataclass(frozen=True)
 class ShapeProblem:
-    """**Fields**: `model` of the independent channels; `data` with ŷ, w and G; `background` σ₀ (m,), S/m (2-D: S);
-    `rtol` of the cost, to which it is fitted."""
+    """Least squares problem for the coefficients of bodies.
+
+    **Fields**: `model`: forward model of the independent channels; `data`: holds ŷ, w and G; `background` (m,): σ₀,
+    S/m (2-D: S); `rtol`: relative change of the cost that ends a fit.
+    """
 
     model: ForwardModel
     data: Data
@@ -120,12 +135,13 @@ class ShapeProblem:
     rtol: float = 3e-3
 
     def linearise(self, coefficients: Float[np.ndarray, " n"], bodies: Bodies) -> tuple[Any, Any, Any, Any]:
-        """Residual (r + p,), a function that gives its Jacobian (r + p, n), covariance and precision (r + p, r + p)."""
+        """Residual (r + p,), a function that returns its Jacobian (r + p, n), its covariance and its precision
+        (r + p, r + p), for r channels and p pairs of bodies."""
         image, slopes, overlap, overlap_slope = bodies.image(coefficients)
         conductivity = self.background * np.exp(image)
         fields = solved_fields(self.model, conductivity)
         weight = np.asarray(self.data.weight)
-        # The condition that bodies keep apart is one more datum of unit variance for every two of them.
+        # The penalty of overlap is an additional datum of unit variance for every pair of bodies.
         apart, more = bodies.prior.apart, np.eye(len(overlap))
 
         def jacobian():
@@ -142,7 +158,7 @@ class ShapeProblem:
         )
 
     def fit(self, bodies: Bodies, start: Float[np.ndarray, " n"], max_steps: int, rtol: float | None = None) -> Fit:
-        """The least cost near `start`, by Levenberg-Marquardt."""
+        """Minimise the cost from `start` by the Levenberg-Marquardt method, in at most `max_steps` steps."""
         unknown = np.full((len(self.data.voltages), 1 + len(start)), np.nan)
         accepted: list[Any] = [unknown[:, 0], unknown[:, 1:]]
 
@@ -150,7 +166,7 @@ class ShapeProblem:
             residual, jacobian, covariance, precision = self.linearise(coefficients, bodies)
             cost = 0.5 * (residual @ precision @ residual + coefficients @ coefficients)
 
-            def step(damping):  # points that are refused need no Jacobian
+            def step(damping):  # the Jacobian is computed only at points that are accepted
                 rows = jacobian()
                 accepted[:] = residual, rows
                 return ridge_model(residual, rows, coefficients, covariance, precision)[1](damping)  # pyright: ignore
@@ -163,19 +179,19 @@ class ShapeProblem:
 
     @property
     def uncertainty(self) -> float:
-        """Contribution of the data's covariance to the -log evidence: half the logarithm of its determinant."""
+        """Contribution of the data's covariance to -log evidence: half the logarithm of its determinant."""
         return 0.5 * float(np.linalg.slogdet(np.asarray(self.data.covariance))[1])
 
     def surprise(self, fit: Fit) -> float:
-        """-log evidence of some bodies, up to a constant, with the odds against their kinds."""
+        """-log evidence of the bodies of a fit, up to a constant, including the prior odds against their kinds."""
         return fit.cost + 0.5 * float(np.linalg.slogdet(self._hessian(fit))[1]) + fit.bodies.odds
 
     def deviations(self, fit: Fit) -> Float[np.ndarray, " n"]:
-        """Standard deviations of the coefficients after the data, by Laplace's approximation."""
+        """Posterior standard deviations of the coefficients, from Laplace's approximation."""
         return np.sqrt(np.diag(np.linalg.inv(self._hessian(fit))))
 
     def _hessian(self, fit: Fit) -> Float[np.ndarray, "n n"]:
-        """H at the least cost."""
+        """Hessian H at the minimum of the cost."""
         _, rows = fit.rows
         channels = len(self.data.voltages)
         weighed = np.concatenate([self.data.precision @ rows[:channels], rows[channels:]])

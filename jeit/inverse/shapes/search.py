@@ -1,4 +1,4 @@
-"""`reconstruct_shapes`: the bodies that explain a frame of voltages; their number is estimated from the data."""
+"""Search for the bodies that explain a frame of voltages (`reconstruct_shapes`), including their number."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ from jeit_solvers.engines import as_array
 if TYPE_CHECKING:
     from jeit.inverse.shapes.finer import Finer
 
-# Least factor by which the objective must rise when a body is left out and the others are fitted again.
+# Minimum factor by which the objective must rise when a body is left out and the others are fitted again.
 LEAST_RISE = 1.4
 _FIRST_STEPS, _STEPS, _STEPS_WITHOUT, _STEPS_TRIED = 15, 40, 8, 6
 _ROUGHLY = 1e-2
-# After so many in a row that data do not ask for, weaker ones are not tried.
+# Number of starts in a row that the data do not support, after which the remaining, weaker ones are not tried.
 _MOST_REFUSED = 2
-# Least factor by which the objective rises without a body, for the body to be beyond doubt.
+# Factor by which the objective rises without a body, above which the body is beyond doubt.
 _SURELY = 10.0
-# Greatest number of changes of the number or kind of bodies.
+# Maximum number of changes of the number or kind of bodies.
 _MOST_CHANGES = 10
-# Greatest number of times that the mesh is refined at the bodies, which move as a result. And the lengths of edges
-# there, in units of the least half axis, that are tried in turn: while ghosts are among the bodies, and afterwards.
+# Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on their
+# surfaces, in units of the shortest half axis, that are tried in turn: in the first refinement, when there may still be
+# ghosts among the bodies, and in later ones.
 _MOST_MESHES, _EDGES = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
-# Least gain of the log evidence for which the richer of two descriptions of the bodies is accepted.
+# Minimum gain of log evidence for accepting the richer of two descriptions of the bodies.
 _MARGIN = 2.0
 
 
@@ -46,8 +47,11 @@ Body = Star | Ellipsoid
 
 
 class FinerImage(eqx.Module):
-    """Conductivity on a finer mesh: `conductivity` (c,), S/m, of the cells of the mesh of `model`. The electrodes lie
-    as before; the protocol of `model` is another one, of independent channels."""
+    """Conductivity on a refined mesh.
+
+    **Fields**: `model`: forward model on the refined mesh, with the same electrodes and a protocol of independent
+    channels; `conductivity` (c,): conductivity of the refined cells, S/m.
+    """
 
     model: ForwardModel
     conductivity: Float[Array, " c"]
@@ -56,15 +60,15 @@ class FinerImage(eqx.Module):
 class ShapeReconstruction(eqx.Module):
     """Result of `reconstruct_shapes`.
 
-    **Fields**: `bodies`, `Star`s of a sheet and `Ellipsoid`s of a solid, those that explain most first; `conductivity`
-    (m,), S/m (2-D: S), of a solid's cells that are covered in part the geometric mean; `voltages` (M,), what the model
-    predicts for the bodies; `misfit`, root mean square of predicted - measured over the channels used, in standard
-    deviations; `drift`, the bath's conductivity over its `background`, less one; `doubtful`, bodies among the starts
-    that were left out again because their `rise` is too small; `contrast_deviations`, posterior standard deviation of
-    each body's contrast due to noise, in solids with 0.1 added for the mesh; `alternatives`, each body of a solid as
-    the other kind, ellipsoid or column, where the data do not determine which it is, else None;
-    `alternative_deviations`, of their contrasts, or NaN; `finer`, of a solid in which there are any, on the last of the
-    meshes that are finer at their surfaces: for pictures.
+    **Fields**: `bodies`: `Star`s in a sheet, `Ellipsoid`s in a solid, in descending order of `rise`; `conductivity`
+    (m,): S/m (2-D: S), in partly covered cells of a solid the geometric mean of body and bath; `voltages` (M,):
+    voltages predicted for the bodies; `misfit`: root mean square of predicted - measured over the channels used, in
+    standard deviations; `drift`: relative difference of the bath's conductivity from `background`; `doubtful`: bodies
+    that were removed because their `rise` is too small; `contrast_deviations`: posterior standard deviation of each
+    body's contrast due to noise, in solids combined with 0.1 for the mesh; `alternatives`: for each body of a solid,
+    the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
+    `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`: for a solid
+    with bodies, the conductivity on the last refined mesh, for display.
     """
 
     bodies: tuple[Body, ...]
@@ -80,7 +84,7 @@ class ShapeReconstruction(eqx.Module):
 
     @property
     def hyperparameter(self) -> float:
-        """NaN: shapes have a prior of their own."""
+        """NaN: the prior of shapes has no hyperparameter."""
         return float("nan")
 
     @property
@@ -107,31 +111,31 @@ def reconstruct_shapes(
     smooth: Reconstruction | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ShapeReconstruction:
-    """Estimate the bodies, star shapes in a sheet and ellipsoids in a solid, that explain measured `voltages` (M,), in
+    """Estimate the bodies (star shapes in a sheet, ellipsoids in a solid) that explain measured `voltages` (M,), in
     volts.
 
-    - `background`: conductivity without them, one number or (m,), S/m (2-D: S); its drift is estimated.
-    - `start`: sign, centre (x, y) or (x, y, z) and radius, metres, of every body that may be there, such as of all the
-      inclusions of an image; surplus starts do no harm, and two bodies that share one start are separated; no body is
-      added where no start is given.
+    - `background`: conductivity without bodies, one number or (m,), S/m (2-D: S); its drift is estimated.
+    - `start`: sign, centre (x, y) or (x, y, z) and radius, in metres, of every possible body, for example of all
+      inclusions of an image. Surplus starts do no harm, and two bodies at one start are separated, but no body is added
+      where no start is given.
     - `noise`, `mask`: as in `jeit.inverse.reconstruct`.
-    - `prior`: `StarPrior()` of sheets, `EllipsoidPrior()` of solids, unless given.
+    - `prior`: default `StarPrior()` for sheets, `EllipsoidPrior()` for solids.
     - `least_rise`: bodies without which the objective rises by less than this factor, or that the evidence does not
       favour, are treated as ghosts.
-    - `smooth`: an image of the same channels by a smooth prior and no bounds; what it shows besides bodies is modelled
-      as a `SmoothField`, whose level is chosen by the evidence, and only bodies that are detected beside that field are
-      fitted.
-    - `progress` is called with the name of each stage as it begins: those of a solid take up to a minute.
+    - `smooth`: an image of the same channels with a smooth prior and no bounds. Changes of conductivity besides the
+      bodies are then modelled as a `SmoothField`, whose level is chosen by the evidence, and only bodies that are
+      detected beside that field are fitted.
+    - `progress`: called with the name of each stage as it begins. Stages take up to a minute in a solid.
 
-    All bodies are first fitted together, as strong disks or balls. Then each in turn is left out and the rest are
-    fitted again, and the body whose loss raises the objective least is removed, as long as the rise is small. Ghosts
-    due to errors of the model and missing electrodes are removed in this way, since other bodies can take their place.
-    Each remaining body is split in two, or changed to the other kind, a weak star or a column from floor to lid, where
-    the evidence favours it (`ShapeProblem.surprise`): once with splits first, once with kinds first; the better result
-    is kept.
+    All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and the others
+    are fitted again; the body whose absence raises the objective least is removed, as long as the rise is small. This
+    removes ghosts due to model errors and missing electrodes, because other bodies can take their place. Remaining
+    bodies are split in two, or changed to the other kind (a weak star, or a column from floor to lid), if the evidence
+    favours it (`ShapeProblem.surprise`). The search is run twice, starting with a split and with a change of kind, and
+    the better result is kept.
 
-    Raises `ValueError` for arguments that do not fit, and for a `smooth` that is no image of these channels by a smooth
-    prior.
+    Raises `ValueError` for arguments that do not fit together, and if `smooth` is not an image of these channels with a
+    smooth prior.
 
     Kolehmainen, Arridge, Lionheart, Vauhkonen and Kaipio, Inverse Problems 15 (1999) 1375, boundaries by Fourier
     coefficients; the choice by evidence is jeit's own.
@@ -197,7 +201,7 @@ def reconstruct_shapes(
 
 
 def _checked_start(start, dimension: int):
-    """Signs (k,), centres (k, d) and radii (k,). Raises `ValueError`."""
+    """Signs (k,), centres (k, d) and radii (k,) from `start`. Raises `ValueError` for invalid starts."""
     try:
         sign = np.array([one[0] for one in start], float)
         centre = np.array([one[1] for one in start], float).reshape(-1, dimension)
@@ -211,28 +215,31 @@ def _checked_start(start, dimension: int):
 
 
 def _grown(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
-    """Bodies with all their modes, fitted to the data as round ones; and their coefficients."""
+    """Fit the bodies as disks or balls, and return them with all their modes, and their coefficients."""
     found = problem.fit(*bodies.with_modes(1, coefficients), steps, _ROUGHLY)
     return found.bodies.with_modes(bodies.prior.modes, found.coefficients)
 
 
 class _Setting(NamedTuple):
-    """Setting in which bodies are fitted: the problem of them `alone`, or with a smooth field `beside` it."""
+    """Setting in which bodies are fitted: the problem of bodies `alone`, and the smooth field `beside` them or None."""
 
     alone: ShapeProblem
     beside: SmoothField | None
 
     def problem(self, level: float) -> ShapeProblem:
-        """The problem with the field at a level."""
+        """The problem of bodies, with the smooth field of this level if there is a field."""
         return self.alone if self.beside is None else self.beside.beside(level)
 
     def on(self, alone: ShapeProblem) -> _Setting:
-        """The same with the problem on another mesh."""
+        """The setting with the problem `alone` on another mesh."""
         return _Setting(alone, self.beside and replace(self.beside, alone=alone))
 
     def settled(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
-        """The level of the field that goes with some bodies, from a `level` on; their fit, and -log evidence for both.
-        From above, so that bodies are not bent by what the field explains."""
+        """Alternate between fitting the bodies and lowering the field's level, until the level is the likeliest.
+
+        Returns the level, the fit and -log evidence. The level decreases from `level`, because bodies fitted with too
+        low a level would be distorted to explain what the field explains.
+        """
         while True:
             problem = self.problem(level)
             fit = problem.fit(bodies, coefficients, steps, _ROUGHLY)
@@ -243,9 +250,11 @@ class _Setting(NamedTuple):
 
 
 def _added_one_by_one(setting: _Setting, bodies: Bodies, coefficients, sure: int = 0) -> tuple[float, Fit, list[int]]:
-    """The level of a smooth field, the bodies that data ask for besides, each after those before it, and which they
-    are. The first `sure` are beyond doubt and fitted together: one of two that is fitted alone moves between them, and
-    does not come back."""
+    """Add bodies in their order to a smooth field, and keep each that the data support besides those before it.
+
+    Returns the level of the field, the fit, and the indices of the bodies kept. The first `sure` bodies are beyond
+    doubt and are fitted together: either of two bodies fitted alone would settle between them and not return.
+    """
     rows = bodies.rows(coefficients)
     chosen, refused = list(range(sure)), 0
     start = np.append(coefficients[0], rows[:sure])
@@ -261,7 +270,7 @@ def _added_one_by_one(setting: _Setting, bodies: Bodies, coefficients, sure: int
 
 
 class _Found(NamedTuple):
-    """Bodies that the data support, with their rises, and the bodies left out."""
+    """Result of removing ghosts: `fit` of the remaining bodies, their `rises`, and the removed bodies, `doubtful`."""
 
     fit: Fit
     rises: list[float]
@@ -277,8 +286,10 @@ class _State(NamedTuple):
 
 
 def _on_finer_meshes(state: _State, least_rise: float, report: Callable[[str], None]) -> tuple[_State, Finer | None]:
-    """The same fitted where the mesh is finer on their surfaces, again until they stay there; ghosts that a coarser one
-    made are not. And the last of those meshes."""
+    """Fit the bodies on meshes refined at their surfaces, until the surfaces stay within the refined cells.
+
+    Ghosts due to the coarse mesh are dropped. Returns the state and the last refined problem, or None.
+    """
     from jeit.inverse.shapes.finer import finer
 
     given, there = state.setting, None
@@ -319,14 +330,16 @@ def _without_ghosts(
     least_rise: float,
     known: Float[np.ndarray, " k"] | None = None,
 ) -> _Found:
-    """The bodies that are missed when they are left out and the rest fitted again; the least missed goes first.
+    """Remove bodies without which the others, fitted again, explain the data about as well; one at a time, starting
+    with the body whose absence raises the cost least.
 
-    `known`: the cost without each, at least, if that is known.
+    `known`: lower limit of the cost without each body, if known.
     """
     doubtful, missed = list(doubtful), np.zeros(len(fitted.bodies.sign)) if known is None else known.copy()
     while True:
         bodies, coefficients, cost, _ = fitted
-        # With one ghost fewer that others can replace, the remaining bodies are missed at least as much.
+        # After a ghost is removed, leaving out another body raises the cost at least as much as before, so costs
+        # computed earlier are lower limits.
         beyond_doubt = max(_SURELY * cost, problem.surprise(fitted) + _MARGIN)
         unsure, others = np.flatnonzero(missed <= beyond_doubt).tolist(), {}
         for k in unsure:
@@ -362,7 +375,7 @@ def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
 
 
 def _of_one_material(problem: ShapeProblem, fitted: Fit) -> Fit:
-    """The ellipsoids with those of either sign of one material, where that is likelier than that each is of its own."""
+    """The ellipsoids, with one material for all bodies of a sign where that is likelier than a material for each."""
     for sign in (1, -1):
         bodies = fitted.bodies
         if isinstance(bodies, Ellipsoids) and ((bodies.sign == sign) & ~bodies.alike).sum() > 1:
@@ -372,8 +385,8 @@ def _of_one_material(problem: ShapeProblem, fitted: Fit) -> Fit:
 
 
 def _best(problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]) -> Fit | None:
-    """The least cost from several starts, by which a few steps are best; None where those are hopeless beside what is
-    fitted."""
+    """Make a few steps from each of several starts, and fit the best of them to convergence. None if its cost is more
+    than `_SURELY` times that of `fitted`."""
     tried = [problem.fit(*one, _STEPS_TRIED, _ROUGHLY) for one in starts]
     best = min(tried, key=lambda one: one.cost, default=None)
     if best is None or best.cost > _SURELY * fitted.cost:
@@ -382,19 +395,21 @@ def _best(problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Flo
 
 
 def _is_supported(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
-    """Whether the evidence is for the other."""
+    """Whether the evidence for `other` exceeds that for `simple` by the margin."""
     return problem.surprise(other) + _MARGIN <= problem.surprise(simple)
 
 
 def _changed(problem: ShapeProblem, found: _Found, least_rise: float) -> _Found:
-    """The bodies that explain the data best once some are split and others of the other kind; or as they are."""
+    """Search for better bodies, starting once with a split and once with a change of kind; the likelier result, or
+    `found` if neither change is supported."""
     changes = [_in_two(problem, found.fit, least_rise), _otherwise(problem, found.fit)]
     ways = [_searched(problem, found, one, least_rise) for one in changes if one is not None] or [found]
     return min(ways, key=lambda one: problem.surprise(one.fit))
 
 
 def _searched(problem: ShapeProblem, found: _Found, changed: Fit, least_rise: float) -> _Found:
-    """The bodies that explain the data once they are `changed`: split one by one, and then other kinds tried."""
+    """Search onwards from the bodies `changed`: remove ghosts, then split a body or, if no split is supported, change
+    a kind, until no change is supported."""
     for _ in range(_MOST_CHANGES):
         found = _without_ghosts(problem, changed, found.doubtful, least_rise)
         change = _in_two(problem, found.fit, least_rise) or _otherwise(problem, found.fit)

@@ -1,8 +1,8 @@
-"""Star shapes: an outline r(θ) round a centre, of bodies in a sheet or seen from above.
+"""Star-shaped bodies in a sheet, or in the plane of a tank: an outline r(θ) around a centre.
 
-    log r(θ) = log r₀ + Σ aₙ cos nθ + bₙ sin nθ,  n = 2 … N.
+    log r(θ) = log r₀ + Σ (aₙ cos nθ + bₙ sin nθ),  n = 2 … N.
 
-Contrasts, and what they make of the conductivity, are those of `jeit.inverse.shapes.bodies`.
+`jeit.inverse.shapes.bodies` describes contrast and conductivity.
 """
 
 from __future__ import annotations
@@ -19,22 +19,25 @@ from jeit.mesh import Mesh, measures
 
 # Barycentric weights of the six points at which a cell is sampled.
 _SAMPLES = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2.5, 2.5, 1], [2.5, 1, 2.5], [1, 2.5, 2.5]]) / 6
-# Width of the blur of an outline, in units of a cell's size: enough to be differentiable.
+# Width of the blur of an outline, in units of the cell size: large enough for the coverage to be differentiable.
 _BLUR = 0.2
-# Widths of the blur from an outline beyond which a cell's share is less than 1e-12.
+# Distance from an outline, in widths of the blur, beyond which the covered share of a cell is less than 1e-12.
 _REACH = 30
 _OUTLINE = 128
 
 
 @dataclass(frozen=True)
 class StarPrior(BodyPrior):
-    """Prior of stars: `modes`, N, the finest waves of an outline, 1 makes disks; `roughness`, of the logarithm of r in
-    the second mode; the others have 2/n of it. The rest as of `BodyPrior`, and:
+    """Prior of stars. Fields that are not listed are described in `BodyPrior`.
 
-    - `contrast` of log σ and its spread. A body ten times as conductive or resistive as the bath can hardly be
-      distinguished from a stronger one: the contrast of strong bodies is best held fixed at a strong value.
-    - `weak_contrast` and the spread of its logarithm: of bodies that the data show to be weak. `odds_against_weak`: how
-      many times as likely strong ones are beforehand.
+    - `modes`: N, number of the highest mode of an outline; 1 gives disks.
+    - `roughness`: standard deviation of a₂ and b₂; for aₙ and bₙ it is multiplied by 2/n.
+    - `contrast`, `contrast_spread`: mean and standard deviation of the contrast in log σ of a strong body. Data hardly
+      distinguish a body ten times as conductive or resistive as the bath from a stronger one, so these are best kept
+      close to a high value.
+    - `weak_contrast`, `weak_spread`: median of the contrast in log σ of a weak body, and standard deviation of its
+      logarithm.
+    - `odds_against_weak`: prior odds of a strong body relative to a weak one.
     """
 
     modes: int = 4
@@ -46,17 +49,19 @@ class StarPrior(BodyPrior):
 
     @property
     def size(self) -> int:
-        """Coefficients of a body: centre, log radius, contrast, and two of every mode from the second."""
+        """Number of coefficients of a body: centre, log radius, contrast, and two for each mode from the second."""
         return 4 + 2 * (self.modes - 1)
 
     def deviation(self, span: float) -> Float[np.ndarray, " q"]:
-        """Standard deviations of a body's values, 1 of its contrast; `span` of the whole body, metres."""
+        """Prior standard deviations of a body's parameters, 1 for its contrast; `span`: longest side of the domain,
+        metres."""
         mode = self.roughness * 2 / np.arange(2, self.modes + 1)
         first = [self.place * span, self.place * span, self.radius_spread, 1.0]
         return np.concatenate([first, np.repeat(mode, 2)])
 
     def contrast_of(self, coefficient: float, other: bool) -> tuple[float, float]:
-        """Contrast of log σ of a body, weak if `other`, positive, and its derivative."""
+        """Contrast in log σ, without its sign, of a body that is weak if `other`; and its derivative with respect to
+        the coefficient."""
         if not other:
             return self.contrast + self.contrast_spread * coefficient, self.contrast_spread
         contrast = self.weak_contrast * np.exp(self.weak_spread * coefficient)
@@ -64,12 +69,13 @@ class StarPrior(BodyPrior):
 
 
 class Star(eqx.Module):
-    """A body found in a sheet, with a star-shaped outline.
+    """Body with a star-shaped outline, found in a sheet.
 
-    **Fields**: `sign`, +1 conductive or -1 resistive; `centre` (2,), of the star, metres; `outline` (k, 2), metres,
-    counter-clockwise; `contrast` of log σ, positive, estimated from the data where the body is `weak`, else the
-    prior's, "at least about so much"; `rise`, the factor by which the least objective grows without this body, which
-    distinguishes a body from a ghost.
+    **Fields**: `sign`: +1 if more conductive than the bath, -1 if less; `centre` (2,): centre of the star, metres;
+    `outline` (k, 2): points of the outline, metres, counter-clockwise; `contrast`: contrast in log σ, without its sign;
+    `weak`: whether the body is weak, so that the data determine its contrast: for other bodies the contrast follows the
+    prior and is roughly a lower limit; `rise`: factor by which the minimum of the objective increases without this
+    body, small for a ghost.
     """
 
     sign: int
@@ -86,12 +92,12 @@ class Star(eqx.Module):
 
     @property
     def measure(self) -> float:
-        """The area, m²."""
+        """Area, m²."""
         return self.area
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether the contrast is determined by the data: true of weak bodies."""
+        """Whether the data determine the contrast: True for weak bodies."""
         return self.weak
 
     @property
@@ -101,7 +107,7 @@ class Star(eqx.Module):
         return first / area
 
     def holds(self, points: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
-        """Whether points, metres, lie inside."""
+        """Whether each of `points`, in metres, lies inside the body."""
         corner, offset = self._from_centre(self.outline), self._from_centre(points)
         angle = np.unwrap(np.angle(corner))
         turn = angle[0] + (np.angle(offset) - angle[0]) % (2 * np.pi)
@@ -118,7 +124,7 @@ class Star(eqx.Module):
 
 
 class _Values(NamedTuple):
-    """A star's: `waves` are aₙ - i bₙ."""
+    """Centre (x + iy, metres), log radius and `waves` aₙ - i bₙ of a star."""
 
     centre: complex
     log_radius: float
@@ -129,8 +135,8 @@ class _Values(NamedTuple):
 class Stars(Bodies):
     """Stars on a mesh.
 
-    **Fields**, besides those of `Bodies`: `points` (m, s), where cells are sampled, x + iy in metres; `width` (m,) of
-    the blur, metres; `edges` (b, 2) of the whole body, from point to point.
+    **Fields**, besides those of `Bodies`: `points` (m, s): sampling points of the cells, x + iy in metres; `width`
+    (m,): width of the blur, metres; `edges` (b, 2): end points of the edges of the domain's boundary, x + iy in metres.
     """
 
     points: Complex[np.ndarray, "m s"]
@@ -139,7 +145,7 @@ class Stars(Bodies):
 
     @classmethod
     def create(cls, mesh: Mesh, prior: BodyPrior, start, sign) -> Stars:
-        """`start` (k, 2), metres."""
+        """Create stars for a mesh, with starting centres `start` (k, 2), metres."""
         points = np.asarray(mesh.points) @ np.array([1, 1j])
         corners, edges = points[np.asarray(mesh.cells)], points[np.asarray(mesh.facets)]
         span = float(np.ptp(np.asarray(mesh.points), axis=0).max())
@@ -156,11 +162,12 @@ class Stars(Bodies):
 
     @property
     def num_splits(self) -> int:
-        """Two, both axes."""
+        """2: both axes."""
         return 2
 
     def otherwise(self, some, coefficients) -> tuple[Stars, Float[np.ndarray, " n"]]:
-        """The same stars with `some` of them weak, and larger by as much as keeps their effect on the field."""
+        """The stars with those of indices `some` made weak and enlarged to keep their effect on the electric field;
+        and their coefficients."""
         rows, weak = self.rows(coefficients), self.other.copy()
         for k in some:
             strength = np.tanh(self.contrast(k, rows[k])[0] / 2) / np.tanh(self.prior.weak_contrast / 2)
@@ -169,20 +176,20 @@ class Stars(Bodies):
         return replace(self, other=weak), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):
-        """2 artanh(share · tanh(contrast / 2)), Maxwell Garnett's formula: the effect on the field of a cell that is
-        covered in part is that share of the effect of a covered cell."""
+        """2 artanh(share · tanh(contrast / 2)), Maxwell Garnett's formula: a partly covered cell has `share` times the
+        effect of a covered cell on the electric field. Also its derivatives with respect to `share` and `contrast`."""
         strength = np.tanh(contrast / 2)
         steep = 1 / (1 - (share * strength) ** 2)
         return 2 * np.arctanh(share * strength), 2 * strength * steep, steep * share * (1 - strength**2)
 
     def axis(self, k: int, row, number: int):
-        """The longer one, and across it; along x and y of a disk."""
+        """Unit vector along the longer axis of star k (`number` 0) or across it (1); along x or y for a disk."""
         waves = self._values(k, row).waves
         angle = number * np.pi / 2 - (np.angle(waves[0]) / 2 if len(waves) else 0)
         return np.array([np.cos(angle), np.sin(angle)])
 
     def body(self, k: int, coefficients, rise: float = np.nan) -> Star:
-        """Star k, as far as it lies in the body."""
+        """Star k, with its outline clipped to the domain."""
         row = self.rows(coefficients)[k]
         centre, log_radius, waves = self._values(k, row)
         direction = np.exp(2j * np.pi * np.arange(_OUTLINE) / _OUTLINE)
@@ -205,7 +212,8 @@ class Stars(Bodies):
         return _Values(complex(*self.centre(k, row)), self.log_radius(row), values[0::2] - 1j * values[1::2])
 
     def _wave(self, waves, direction):
-        """Σ aₙ cos nθ + bₙ sin nθ and its slope, for directions exp iθ; and the powers exp inθ, n = 2 … N."""
+        """Σ (aₙ cos nθ + bₙ sin nθ) and its derivative with respect to θ, for `direction` exp iθ; and the powers
+        exp inθ, n = 2 … N."""
         number = np.arange(2, self.prior.modes + 1)
         repeated = np.broadcast_to(direction, (self.prior.modes, *direction.shape))
         powers = np.cumprod(repeated, axis=0, dtype=complex)[1:]
@@ -213,9 +221,9 @@ class Stars(Bodies):
         return sums[0].real, sums[1].real, powers
 
     def covered(self, k: int, row) -> Covered:
-        """Cells that star k reaches."""
+        """Coverage of cells by star k, whose coefficients are `row`."""
         centre, log_radius, waves = self._values(k, row)
-        # No outline lies farther out, and beyond so many widths of the blur no share is left.
+        # Upper limit of the outline's distance from the centre; cells farther out by `_REACH` widths are not covered.
         farthest = np.exp(np.minimum(log_radius + np.abs(waves).sum(), np.log(10 * self.span)))
         cells = np.flatnonzero(np.abs(self.points[:, 0] - centre) < farthest + _REACH * self.width)
         offset, width = self.points[cells] - centre, self.width[cells, None]
@@ -225,7 +233,7 @@ class Stars(Bodies):
         radius = np.exp(np.minimum(log_radius + wave, np.log(10 * self.span)))
         inside = 0.5 * (1 + np.tanh(0.5 * (radius - distance) / width))
         edge = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(r - distance)
-        # As the centre moves by dz, the distance falls by Re(dz/u), and θ by Im(dz/u) / distance; u is the direction.
+        # If the centre moves by dz, the distance decreases by Re(dz/u) and θ by Im(dz/u) / distance; u is `direction`.
         towards = (edge * (1 - 1j * radius * slope / distance) * direction).sum(axis=1)
         along = edge * radius
         modes = np.einsum("ms,nms->mn", along, powers)
@@ -236,8 +244,8 @@ class Stars(Bodies):
 
 
 def _first_crossing(centre: complex, direction, edges) -> tuple[Float[np.ndarray, " k"], bool]:
-    """Distance from `centre` at which lines in some `direction` (k,) first cross `edges` (b, 2), infinity where they do
-    not; and whether the closed line that these are goes round it."""
+    """Distance from `centre` at which the ray in each `direction` (k,) first crosses `edges` (b, 2), infinite if it
+    does not; and whether the closed line formed by the edges encloses `centre`."""
     start, along = edges[:, 0] - centre, edges[:, 1] - edges[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         across = _cross(direction[:, None], along)

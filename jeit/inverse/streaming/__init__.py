@@ -1,1 +1,1 @@
-"""Imaging frame after frame in bounded time: `Imager`, and `stream`, which handles bad frames."""
+"""Imaging of successive frames in bounded time: `Imager`, and `stream`, which also handles faulty frames."""

@@ -1,9 +1,9 @@
-"""`Imager`: images frame after frame, linear or by Gauss-Newton from the last image, in a bounded time.
+"""Imaging of successive frames in bounded time (`Imager`): linear, or by Gauss-Newton steps from the last image.
 
-Everything that does not depend on the frame is computed once: which channels are independent, the prior's basis, the
-hyperparameter, the electrodes' integrals, the linear image's matrix, and the combinations of the prior's shapes, some
-dozens, that the data can resolve. Array shapes never change, so nothing is compiled again: a channel that is masked
-keeps its place, and gets a variance so large that it does not count.
+Everything that does not depend on the frame is computed once: the independent channels, the prior's basis, the
+hyperparameter, the electrodes' integrals, the matrix of linear images, and the combinations of the prior's shapes, a
+few dozen, that the data can resolve. Array shapes never change, so nothing is compiled again: a masked channel keeps
+its place but gets a variance so large that it has no effect.
 """
 
 from __future__ import annotations
@@ -32,26 +32,27 @@ from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit_solvers.engines import as_array
 
 FRAME_STEPS = 4
-"""Most iterations that a frame is given, unless the solver says otherwise."""
-# The tolerance unless the solver says otherwise, and the least information of a shape that is kept.
+"""Default maximum number of iterations per frame."""
+# Default tolerance of the solver; default minimum signal of a shape (see `Parametrisation.informative`).
 _RTOL, _INFORMATIVE = 1e-3, 0.03
-# Standard deviation of a masked channel over the largest noise. With a larger one, combinations that only masked
-# channels measure would have no inverse in double precision.
+# Ratio of the standard deviation assigned to masked channels to the largest noise. With a larger ratio, matrices of
+# combinations that only masked channels measure could not be inverted in double precision.
 _BLIND = 1e3
 
 
 def check_memory(memory) -> None:
-    """Raises `ValueError` for what is no number of frames."""
+    """Raises `ValueError` unless `memory` is a number of frames from 0."""
     if not (is_number(memory) and memory >= 0):
         raise ValueError(f"memory must be a number of frames, or 0 for none; it is {describe(memory)}.")
 
 
 class FrameEstimate(eqx.Module):
-    """Result of an `Imager` for one frame by iteration.
+    """Result of an iterative `Imager` for one frame.
 
-    **Fields**: `conductivity` (m,), S/m (2-D: S); `coefficients`, where the next frame may start; `misfit`, root mean
-    square in standard deviations of the channels used; `iterations`; `converged`, whether one more step would have
-    changed the objective by less than the tolerance.
+    **Fields**: `conductivity` (m,): S/m (2-D: S); `coefficients` (n,): coefficients of the image, from which the next
+    frame may start; `misfit`: root mean square of predicted - measured over the channels used, in standard deviations;
+    `iterations`: number of iterations; `converged`: whether another step would have changed the objective by less than
+    the tolerance.
     """
 
     conductivity: Float[Array, " m"]
@@ -62,10 +63,11 @@ class FrameEstimate(eqx.Module):
 
 
 class LinearMap(eqx.Module):
-    """The linear image: σ = `level` (m,) + `matrix` (m, k) · `estimator` (k, M) · voltages (M,), S/m (2-D: S).
+    """Linear image σ = `level` (m,) + `matrix` (m, k) · `estimator` (k, M) · voltages (M,), S/m (2-D: S).
 
-    k is the number of independent channels or of the prior's shapes, whichever is smaller. With a memory, the weights
-    of the last image's shapes (k,), less those of an undisturbed frame, come in times `carry` (k, k).
+    k is the number of independent channels or of the prior's shapes, whichever is smaller. With a memory, `carry`
+    (k, k) times the last image's weights (k,), relative to those of an undisturbed frame, is added to the weights that
+    `matrix` multiplies.
     """
 
     matrix: Float[Array, "m k"]
@@ -75,14 +77,15 @@ class LinearMap(eqx.Module):
 
 
 class Imager(eqx.Module):
-    """Images frames of one sensor. Made by `Imager.create`; `stream` passes frames to it, and handles bad ones.
+    """Imager for the frames of one sensor, created by `Imager.create`; `stream` passes frames to it and handles faulty
+    ones.
 
-    **Fields**: `channels`, which of them are independent; `inversion`, the problem, whose data are exchanged for every
-    frame's; `noise` (M,), volts; `mask` (M,), the channels used at all; `expected` (M,) volts, an undisturbed frame;
-    `offset` (M,) volts, added to frames: the part of the model's voltages that the sensor's lack; `touching` (L, M),
-    channels that drive or read each electrode; `tied`, pairs (P, 2) of channels that reciprocity ties, and the ratio
-    (P,) of the second's voltage to the first's; `solver`, with the most iterations that a frame is given;
-    `persistence`, the share of the last image that the next one is expected to keep, 0 without a memory.
+    **Fields**: `channels`: independent channels; `inversion`: the problem, whose data are replaced for every frame;
+    `noise` (M,): volts; `mask` (M,): True for channels that are used; `expected` (M,): voltages of an undisturbed
+    frame; `offset` (M,): model's minus sensor's voltages of the undisturbed body, added to frames; `touching` (L, M):
+    True for channels that drive or read each electrode; `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,)
+    of the second voltage to the first; `solver`: solver with its settings; `persistence`: fraction of the last image
+    that is expected in the next one, 0 without a memory.
     """
 
     channels: IndependentChannels
@@ -111,15 +114,20 @@ class Imager(eqx.Module):
         parametrisation: Parametrisation | None = None,
         memory: float = 0.0,
     ) -> "Imager":
-        """`background`: conductivity of the undisturbed body, S/m (2-D: S). `reference` (M,): a measured frame of it,
-        volts; frames are then imaged by their difference to it, so that errors of the model cancel. `solver`:
-        `GaussNewton()` unless given, `LevenbergMarquardt()` or, for linear images, `OneStep()`; by at most 4 steps a
-        frame, and until the objective changes by less than 1e-3, unless it says otherwise. `prior`: `Gaussian` of a
-        twelfth of the body's width unless given. `parametrisation`: its link, regions and `informative` shapes.
-        `memory`: frames over which an image changes; the last image then predicts the next (a Kalman filter in its
-        steady state, of coefficients with covariance exp(-|t - t'| / memory) in time), which takes noise out and lags
-        by a part of it; 0 takes every frame alone. The rest as in `reconstruct`. Raises `ValueError` for arguments that
-        do not fit.
+        """Create an imager for a forward model.
+
+        - `background`: conductivity of the undisturbed body, S/m (2-D: S).
+        - `reference` (M,): measured frame of the undisturbed body, volts. Images are then computed from differences to
+          it, so that model errors cancel.
+        - `solver`: `GaussNewton()` (default), `LevenbergMarquardt()`, or `OneStep()` for linear images. Defaults are 4
+          steps per frame and a tolerance of 1e-3 for the relative change of the objective.
+        - `prior`: by default `Gaussian` with a length of about a twelfth of the body's width.
+        - `parametrisation`: link, regions and `informative` shapes.
+        - `memory`: number of frames over which images are correlated. The last image then predicts the next one (a
+          steady-state Kalman filter for coefficients with covariance exp(-|t - t'| / memory) in time), which reduces
+          noise and adds a lag of part of the memory. With 0, every frame is imaged independently.
+
+        Other arguments are as in `reconstruct`. Raises `ValueError` for arguments that do not fit together.
 
         Kaipio, Karjalainen, Somersalo and Vauhkonen, Ann. N. Y. Acad. Sci. 873 (1999) 430-439.
         """
@@ -138,7 +146,7 @@ class Imager(eqx.Module):
         small = model.with_protocol(model.protocol.subset(np.asarray(channels.index)))
         inversion, _ = pose(
             eqx.tree_at(lambda m: m.electrodes, small, IntegratedElectrodes(model.electrodes, model.mesh)),
-            channels.weigh(_blinded(deviation, used)).combine(predicted),
+            channels.weigh(_masked_noise(deviation, used)).combine(predicted),
             background,
             prior,
             hyperparameter,
@@ -163,33 +171,33 @@ class Imager(eqx.Module):
 
     @property
     def start(self) -> Float[Array, " n"]:
-        """Coefficients of the background: where the first frame starts."""
+        """Coefficients of the background, from which the first frame starts."""
         return jnp.zeros(self.inversion.num_coefficients)
 
     @property
     def steps(self) -> int:
-        """Most iterations that a frame is given."""
+        """Maximum number of iterations per frame."""
         return 1 if self.solver.is_linear else self.solver.descent(FRAME_STEPS, _RTOL).history - 1
 
     def weighing(self, usable: Bool[Array, " M"]) -> Weighing:
-        """Weights that combine frames of which only the `usable` channels count."""
-        return self.channels.weigh(_blinded(self.noise, self.mask & usable))
+        """Map from frames to data in which only the `usable` channels have an effect."""
+        return self.channels.weigh(_masked_noise(self.noise, self.mask & usable))
 
     def linear_map(self, weighing: Weighing) -> LinearMap:
-        """The linear image for frames combined in this way: one Gauss-Newton step from the background."""
+        """Linear image of frames with this weighing: one Gauss-Newton step from the background."""
         return _linear_map(self.inversion, weighing, self.offset, self.persistence)
 
     def estimate(self, frame: Float[Array, " M"], weighing: Weighing, start: Float[Array, " n"]) -> FrameEstimate:
-        """The image of a frame (M,) in volts, by at most `steps` iterations from coefficients `start`.
+        """Image of a frame (M,) in volts, computed by at most `steps` iterations from coefficients `start`.
 
-        With a memory, `start` is also what the prior expects: `persistence` times the last image's coefficients.
-        Channels that do not count must hold some finite voltage, best that of the last frame.
+        With a memory, `start` is also the prior mean, `persistence` times the last image's coefficients. Unused
+        channels must hold finite voltages, preferably those of the last frame.
         """
         return _estimate(self, frame, weighing, start)
 
 
 def _check_together(solver: AbstractSolver, prior: AbstractPrior, parametrisation: Parametrisation, memory) -> None:
-    """Raise `ValueError` for settings that need a covariance, or more than a bounded time."""
+    """Raise `ValueError` for settings that need a covariance the prior does not have, or unbounded time."""
     if memory > 0 and not prior.is_quadratic:
         raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
     if solver.is_linear and not prior.is_quadratic:
@@ -200,7 +208,8 @@ def _check_together(solver: AbstractSolver, prior: AbstractPrior, parametrisatio
 
 
 def _check_reference(measured, predicted) -> None:
-    """Check units and polarity: a factor of ten, or a wrong sign, is not an error of the model."""
+    """Check units and polarity. Raise `ValueError` if measured and predicted voltages differ by a factor of ten or in
+    sign, which model errors do not explain."""
     ratio = measured @ predicted / (predicted @ predicted)
     if not 0.1 < ratio < 10:
         raise ValueError(
@@ -209,7 +218,7 @@ def _check_reference(measured, predicted) -> None:
         )
 
 
-def _blinded(noise, used) -> Float[Array, " M"]:
+def _masked_noise(noise, used) -> Float[Array, " M"]:
     return jnp.where(used, noise, _BLIND * jnp.max(jnp.where(used, noise, 0)))
 
 
@@ -223,7 +232,7 @@ def _linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: f
     if inversion.num_coefficients <= len(residual):
         shapes = jnp.eye(inversion.num_coefficients)
         carry = persistence * (shapes - gain @ jacobian)
-    else:  # never with a memory, whose shapes are no more than the data
+    else:  # not reached with a memory, because there are then no more shapes than data
         shapes, gain = gain.T, jnp.eye(len(residual))
         carry = jnp.zeros_like(gain)
     matrix = jax.vmap(inversion.basis.expand)(shapes).T * inversion.link.slope(inversion.reference)[:, None]
@@ -236,14 +245,14 @@ def _estimate(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate
     data = weighing.combine(frame + imager.offset)
     inversion = eqx.tree_at(lambda i: i.data, imager.inversion, data)
     expected = jnp.zeros_like(start)
-    if imager.persistence > 0:  # the prior's centre moves, and the coefficients count from there
+    if imager.persistence > 0:  # the prior mean moves, and the coefficients are relative to it
         expected, start = start, expected
         inversion = eqx.tree_at(lambda i: i.reference, inversion, inversion.estimate(expected))
     descent = imager.solver.descent(FRAME_STEPS, _RTOL)
     solution = optx.least_squares(
         residual, descent, start, inversion, options={"expand": expand}, max_steps=imager.steps, throw=False
     )
-    # The last step leads to a point not looked at yet. It takes voltages, but no Jacobian, to see if it is better.
+    # The point reached by the last step has not been evaluated; its cost takes voltages but no Jacobian.
     state = solution.state
     cost = inversion.cost(state.trial)
     better = cost < state.cost
@@ -255,5 +264,5 @@ def _estimate(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate
         coefficients=expected + coefficients,
         misfit=jnp.sqrt(squares / jnp.sum(weighing.noise <= jnp.max(imager.noise))),
         iterations=state.num_accepted - 1 + better,
-        converged=state.converged | (least <= descent.atol),  # no step can lower it by more than there is
+        converged=state.converged | (least <= descent.atol),  # no step can lower the cost by more than its value
     )

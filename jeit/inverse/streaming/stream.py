@@ -1,4 +1,4 @@
-"""Streams: frames are checked, and imaged one after the other."""
+"""Streams: frames are checked and imaged one after another."""
 
 from __future__ import annotations
 
@@ -17,39 +17,44 @@ from jeit.inverse.nonlinear.solvers import counted_iterations
 from jeit.inverse.streaming.imager import Imager
 from jeit_solvers import Status
 
-# A frame that differs from an undisturbed one by more than this share is another sensor's, or faulty.
+# Relative difference from an undisturbed frame above which a frame is faulty or from another sensor.
 _LARGEST_DIFFERENCE = 0.5
-# Beyond this change, an electrode counts as dead if its channels have changed by half or more and hold most of the
-# change.
+# Relative difference from an undisturbed frame above which dead electrodes and saturation are looked for. An electrode
+# is dead if without its channels at most the second fraction of the difference is left, and if the median relative
+# change of its channels exceeds the third number.
 _SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
+# Minimum fraction of the channels in use that must be usable.
 _LEAST_CHANNELS = 0.5
-# Beyond the same change, this many channels with equal readings, above or below all others, are at a rail.
+# Minimum number of channels with equal readings, above or below all others, that count as saturated; relative
+# difference within which their undisturbed voltages count as equal.
 _AT_RAIL, _ALIKE = 3, 1e-6
-# Reciprocal channels that hold only noise agree by chance: a change is detected from this many standard deviations of
-# that agreement, over at least this many pairs; a relative change smaller than the last number, against an undisturbed
-# frame, counts as none.
+# A frame differs from an undisturbed one by more than noise if the correlation of the changes of reciprocal channels
+# exceeds that of independent noise. Threshold in standard deviations; minimum number of pairs; relative change of a
+# frame below which it counts as equal to the undisturbed one.
 _CHANCE, _FEWEST_PAIRS, _EQUAL = 3.0, 10, 1e-12
 
 
 class FrameStatus(StrEnum):
-    """Status of a frame. Each is equal to its word."""
+    """Status of a frame, as a string."""
 
     IMAGED = "imaged"
     PARTIAL = "partial"
-    """Imaged, with some channels left out."""
+    """The frame was imaged, with some channels left out."""
     UNCHANGED = "unchanged"
-    """Imaged, though it differs from an undisturbed frame by noise alone."""
+    """The frame was imaged, but differs from an undisturbed frame by noise only."""
     STEP_LIMIT = Status.STEP_LIMIT.value
-    """Imaged, though the steps that a frame is given were too few for it to converge."""
+    """The frame was imaged, but did not converge within the maximum number of steps."""
     REFUSED = "refused"
-    """There is no image of it."""
+    """The frame was not imaged."""
 
 
 class FrameCheck:
-    """Checks frames (M,) of a sensor that reads `expected` (M,) volts when undisturbed, in the channels of `mask`.
+    """Check of the frames (M,) of a sensor for faults.
 
-    `touching` (L, M): which channels each electrode takes part in. `tied`: pairs (P, 2) of channels that reciprocity
-    ties, and the ratio (P,) of the second's voltage to the first's. `noise` (M,): volts, relative to each other.
+    `mask` (M,): True for channels that are used. `expected` (M,): voltages of an undisturbed frame. `touching` (L, M):
+    True for channels that drive or read each electrode. `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,)
+    of the second voltage to the first. `noise` (M,): standard deviation of the channels, volts or relative to each
+    other.
     """
 
     def __init__(
@@ -67,16 +72,16 @@ class FrameCheck:
         self.size = np.linalg.norm(expected[mask])
         self.ordinary = (_SUSPICIOUS * self.size) ** 2
 
-    @np.errstate(over="ignore")  # a square that overflows is not an ordinary one
+    @np.errstate(over="ignore")  # a frame whose square overflows is treated as faulty
     def __call__(self, frame):
-        """Values, usable channels, status and reason of a frame as it came."""
-        values, usable, status, reason = self._looked_at(frame)
-        if status != FrameStatus.REFUSED and (noise := self._unchanged(values, usable)):
+        """Values, usable channels, status and reason of a raw frame."""
+        values, usable, status, reason = self._inspect(frame)
+        if status != FrameStatus.REFUSED and (noise := self._reason_unchanged(values, usable)):
             return values, usable, FrameStatus.UNCHANGED, f"{reason} {noise}".lstrip()
         return values, usable, status, reason
 
-    def _unchanged(self, values, usable) -> str:
-        """A sentence, if a frame differs from an undisturbed one by noise alone."""
+    def _reason_unchanged(self, values, usable) -> str:
+        """Sentence that says that a frame differs from an undisturbed one by noise only; empty if it does not."""
         change = np.where(usable, values - self.expected, 0)
         if np.linalg.norm(change) <= _EQUAL * self.size:
             return "It equals an undisturbed frame."
@@ -89,7 +94,7 @@ class FrameCheck:
             return ""
         return "Nothing but noise: reciprocal channels change alike as by chance."
 
-    def _looked_at(self, frame):
+    def _inspect(self, frame):
         none = np.zeros_like(self.mask)
         if np.ma.isMaskedArray(frame):
             frame = np.ma.filled(frame.astype(float), np.nan)
@@ -103,7 +108,7 @@ class FrameCheck:
             reason = f"The frame is {values.dtype} of shape {values.shape}, not {self.mask.size} real voltages."
             return values, none, FrameStatus.REFUSED, reason
         change = (values - self.expected)[self.mask]
-        if change @ change < self.ordinary:  # which NaN is not, nor a frame of zeros
+        if change @ change < self.ordinary:  # False for frames with NaN and for frames of zeros
             return values, self.mask, FrameStatus.IMAGED, ""
         finite = np.isfinite(values)
         usable = self.mask if finite.all() else self.mask & finite
@@ -135,10 +140,11 @@ class FrameCheck:
         return values, usable, FrameStatus.IMAGED, ""
 
     def _without_dead_electrode(self, difference, usable):
-        """The usable channels less those of an electrode that explains most of a large difference, and a sentence."""
+        """Usable channels without those of a dead electrode, and a sentence; all usable channels and an empty string if
+        no electrode is dead."""
         total = np.linalg.norm(difference)
         left = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
-        # An electrode that all channels read, such as a common reference, cannot be left out.
+        # An electrode whose removal leaves too few channels, such as a common reference, cannot be left out.
         left[(usable & ~self.touching).sum(axis=1) < _LEAST_CHANNELS * self.mask.sum()] = np.inf
         electrode = int(np.argmin(left))
         if not np.isfinite(left[electrode]):
@@ -152,14 +158,14 @@ class FrameCheck:
         return rest, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
 
     def _at_rail(self, values, usable):
-        """Channels of an amplifier that can give no more."""
+        """Channels (M,) at which the amplifier is saturated."""
         far = np.abs(values - self.expected) > _SUSPICIOUS * np.abs(self.expected)
         rail = np.zeros_like(usable)
         for end in (values[usable].max(), values[usable].min()):
             same = usable & (values == end)
             if np.count_nonzero(same) < _AT_RAIL or not end:
                 continue
-            # Channels that symmetry makes equal, in numbers that nobody measured, are so undisturbed too.
+            # Channels that are equal by symmetry, as in simulated frames, are also equal in the undisturbed frame.
             if far[same].all() and np.ptp(self.expected[same]) > _ALIKE * np.abs(self.expected[same]).max():
                 rail |= same
         return rail
@@ -176,10 +182,11 @@ class FrameCheck:
 class FrameImage(eqx.Module):
     """Result for one frame of a stream.
 
-    **Fields**: `number`, from 0; `conductivity` (m,), S/m (2-D: S), NumPy, None for a frame that is refused; `status`,
-    and its `reason`, in a sentence, empty where all is well; `usable` (M,), the channels used; `misfit`, root mean
-    square in standard deviations (NaN for linear images, which solve no forward problem, and refused frames);
-    `iterations`; `latency`, seconds from the frame to its image.
+    **Fields**: `number`: number of the frame, from 0; `conductivity` (m,): S/m (2-D: S), a NumPy array, None for a
+    refused frame; `status`; `reason`: sentence that explains the status, empty for an ordinary frame; `usable` (M,):
+    True for the channels used; `misfit`: root mean square of predicted - measured in standard deviations (NaN for
+    refused frames and linear images, for which no forward problem is solved); `iterations`: number of iterations;
+    `latency`: time from the frame to its image, seconds.
     """
 
     number: int
@@ -193,20 +200,22 @@ class FrameImage(eqx.Module):
 
     @property
     def imaged(self) -> bool:
-        """Whether there is an image."""
+        """Whether the frame was imaged."""
         return self.conductivity is not None
 
 
 def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
-    """Images of frames (M,) in volts, each as soon as its frame has come. NaN marks channels without a reading.
+    """Yield the image of each frame (M,), in volts, as soon as the frame arrives. NaN marks channels without a reading.
 
-    Iterative methods start from the last image, and an imager with a memory expects the next one near it. Everything is
-    compiled before the first frame is asked for. A frame is refused, and the stream goes on, when it has another number
-    of channels or is not real, when fewer than half of the channels can be used, when all read zero (the current source
-    has failed), or when it differs from an undisturbed frame by more than half of it. A dead electrode's channels are
-    left out, and named, and so are those that an amplifier cuts at the ends of its range. A frame that differs from an
-    undisturbed one by noise alone is imaged, with status "unchanged". Raises `ValueError` for what is no imager, for
-    what are no frames, and for an array of frames that is not (frames, channels).
+    Iterative methods start from the last image; an imager with a memory also uses it as prior mean. Everything is
+    compiled before the first frame is requested. A frame is refused, and the stream continues, if it has another number
+    of channels, is not real, has fewer than half of the channels usable, reads zero everywhere (the current source has
+    failed), or differs from an undisturbed frame by more than half of it. Channels of a dead electrode and saturated
+    channels are left out, which `reason` reports. A frame that differs from an undisturbed one by noise only is imaged
+    with status "unchanged".
+
+    Raises `ValueError` if `imager` is not an `Imager`, if `frames` is not iterable, and for an array of frames whose
+    shape is not (frames, channels).
     """
     check_kind("imager", imager, Imager, "an Imager, as of Imager.create or prepare_imager(reference)[0]")
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
@@ -222,7 +231,7 @@ def _images(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
 
 
 class _Session:
-    """State of a stream from one frame to the next, in NumPy where JAX's dispatch would cost more than the work."""
+    """State of a stream between frames. NumPy is used where JAX's dispatch would take longer than the computation."""
 
     def __init__(self, imager: Imager):
         self.imager = imager
@@ -238,7 +247,7 @@ class _Session:
         self.coefficients = np.asarray(imager.start)
 
     def image(self, number: int, frame) -> FrameImage:
-        """The image of one frame, or the reason why there is none."""
+        """Image of one frame, or the reason why it was refused."""
         begin = time.perf_counter()
         values, usable, status, reason = self.check(frame)
         if status == FrameStatus.REFUSED:
@@ -265,8 +274,8 @@ class _Session:
         self.weighing = self.imager.weighing(jnp.asarray(usable))
         if self.imager.solver.is_linear:
             linear = self.imager.linear_map(self.weighing)
-            # Reading the matrix takes most of a linear image's time; it multiplies differences, so single will do, and
-            # BLAS reads it column by column in half the time.
+            # Reading the matrix takes most of the time of a linear image. It multiplies differences, so single
+            # precision suffices; BLAS reads it in half the time in column-major order.
             self.matrix = np.asfortranarray(linear.matrix, np.float32)
             self.estimator = np.asarray(linear.estimator)
             self.resting = self.estimator @ self.expected
@@ -274,7 +283,7 @@ class _Session:
             self.level = np.asarray(linear.level) + np.asarray(linear.matrix) @ self.resting
 
     def _estimate(self, frame):
-        """Conductivity, misfit, iterations, and whether they converged."""
+        """Conductivity, misfit, number of iterations, and whether the image converged."""
         if self.imager.solver.is_linear:
             weights = self.estimator @ frame - self.resting
             if self.imager.persistence > 0:

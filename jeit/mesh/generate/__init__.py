@@ -1,1 +1,1 @@
-"""The 2-D generator: outlines walked by arc length, triangulated, smoothed and repaired (NumPy and SciPy)."""
+"""Generator of plane meshes: outlines parametrised by arc length, triangulation, smoothing and repair."""

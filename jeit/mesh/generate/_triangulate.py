@@ -1,12 +1,12 @@
-"""Triangulation of points by the Delaunay criterion, repair of slivers, and outlines kept as edges.
+"""Delaunay triangulation of points within an outline whose segments are kept as edges, and repair of bad cells.
 
 The steps:
 
-1. `outline_nodes`: nodes along the outline, one per cell size;
+1. `outline_nodes`: place nodes along the outline at distances of the cell size;
 2. `fill`: insert circumcentres of cells that are too large, many at a time (Delaunay refinement);
 3. `smooth`: move every free node to the weighted mean of the circumcentres around it (optimal Delaunay
    triangulation, L. Chen and J. Xu, J. Comput. Math. 22 (2004) 299), triangulating anew each time;
-4. `polish` and `repair` (in `_repair`) until the smallest angle is large enough.
+4. `polish` and `repair` until the smallest angle is large enough.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from jeit.mesh.generate.curve import Curve, Size, divide, within
 
 @dataclass
 class Front:
-    """Working state of the generator: nodes on every curve by arc length, fixed and free nodes inside.
+    """State of the generator: nodes on every curve, by arc length, and fixed and free nodes inside.
 
-    `guards[k]` holds the arc lengths on curve k of sharp corners, whose two sides are not to be divided.
+    `guards[k]` contains the arc lengths of the sharp corners of curve k; segments that end there are not divided.
     """
 
     curves: list[Curve]
@@ -45,12 +45,12 @@ class Front:
         return self.num_outline + len(self.fixed)
 
     def points(self) -> np.ndarray:
-        """All nodes (n, 2): curve after curve, then fixed, then free ones."""
+        """All nodes (n, 2): nodes of each curve in turn, then fixed nodes, then free nodes."""
         on_curves = [curve.at(stops) for curve, stops in zip(self.curves, self.stops, strict=True)]
         return np.concatenate([*on_curves, self.fixed, self.free])
 
     def segments(self) -> np.ndarray:
-        """Outline segments as node pairs (s, 2), in the order of the nodes they start at."""
+        """Outline segments as pairs of nodes (s, 2), in the order of their first nodes."""
         pieces, offset = [], 0
         for stops in self.stops:
             index = np.arange(offset, offset + len(stops))
@@ -59,11 +59,11 @@ class Front:
         return np.concatenate(pieces)
 
     def guarded(self) -> np.ndarray:
-        """True for the nodes on the outline that are sharp corners, (num_outline,)."""
+        """Whether each node on the outline is a sharp corner (num_outline,)."""
         return np.concatenate([np.isin(s, g) for s, g in zip(self.stops, self.guards, strict=True)])
 
     def divide(self, chosen: np.ndarray) -> None:
-        """Put a node in the middle of the chosen outline segments (indices)."""
+        """Insert a node in the middle of each of the `chosen` outline segments (indices)."""
         offset = 0
         for k, stops in enumerate(self.stops):
             mine = chosen[(chosen >= offset) & (chosen < offset + len(stops))] - offset
@@ -74,15 +74,15 @@ class Front:
 
 
 def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
-    """Delaunay triangles (m, 3), counter-clockwise, that lie inside the outline."""
+    """Delaunay triangles (m, 3) inside the outline, counter-clockwise."""
     outline = points[: front.num_outline]
-    # Far nodes around the domain keep the outline off the hull, where collinear nodes make slivers.
+    # Distant auxiliary nodes keep the outline off the convex hull, where collinear nodes would produce slivers.
     reach = np.ptp(outline, axis=0).max()
     angle = 2 * np.pi * (np.arange(16) + 0.37) / 16
     far = outline.mean(axis=0) + 4 * reach * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     cells = Delaunay(np.concatenate([points, far])).simplices
     cells = cells[(cells < len(points)).all(axis=1)]
-    # A cell with a node inside the domain is inside; only those spanned by the outline need a test.
+    # A cell with a node in the interior lies inside; only cells whose nodes are all on the outline need a test.
     doubtful = np.flatnonzero((cells < front.num_outline).all(axis=1))
     keep = np.ones(len(cells), bool)
     keep[doubtful] = within(front.curves, points[cells[doubtful]].mean(axis=1))
@@ -93,7 +93,7 @@ def triangulate(front: Front, points: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product of plane vectors (…, 2)."""
+    """Cross products (…) of plane vectors (…, 2)."""
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
@@ -115,17 +115,18 @@ def circumcircles(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np
 
 
 def smallest_angles(corners: np.ndarray) -> np.ndarray:
-    """Smallest angle (…) in degrees of triangles (…, 3, 2); negative where they are clockwise."""
+    """Smallest angle (…) of triangles (…, 3, 2), in degrees; negative for clockwise triangles."""
     edges = np.roll(corners, -1, axis=-2) - corners
     length = np.sort(np.sqrt((edges**2).sum(-1)), axis=-1)
     area = cross(edges[..., 0, :], edges[..., 1, :])
-    # sin of the angle opposite the shortest side; that angle is below 90°, so the arcsine is the angle.
+    # Sine of the angle opposite to the shortest side, which is below 90°, so that its arcsine is the angle.
     sine = area / np.maximum(length[..., 1] * length[..., 2], 1e-300)
     return np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0)))
 
 
 def select_apart(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -> np.ndarray:
-    """Indices of points taken greedily by falling `priority`, none within `radius` of one taken before."""
+    """Select points greedily in order of decreasing `priority`, skipping points within `radius` of a selected one.
+    Returns their indices."""
     order = np.argsort(-priority, kind="stable")
     near = KDTree(points[order]).query_ball_point(points[order], radius[order], return_sorted=False)
     taken = np.zeros(len(points), bool)
@@ -138,7 +139,8 @@ def select_apart(points: np.ndarray, radius: np.ndarray, priority: np.ndarray) -
 
 
 def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: np.ndarray) -> np.ndarray:
-    """True for `points` that lie inside the outline and farther than `gap` from it; `nodes` as in the front."""
+    """Whether each of `points` lies inside the outline, at a distance of more than `gap` from it. `nodes` are the nodes
+    of `front`."""
     if not len(points):
         return np.zeros(0, bool)
     segments = front.segments()
@@ -155,7 +157,8 @@ def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: n
     return clear
 
 
-# Degrees. What is asked of the repair is a little more than what is promised.
+# Angles in degrees: the guaranteed minimum angle; the minimum that `repair` aims at, which is slightly larger; and the
+# angle below which `polish` improves a cell. Last, the maximum number of rounds of `repair`.
 PROMISED_ANGLE = 25.0
 _REPAIR_ANGLE = 25.5
 _POLISH_ANGLE = 31.0
@@ -167,14 +170,14 @@ _STEPS = np.concatenate([length * _DIRECTIONS for length in (0.02, 0.06, 0.15, 0
 
 
 def improvable(front: Front, cells: np.ndarray) -> np.ndarray:
-    """True for cells not cut off by a sharp corner of the outline, whose shape is given."""
+    """Whether each cell can be improved: no cell at a sharp corner can, since the outline determines its shape."""
     sharp = np.zeros(cells.max() + 1, bool)
     sharp[: front.num_outline] = front.guarded()
     return np.logical_not(sharp[cells].any(axis=1))
 
 
 def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.ndarray:
-    """Indices of outline segments that are not an edge of any cell."""
+    """Indices of the outline segments that are not an edge of any cell."""
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]]).astype(np.int64)
     segments = front.segments().astype(np.int64)
     present = np.isin(segments[:, 0] * num_points + segments[:, 1], edges[:, 0] * num_points + edges[:, 1])
@@ -182,10 +185,10 @@ def missing_segments(front: Front, cells: np.ndarray, num_points: int) -> np.nda
 
 
 def polish(front: Front, passes: int = 4) -> None:
-    """Move the free nodes of the worst cells to where the smallest angle around them is largest.
+    """Move the free nodes of the worst cells so that the smallest angle around each of these nodes grows.
 
-    Every node tries steps in eight directions, which raises the least angle without needing its gradient
-    (it has none where two cells tie).
+    Steps in eight directions are tried for each node, because the smallest angle is not differentiable where two cells
+    tie.
     """
     held = front.num_held
     for _ in range(passes):
@@ -228,10 +231,11 @@ def polish(front: Front, passes: int = 4) -> None:
 
 
 def repair(front: Front) -> bool:
-    """Insert nodes until the outline is there and every cell meets the angle asked; False if it does not end.
+    """Insert nodes until all outline segments are edges and every cell has the required minimum angle. Returns False if
+    this fails within the maximum number of rounds.
 
-    J. Ruppert, J. Algorithms 18 (1995) 548: a bad cell gets a node at its circumcentre, unless that comes too
-    close to an outline segment, which is halved instead. Many are done at a time, apart from each other.
+    J. Ruppert, J. Algorithms 18 (1995) 548: a node is inserted at the circumcentre of a bad cell, unless it would lie
+    too close to an outline segment, which is halved instead. Many cells far enough from each other are treated at once.
     """
     for round_number in range(_ROUNDS):
         points = front.points()
@@ -256,12 +260,13 @@ def _diametral(front: Front, points: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def _divisible(front: Front) -> np.ndarray:
-    """True for outline segments that do not end in a sharp corner."""
+    """Whether each outline segment may be divided: neither of its ends is a sharp corner."""
     return np.logical_not(front.guarded()[front.segments()].any(axis=1))
 
 
 def _recover(front: Front, points: np.ndarray, missing: np.ndarray, *, remove: bool) -> None:
-    """Make missing segments appear: remove the free nodes close to them, or else halve them."""
+    """Make missing outline segments appear: remove the free nodes close to them or, if there are none, halve the
+    segments."""
     middle, half = _diametral(front, points)
     if remove and len(front.free):
         near = KDTree(front.free).query_ball_point(middle[missing], half[missing])
@@ -279,7 +284,7 @@ def _refine(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray
     centre = centre[chosen]
     middle, half = _diametral(front, points)
     divisible = _divisible(front)
-    # A segment is encroached upon if the new node falls into the circle over it.
+    # A segment is encroached upon if a new node lies in the circle whose diameter is the segment.
     near = KDTree(centre).query_ball_point(middle, half * (1 - 1e-9))
     encroached = np.array([len(n) > 0 for n in near])
     spoilt = np.zeros(len(centre), bool)
@@ -297,15 +302,16 @@ def _refine(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray
     front.divide(halved)
 
 
-# Largest circumradius per wanted cell size: makes the mean edge equal the size (an equilateral cell has 0.577).
+# Maximum ratio of circumradius to cell size, chosen so that the mean edge equals the cell size (the ratio of an
+# equilateral triangle is 0.577).
 _FILLING = 0.74
 _SMOOTHING_STEPS = 14
-# A corner sharper than this is cut off as one cell with equal sides: two cells there would be too thin.
+# Angle below which a corner is cut off by a single isosceles cell: two cells there would be too thin.
 _SHARP = np.radians(75.0)
 
 
 def outline_nodes(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, guard: float) -> Front:
-    """Nodes on the outline, with the sharp corners cut off at `guard` times the cell size there."""
+    """Place nodes on the outline and cut off sharp corners at a distance of `guard` times the local cell size."""
     all_stops, guards = [], []
     for curve, own in zip(curves, stops, strict=True):
         stop = np.unique(np.concatenate([curve.corners, own % curve.length]))
@@ -323,7 +329,7 @@ def outline_nodes(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarra
 
 
 def fill(front: Front, size: Size) -> None:
-    """Insert nodes until no cell is larger than asked."""
+    """Insert nodes until no cell is larger than `size` allows."""
     for _ in range(200):
         points = front.points()
         cells = triangulate(front, points)
@@ -339,7 +345,7 @@ def fill(front: Front, size: Size) -> None:
 
 
 def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
-    """Move the free nodes towards the optimal Delaunay triangulation for the wanted sizes."""
+    """Move the free nodes towards the optimal Delaunay triangulation for the requested cell sizes."""
     held = front.num_held
     if not len(front.free):
         return
@@ -349,7 +355,7 @@ def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
         corners = points[cells]
         middle = corners.mean(axis=1)
         offset = circumcircles(points, cells)[0] - middle
-        # The circumcentre of an obtuse cell lies far outside it and would throw nodes about.
+        # The circumcentre of an obtuse cell lies far outside it and would displace nodes too far.
         reach = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
         offset *= np.minimum(1.0, reach / np.maximum(np.linalg.norm(offset, axis=1), 1e-300))[:, None]
         weight = doubled_areas(points, cells) / size(middle) ** 3
@@ -366,12 +372,12 @@ def smooth(front: Front, size: Size, steps: int = _SMOOTHING_STEPS) -> None:
 def generate(
     curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, front: Front | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 2) and cells (m, 3) inside `curves`, the first of which encloses the others.
+    """Mesh the region inside the first of `curves` and outside the others: points (n, 2) and cells (m, 3).
 
-    `stops` are arc lengths on each curve and `fixed` points (f, 2) inside where nodes must be; `size` gives the
-    wanted edge length at points (p, 2). A `front` already filled for this size saves the first two
-    steps. Node 0 is the first node of the first curve. Raises `ValueError` if no mesh with the promised angle is
-    found.
+    `stops` are arc lengths on each curve, and `fixed` points (f, 2) inside, at which nodes are placed; `size` returns
+    the requested edge length at points (p, 2). If a `front` already filled for this size is given, the first two steps
+    are skipped. Node 0 is the first node of the first curve. Raises `ValueError` if no mesh with the guaranteed minimum
+    angle is found.
     """
     for guard in (1.0, 0.5, 0.25):
         if front is None:
@@ -394,7 +400,8 @@ def generate(
 
 
 def order_nodes(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number neighbouring nodes and cells close to each other, keeping node 0 first (drops unused nodes)."""
+    """Renumber nodes and cells so that neighbours have close indices; node 0 stays first, and unused nodes are
+    removed."""
     used = np.unique(cells)
     number = np.full(len(points), -1)
     number[used] = np.arange(len(used))

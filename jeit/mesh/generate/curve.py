@@ -1,4 +1,4 @@
-"""Closed curves by arc length, as the mesh generator walks them (NumPy)."""
+"""Closed curves parametrised by arc length, for the mesh generator."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ Size = Callable[[np.ndarray], np.ndarray]
 class Curve:
     """A closed curve of `length` metres.
 
-    `at` gives points (p, 2) at arc lengths (p,); `corners` are the arc lengths of its corners, all of them nodes;
-    `inside` returns which points it encloses and `distance` how far from it they are; `angles` are the angles of the
-    domain at the corners in radians.
+    **Fields**: `at`: function that returns the points (p, 2) at arc lengths (p,); `inside`: function that returns
+    whether points are enclosed; `distance`: function that returns the distances of points from the curve, metres;
+    `corners`: arc lengths of the corners, which always become nodes; `angles`: interior angles of the domain at the
+    corners, radians.
     """
 
     length: float
@@ -31,7 +32,7 @@ class Curve:
 
 
 def circle(radius: float, centre: np.ndarray) -> Curve:
-    """A circle, arc length counter-clockwise from angle 0."""
+    """A circle; arc length runs counter-clockwise from angle 0."""
 
     def at(arc_length: np.ndarray) -> np.ndarray:
         angle = np.asarray(arc_length) / radius
@@ -51,9 +52,9 @@ def circle(radius: float, centre: np.ndarray) -> Curve:
 
 
 def smooth(length: float, at: Callable[[np.ndarray], np.ndarray], num_chords: int = 720) -> Curve:
-    """A closed curve without corners, `at` giving points (p, 2) at arc lengths (p,); the domain is on its left.
+    """A closed curve without corners. `at` returns points (p, 2) at arc lengths (p,); the domain lies to the left.
 
-    What it encloses, and how far from it a point is, are those of `num_chords` chords.
+    Enclosure and distances are computed from a polygon of `num_chords` chords.
     """
     chords = at(length * np.arange(num_chords) / num_chords)
     inscribed = closed_line(chords)
@@ -61,7 +62,7 @@ def smooth(length: float, at: Callable[[np.ndarray], np.ndarray], num_chords: in
 
 
 def closed_line(vertices: np.ndarray) -> Curve:
-    """A closed polygon, arc length from its first vertex; the domain is on its left."""
+    """A closed polygon; arc length starts at the first vertex, and the domain lies to the left."""
     closed = np.concatenate([vertices, vertices[:1]])
     stops = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
 
@@ -90,7 +91,7 @@ def closed_line(vertices: np.ndarray) -> Curve:
 
 
 def within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
-    """True for points inside the first curve and outside the others (holes)."""
+    """Whether points lie inside the first curve and outside the others, which are holes."""
     result = np.zeros(len(points), bool)
     for curve in curves:
         result ^= curve.inside(points)
@@ -98,7 +99,7 @@ def within(curves: list[Curve], points: np.ndarray) -> np.ndarray:
 
 
 def divide(curve: Curve, stops: np.ndarray, size: Size) -> np.ndarray:
-    """Arc lengths of nodes along a curve, `stops` among them, one node per wanted cell size."""
+    """Arc lengths of nodes along a curve, including `stops`, at distances of the requested cell size."""
     stops = np.unique(stops)
     if not len(stops):
         stops = np.zeros(1)

@@ -1,4 +1,4 @@
-"""Refinement of plane meshes, and meshes of few nodes."""
+"""Local refinement of plane meshes, and the error for meshes with too few nodes."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ from scipy.spatial import KDTree
 
 from jeit.mesh.generate.curve import Curve, Size, within
 
-# Steps in which a number of nodes that will do is looked for, and the largest.
+# Factor between successive trial numbers of nodes, and maximum number of nodes tried.
 _STEP, _MOST = 1.1, 2e6
 
 
 class TooFewNodes(ValueError):
-    """Raised for a plane mesh of `asked` nodes that takes `least` about. `solid`: what is said, after "num_points: ",
-    where the plane mesh is that of a solid, with {asked} and {least} for the numbers of that."""
+    """Raised if a plane mesh needs about `least` nodes, more than requested.
+
+    `solid` is the message for a plane mesh that is the base of a solid, without the leading "num_points: "; {asked} and
+    {least} in it are replaced by numbers of nodes of the solid.
+    """
 
     def __init__(self, message: str, least: int, solid: str):
         super().__init__(message)
@@ -31,8 +34,11 @@ class TooFewNodes(ValueError):
 
 @contextmanager
 def nodes_of_solid(asked: int | None, in_plane: Callable[[int], int]) -> Iterator[None]:
-    """A `ValueError` about the nodes of a plane mesh, raised within, speaks of those `asked` of the solid on it;
-    `in_plane`: how many of them its plane mesh has."""
+    """Convert a `TooFewNodes` error raised within into a `ValueError` about the number of nodes of a solid.
+
+    `asked`: number of nodes requested for the solid; `in_plane`: function that returns how many of a solid's nodes lie
+    in its base.
+    """
     try:
         yield
     except TooFewNodes as error:
@@ -45,25 +51,28 @@ def nodes_of_solid(asked: int | None, in_plane: Callable[[int], int]) -> Iterato
         raise ValueError(f"num_points: {error.solid.format(asked=asked, least=f'{least:.0f}')}") from None
 
 
-# Growth of cells away from nodes that lie close together, and from a user's own size function.
+# Growth of the edge length per length away from nodes that lie close together, and in a size function given by the
+# user.
 _OWN_GROWTH = 0.45
 
 
 class Refine(eqx.Module):
     """Smaller cells near given points, or along the whole outline.
 
-    At a distance r from the nearest of `points`, cells have edges of at most h + growth · max(r − distance, 0), with
-    h the cell size there: either `cell_size`, or the background cell size divided by `factor`.
+    At a distance r from the nearest of `points`, the edges of cells have lengths of at most h + growth · max(r −
+    distance, 0), where h is the cell size at the points: `cell_size`, or the background cell size divided by `factor`.
 
-    The potential is singular at the edges of electrodes. For 16 electrodes that cover half the rim of a disk,
-    `disk(radius, num_points=1200, refine=Refine(edges, factor=5, growth=0.3), boundary_points=angles)`, with `edges`
-    the electrodes' end points and `angles` theirs, brings the largest error of a voltage between undriven electrodes
-    from 2.2 % (uniform rings) to 0.5 %; 10,000 nodes with `factor=8, growth=0.4` bring it below 0.1 %
-    (contact impedance times conductivity between 0.01 and 0.1 radii).
+    The current density is singular at the edges of electrodes, so refinement there pays. For 16 electrodes that cover
+    half the rim of a disk, `disk(radius, num_points=1200, refine=Refine(edges, factor=5, growth=0.3),
+    boundary_points=angles)`, with `edges` the end points of the electrodes and `angles` the angles of these points,
+    reduces the maximum error of a voltage between electrodes without current from 2.2 % (uniform rings) to 0.5 %. With
+    10,000 nodes and `factor=8, growth=0.4` it falls below 0.1 % (for contact impedance times conductivity between 0.01
+    and 0.1 radii).
 
-    **Fields**: `points` (k, 2) in metres, or None for the whole outline; `cell_size` in metres; `factor` > 1; `growth`
-    of the edge length per length, 0.35 unless given, at most 1 (above 0.7 the cells are visibly stretched); `distance`
-    in metres over which cells stay at their smallest.
+    **Fields**: `points` (k, 2): coordinates in metres, or None for the whole outline; `cell_size`: in metres; `factor`:
+    ratio of the background cell size to that at the points, at least 1; `growth`: increase of the edge length per
+    length, at most 1 (default 0.35; above 0.7 cells are visibly stretched); `distance`: distance in metres within which
+    cells keep their smallest size.
     """
 
     points: np.ndarray | None
@@ -118,12 +127,13 @@ Refinement = Refine | Sequence[Refine] | Callable[[np.ndarray], np.ndarray] | No
 
 
 class SizeField:
-    """Wanted edge length at any point for a given background cell size."""
+    """Requested edge length at any point, for a given background cell size."""
 
     def __init__(self, curves: list[Curve], refine: Refinement, held: np.ndarray, spacing: np.ndarray):
-        """`held` (k, 2) are nodes that must be there and `spacing` (k,) the room each has.
+        """`held` (k, 2): positions of required nodes; `spacing` (k,): distance of each of them to its nearest neighbour
+        or side.
 
-        Raises `ValueError` for what is no `Refine`.
+        Raises `ValueError` if `refine` contains anything but `Refine` objects.
         """
         self._terms: list[tuple[Callable[[np.ndarray], np.ndarray], Refine]] = []
         self._own: Size | None = None
@@ -141,12 +151,12 @@ class SizeField:
 
     @property
     def is_own(self) -> bool:
-        """Whether the user gave the sizes as a function."""
+        """Whether `refine` is a function given by the user."""
         return self._own is not None
 
     def at(self, points: np.ndarray) -> Callable[[float], np.ndarray]:
-        """Edge length (p,) at points (p, 2) as a function of the background: of the cell size in metres wanted away
-        from refinement, or, where the user gave a function, of the factor it is multiplied by."""
+        """Edge lengths (p,) at points (p, 2), as a function of the background cell size in metres. If the user gave a
+        size function, the argument is instead the factor by which its sizes are multiplied."""
         if self._own is not None:
             own, held = self._own(points), self._held(points)
             return lambda factor: np.minimum(factor * own, held)
@@ -156,7 +166,7 @@ class SizeField:
             result = np.full(len(points), background)
             for beyond, (_, term) in zip(apart, self._terms, strict=True):
                 result = np.minimum(result, term.smallest(background) + term.growth * beyond)
-            # Nodes with room enough for the background cells need no thought.
+            # Required nodes that are farther apart than the background cell size need no refinement.
             return result if background <= self._least_room else np.minimum(result, self._held(points))
 
         return size
@@ -170,13 +180,13 @@ def _distance_from(curves: list[Curve], points: np.ndarray | None) -> Callable[[
 
 
 def _close_nodes(held: np.ndarray, spacing: np.ndarray) -> Size:
-    """Cells no larger than the room that nodes which must be there have, growing away from them."""
+    """Size function that limits cells at required nodes to the `spacing` there, growing away from them."""
     if not len(held):
         return lambda points: np.full(len(points), np.inf)
     tree = KDTree(held)
     count = min(8, len(held))
     if count > 1:
-        # Let every node know of tighter ones farther off, so that the nearest few decide.
+        # Propagate the spacing of distant nodes, so that the nearest few nodes suffice to evaluate the size.
         for _ in range(4):
             apart, other = tree.query(held, k=count)
             spacing = np.min(spacing[other] + _OWN_GROWTH * apart, axis=1)
@@ -190,10 +200,10 @@ def _close_nodes(held: np.ndarray, spacing: np.ndarray) -> Size:
 
 
 def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resolution: int = 128) -> Size:
-    """A user's size function with its growth limited: min over y of f(y) + growth |x − y|.
+    """Limit the growth of a user's size function f: min over y of f(y) + growth |x − y|.
 
-    The minimum is found on a grid by Dijkstra's algorithm; the function itself still counts wherever it
-    is smaller. Raises `ValueError` if the function does not give one positive size per point.
+    The minimum is computed on a grid by Dijkstra's algorithm; where the function itself is smaller, its value is used.
+    Raises `ValueError` if the function does not return one positive, finite size per point.
     """
     outline = curves[0].at(np.linspace(0, curves[0].length, 721))
     low, high = outline.min(axis=0), outline.max(axis=0)
@@ -230,7 +240,7 @@ def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resoluti
     first, last = grid[0, 0], grid[-1, -1]
 
     def size(points: np.ndarray) -> np.ndarray:
-        # Trial nodes may lie outside the domain, where the user's function need not make sense.
+        # Trial nodes may lie outside the domain, where the user's function may be invalid.
         with np.errstate(all="ignore"):
             own = np.asarray(function(points), dtype=float)
         own = np.where(np.isfinite(own) & (own > 0), own, np.inf)

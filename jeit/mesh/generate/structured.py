@@ -1,8 +1,8 @@
-"""Structured triangulations: rings zipped together in a disk, rows zipped together in a rectangle (NumPy).
+"""Structured triangulations: concentric rings of cells in a disk, rows of cells in a rectangle.
 
-Both are built from chains of nodes laid side by side. Where neighbouring chains differ by a node or a few, the
-offset between them drifts slowly, so triangles change from equilateral to right-angled and back and no
-angle falls below about 40°.
+Both consist of chains of nodes laid side by side. Where the numbers of nodes of neighbouring chains differ slightly,
+the offset between the chains varies gradually, so that triangles range between equilateral and right-angled, and no
+angle is smaller than about 40°.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ import numpy as np
 
 from jeit.mesh.generate.refine import TooFewNodes
 
-# Height of a row per mean edge along it: between a square's 1 and an equilateral triangle's 0.87.
+# Height of a row divided by the mean edge length along it: a value between 1 for squares and 0.87 for equilateral
+# triangles.
 _ROW = 0.93
 
 
 def zip_chains(outer: np.ndarray, inner: np.ndarray, *, closed: bool) -> np.ndarray:
-    """Triangles (t, 3) between two chains of nodes running in the same direction, inner on the left.
+    """Triangles (t, 3) between two chains of nodes that run in the same direction, `inner` to the left of `outer`.
 
-    `outer` and `inner` are node numbers, evenly spaced along their chains; a closed chain returns to its
-    first node. Every segment is joined to the node that faces it on the other chain; walking along
-    both chains in the order of segment midpoints makes the triangles fit.
+    `outer` and `inner` are node indices, evenly spaced along their chains; a closed chain returns to its first node.
+    Every segment is joined to the node opposite to it on the other chain, in the order of the segments' midpoints.
     """
     num_outer, num_inner = (len(outer), len(inner)) if closed else (len(outer) - 1, len(inner) - 1)
-    # Midpoints times 2 N_outer N_inner, in integers, so that ties are ties.
+    # Midpoints multiplied by 2 N_outer N_inner, as integers, so that ties are exact.
     outer_middle = (2 * np.arange(num_outer) + 1) * num_inner
     inner_middle = (2 * np.arange(num_inner) + 1) * num_outer
     facing_inner = np.searchsorted(inner_middle, outer_middle, side="left")
@@ -37,19 +37,20 @@ def zip_chains(outer: np.ndarray, inner: np.ndarray, *, closed: bool) -> np.ndar
 
 
 def ring_counts(num_rings: int, num_boundary: int) -> np.ndarray:
-    """Nodes on each ring, outermost first, for rings of equal thickness and about equal spacing along them."""
+    """Number of nodes on each ring, outermost first, for rings of equal thickness with about equal node spacing."""
     ring = np.arange(num_rings, 0, -1)
     return np.maximum(np.rint(num_boundary * ring / num_rings).astype(int), 3)
 
 
 def choose_rings(num_points: int) -> tuple[int, int]:
-    """Number of rings and of boundary nodes whose disk has nearly `num_points` nodes."""
+    """Number of rings and number of boundary nodes such that the disk has close to `num_points` nodes."""
     guess = np.sqrt(num_points / 3.0)
     best = None
     for num_rings in range(max(1, int(guess) - 1), int(guess) + 3):
         for num_boundary in range(max(5, int(4.9 * num_rings)), int(7.3 * num_rings) + 2):
             total = 1 + int(ring_counts(num_rings, num_boundary).sum())
-            # Six nodes per ring make the most regular triangles: part from it only to meet the number.
+            # The most regular triangles have six times as many boundary nodes as rings; deviate only to meet the number
+            # of nodes.
             miss = abs(total / num_points - 1.0)
             cost = (miss > 0.03, miss if miss > 0.03 else 0.0, abs(num_boundary / num_rings - 6.0), miss)
             if best is None or cost < best[0]:
@@ -59,7 +60,8 @@ def choose_rings(num_points: int) -> tuple[int, int]:
 
 
 def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit disk of concentric rings: points (n, 2), node 0 at angle 0 on the circle, and cells (m, 3)."""
+    """Mesh of the unit disk in concentric rings: points (n, 2), with node 0 at angle 0 on the circle, and cells (m,
+    3)."""
     counts = ring_counts(num_rings, num_boundary)
     offsets = np.concatenate([[0], np.cumsum(counts)])
     radius = np.repeat(np.arange(num_rings, 0, -1) / num_rings, counts)
@@ -73,17 +75,17 @@ def ring_disk(num_rings: int, num_boundary: int) -> tuple[np.ndarray, np.ndarray
 
 
 def choose_rows(width: float, height: float, num_points: int, cell_size: float | None) -> tuple[int, int]:
-    """Columns and rows for `row_rectangle` with nearly `num_points` nodes, or of cells of `cell_size`.
+    """Numbers of columns and rows for `row_rectangle`, for close to `num_points` nodes or cells of size `cell_size`.
 
-    Raises `ValueError` if so few nodes can only make flat cells.
+    Raises `ValueError` if so few nodes would make flat cells.
     """
     if cell_size is not None:
-        # Cells with base b and height 0.93 b have the area of equilateral ones with edge 1.036 b.
+        # A cell with base b and height 0.93 b has the area of an equilateral triangle with edge 1.036 b.
         cell_size = min(cell_size, width, height) / 1.036
         return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_ROW * cell_size)))
     edge = np.sqrt(width * height / (_ROW * num_points))
     guess = height / (_ROW * edge)
-    # Few nodes leave little choice: rather miss the number than make long cells.
+    # With few nodes, accept a larger deviation from their number rather than stretched cells.
     enough = 0.03 if num_points > 200 else 0.1
     best = None
     for num_rows in range(max(1, int(0.6 * guess)), int(1.5 * guess) + 3):
@@ -110,8 +112,8 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
 
 
 def row_rectangle(width: float, height: float, num_columns: int, num_rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rectangle of rows with alternately `num_columns` and one more cells: points (n, 2), node 0 at the lower
-    left corner of [0, width] × [0, height], and cells (m, 3)."""
+    """Mesh of the rectangle [0, width] × [0, height] in rows of alternately `num_columns` and `num_columns` + 1
+    segments: points (n, 2), with node 0 at the lower left corner, and cells (m, 3)."""
     points, rows, offset = [], [], 0
     for row in range(num_rows + 1):
         columns = num_columns + row % 2

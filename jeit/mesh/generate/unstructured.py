@@ -1,4 +1,5 @@
-"""Unstructured plane meshes for a number of nodes or a cell size, with refinement and nodes at given places."""
+"""Unstructured plane meshes with a given number of nodes or cell size, local refinement, and nodes at given
+positions."""
 
 from __future__ import annotations
 
@@ -21,17 +22,21 @@ from jeit.mesh.generate.refine import Refinement, SizeField, TooFewNodes
 from jeit.mesh.mesh import Mesh
 
 DEFAULT_NUM_POINTS = 1200
-# Nodes of a mesh.
+# Maximum number of nodes of a mesh.
 MOST_POINTS = 1_000_000
-# Nodes that must be there, closer than this relative to the outline's length, are refused.
+# Minimum distance between required nodes, relative to the length of the outline.
 _CLOSEST = 1e-6
-# Relative error of the number of nodes before smoothing and repair, which may add or drop a few.
+# Tolerated relative error of the number of nodes before smoothing and repair, which may change the number slightly.
 _MISS = 0.02
 
 
 @dataclass(frozen=True)
 class Target:
-    """Target size of a mesh: a number of nodes, or a cell size in metres (the other is None or a default)."""
+    """Target size of a mesh.
+
+    **Fields**: `num_points`: number of nodes; `cell_size`: cell size in metres, or None to use `num_points`; `asked`:
+    whether the number of nodes was given rather than a default.
+    """
 
     num_points: int
     cell_size: float | None
@@ -39,7 +44,7 @@ class Target:
 
     @staticmethod
     def create(num_points: int | None, cell_size: float | None) -> Target:
-        """Check the two arguments of a shape; raises `ValueError` if both are given or one is out of range."""
+        """Create from the two arguments of a shape. Raises `ValueError` if both are given or one is out of range."""
         if num_points is not None and cell_size is not None:
             raise ValueError("num_points, cell_size: give one of the two, not both.")
         if cell_size is not None:
@@ -50,14 +55,14 @@ class Target:
 
 
 def check_count(name: str, value: int, least: int) -> int:
-    """A whole number of at least `least`, or `ValueError`."""
+    """Convert to an integer. Raises `ValueError` unless it is a whole number of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise ValueError(f"{name}: expected a whole number of at least {least}, got {value!r}.")
     return int(value)
 
 
 def check_total(number: float, name: str) -> None:
-    """Raise `ValueError` if the mesh would not fit a machine."""
+    """Raise `ValueError` if the mesh would have more than the maximum number of nodes."""
     if number > MOST_POINTS:
         raise ValueError(
             f"{name}: this would make about {number:.2g} nodes; the limit is {MOST_POINTS:.0e}. Lengths are in "
@@ -66,7 +71,7 @@ def check_total(number: float, name: str) -> None:
 
 
 def check_positions(name: str, positions: ArrayLike) -> np.ndarray:
-    """Finite numbers (k,), or `ValueError`."""
+    """Convert to finite numbers (k,). Raises `ValueError` if that is impossible."""
     array = np.asarray(positions, dtype=float)
     if array.ndim != 1 or not len(array) or not np.isfinite(array).all():
         raise ValueError(
@@ -84,20 +89,20 @@ def mesh_within(
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """A mesh inside the first of `curves` and outside the others, of `area` m² in all.
+    """Mesh the region inside the first of `curves` and outside the others; its area is `area` m².
 
-    There are nodes at `boundary_points`, arc lengths (k,) in metres on the first curve, and at `interior_points` (k, 2)
-    in metres. Raises `ValueError` on bad or contradicting arguments.
+    Nodes are placed at `boundary_points`, arc lengths (k,) in metres on the first curve, and at `interior_points` (k,
+    2) in metres. Raises `ValueError` for invalid or contradictory arguments.
     """
     stops = [_merge(curve, own) for curve, own in zip(curves, _stops(curves, boundary_points), strict=True)]
     fixed = _check_interior(interior_points, curves)
     field = SizeField(curves, refine, *_room(curves, stops, fixed))
     front = None
     if target.cell_size is not None:
-        size = partial(_capped if field.is_own else _sized, field, target.cell_size)
+        size = partial(_capped_size_at if field.is_own else _size_at, field, target.cell_size)
         check_total(_estimate(curves, size, area), "cell_size")
     elif field.is_own and not target.asked:
-        size = partial(_sized, field, 1.0)
+        size = partial(_size_at, field, 1.0)
         check_total(_estimate(curves, size, area), "refine")
     else:
         size, front = _fit(curves, stops, fixed, field, target.num_points, area)
@@ -105,23 +110,25 @@ def mesh_within(
 
 
 def _stops(curves: list[Curve], boundary_points: ArrayLike | None) -> list[np.ndarray]:
-    """Arc lengths on each curve where nodes are wanted besides its corners; one without corners begins with a node."""
+    """Arc lengths of required nodes on each curve, apart from its corners; a curve without corners has a node at its
+    start."""
     stops = [np.zeros(0 if len(curve.corners) else 1) for curve in curves]
     if boundary_points is not None:
         stops[0] = np.mod(check_positions("boundary_points", boundary_points), curves[0].length)
     return stops
 
 
-def _sized(field: SizeField, background: float, points: np.ndarray) -> np.ndarray:
+def _size_at(field: SizeField, background: float, points: np.ndarray) -> np.ndarray:
     return field.at(points)(background)
 
 
-def _capped(field: SizeField, cap: float, points: np.ndarray) -> np.ndarray:
+def _capped_size_at(field: SizeField, cap: float, points: np.ndarray) -> np.ndarray:
     return np.minimum(field.at(points)(1.0), cap)
 
 
 def _merge(curve: Curve, own: np.ndarray) -> np.ndarray:
-    """Wanted positions on a curve together with its corners, coinciding ones once; `ValueError` if too close."""
+    """Merge required positions on a curve with its corners. Raises `ValueError` if two positions are too close to each
+    other."""
     stops = np.sort(np.concatenate([curve.corners, np.mod(own, curve.length)]))
     if len(stops) < 2:
         return stops
@@ -134,7 +141,7 @@ def _merge(curve: Curve, own: np.ndarray) -> np.ndarray:
             "closer than a millionth of the outline (a corner counts). Make them equal or move one."
         )
     keep = gaps > 1e-9
-    # Among coinciding stops the corner is kept, so that corners stay exactly where they are.
+    # Of coinciding positions, keep the corner's, so that corners are not moved.
     kept = stops[keep]
     if len(curve.corners):
         apart = np.abs(kept[:, None] - curve.corners)
@@ -163,7 +170,8 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
 
 
 def _room(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes that must be there (k, 2), and how far each is from the next one or from a side it is not on (k,)."""
+    """Positions (k, 2) of required nodes, and the distance (k,) of each to the nearest other one or to the nearest side
+    that it does not lie on."""
     chains = [curve.at(stop) for curve, stop in zip(curves, stops, strict=True)]
     held = np.concatenate([*chains, fixed])
     if len(held) < 2:
@@ -187,7 +195,7 @@ def _room(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tu
 
 
 def _sample(curves: list[Curve]) -> np.ndarray:
-    """Points of a regular grid that lie inside."""
+    """Points of a regular grid that lie inside the domain."""
     outline = curves[0].at(np.linspace(0, curves[0].length, 400))
     axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
@@ -195,7 +203,8 @@ def _sample(curves: list[Curve]) -> np.ndarray:
 
 
 def _estimate(curves: list[Curve], size: Size, area: float) -> float:
-    """About how many nodes a mesh of this size has, from samples inside and along the outline."""
+    """Estimate the number of nodes of a mesh with this size function, from samples inside the domain and along its
+    outline."""
     total = area * float(np.mean(1.0 / size(_sample(curves)) ** 2))
     for curve in curves:
         total += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))
@@ -210,10 +219,11 @@ def _fit(
     num_points: int,
     area: float,
 ) -> tuple[Size, Front]:
-    """The size function that makes `num_points` nodes, by its background size or factor, and a filled outline.
+    """Scale the background cell size, or the user's size function, so that the mesh has about `num_points` nodes.
+    Returns the size function and the outline filled with nodes.
 
-    The number of nodes is about ∫ c/h² over the domain: a coarser mesh gives the constant c and the sample
-    points, the next ones correct the rest.
+    The number of nodes is about ∫ c/h² over the domain, h being the cell size: a first mesh determines the constant c
+    and the sample points, further meshes correct the rest.
     """
     first = num_points / 4 if num_points > 4000 else num_points
     value = float(np.sqrt(1.1 * area / first))
@@ -221,7 +231,7 @@ def _fit(
         value *= float(np.sqrt(np.mean(1.0 / field.at(_sample(curves))(1.0) ** 2)))
     best: tuple[float, Size, Front] | None = None
     for _ in range(6):
-        size = partial(_sized, field, value)
+        size = partial(_size_at, field, value)
         front = _triangulate.outline_nodes(curves, stops, fixed, size, 1.0)
         _triangulate.fill(front, size)
         points = front.points()
@@ -231,15 +241,18 @@ def _fit(
         if abs(miss) < _MISS:
             break
         cells = triangulate(front, points)
-        value = _corrected(field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), value, miss, num_points)
+        value = _correct_background(
+            field.at(points[cells].mean(axis=1)), doubled_areas(points, cells), value, miss, num_points
+        )
     assert best is not None
     return best[1], best[2]
 
 
-def _corrected(
+def _correct_background(
     size: Callable[[float], np.ndarray], weight: np.ndarray, value: float, miss: float, num_points: int
 ) -> float:
-    """The background size at which ∫ 1/h² is what it was at `value`, less the relative surplus of nodes `miss`."""
+    """Background size for which ∫ 1/h² is its value for the background size `value` divided by 1 + `miss`, where `miss`
+    is the relative surplus of nodes."""
 
     def total(trial: float) -> float:
         return float(np.sum(weight / size(trial) ** 2))
@@ -254,7 +267,7 @@ def _corrected(
             "the surface alone, as fine as electrodes or refine want it, needs about {least} nodes, more than the "
             "{asked} asked. Ask for more.",
         )
-    # Factors of `value`: the mesh of a body twice as large is twice as large, to the last bit.
+    # Search for a factor of `value`, so that the mesh of a body twice as large is exactly twice as large.
     low, high = -np.log(1e3), np.log(1e3)
     for _ in range(30):
         middle = 0.5 * (low + high)

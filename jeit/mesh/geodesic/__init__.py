@@ -1,5 +1,5 @@
-"""Geodesics on triangulated surfaces in space: their lengths, places on surfaces, and surfaces unrolled into the
-plane."""
+"""Geodesics on triangulated surfaces in space: geodesic distances, points on surfaces, and unrolling of surfaces into
+the plane."""
 
 from __future__ import annotations
 

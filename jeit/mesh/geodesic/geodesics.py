@@ -1,13 +1,14 @@
-"""`Geodesics`: lengths of the shortest ways along a triangulated surface, from any of its points to any other (NumPy).
+"""`Geodesics`: geodesic distances along a triangulated surface between any of its points.
 
-A wave runs over the triangles: from the lengths at two corners the third one's follows, by laying the triangle and the
-point that the wave seems to come from into one plane, as long as the straight line between them crosses the side
-between the two corners; else the way goes through one of these. That is exact wherever the triangles between lie in a
-plane or can be laid into one, whatever way they point. (Novotni and Klein, WSCG 2002, 341-347: Kimmel and Sethian's
-fast marching, PNAS 95 (1998) 8431-8435, with a wave that is round.) Elsewhere the wave is flatter, or rounder, than one
-from so far away in a plane: after a way d over the Gaussian curvature K by K d/3, and more exactly by what a sphere of
-that curvature does. Each length only ever falls, and lengths too large give lengths too large, so that nodes may be
-worked on in any order: those that changed, of all sources together, until none does.
+A wave front propagates over the triangles. From the distances at two corners of a triangle, the triangle and the
+virtual source of the wave are laid into one plane. If the straight line from the source to the third corner crosses the
+side between the two corners, its length is the distance at the third corner; otherwise the shortest path passes through
+one of the two corners. This is exact where the triangles between can be laid into one plane. (Novotni and Klein, WSCG
+2002, 341-347, who extend the fast marching of Kimmel and Sethian, PNAS 95 (1998) 8431-8435, to circular waves.)
+
+On other surfaces, Gaussian curvature K changes the curvature of the front: after a path of length d, by about K d/3;
+the formula for a sphere of that curvature is used. Updates only ever lower distances, so the nodes may be processed in
+any order: those that changed, for all sources together, until none changes.
 """
 
 from __future__ import annotations
@@ -23,33 +24,37 @@ from scipy.spatial import KDTree
 from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
 from jeit.mesh.mesh import Mesh
 
-# Lengths that fall by less, relative, are not passed on; and sources worked on at once, as lengths (s, n) are kept.
+# Minimum relative decrease of a distance that is propagated, and number of sources processed together, which limits the
+# memory for distances (s, n).
 _ENOUGH, _TOGETHER = 1e-10, 128
-# Greatest length of a way on a sphere, radians: farther on, near the antipode, a wave closes in on a point.
+# Maximum length of a path on a sphere, in radians: near the antipode the wave converges to a point.
 _FARTHEST = 2.6
-# Share of a side by which lengths of one wave may disagree.
+# Tolerated disagreement between the distances at the corners of a triangle, as a fraction of its side, if they belong
+# to the same wave.
 _APART = 0.02
-# Greatest distance of places from the surface, in units of its extent, such as of those on the other side of a thick
-# skin.
+# Maximum distance of given points from the surface, relative to the surface's extent: points on the other side of a
+# thick skin are accepted.
 _OFF = 0.25
 
 
 class _Corners(NamedTuple):
-    """Each corner of each triangle, and the side opposite to it, which begins at the origin and goes along x."""
+    """All corners of all triangles, each in the plane of its triangle: the opposite side starts at the origin and runs
+    along x."""
 
-    node: np.ndarray  # (c,), and the two nodes of the side
+    node: np.ndarray  # (c,) node at the corner, and the two nodes of the opposite side
     start: np.ndarray
     end: np.ndarray
-    side: np.ndarray  # (c,) its length; x and y of the corner, metres
+    side: np.ndarray  # (c,) length of the side, and coordinates of the corner, metres
     x: np.ndarray
     y: np.ndarray
 
 
 class Geodesics(eqx.Module):
-    """Ways along a surface; make it with `Geodesics.create`.
+    """Geodesic distances on a surface; created by `Geodesics.create`.
 
-    **Fields**: `surface`; `corners` of its triangles; `curvature` (n,), Gaussian, 1/m²; `first` (n + 1,) and `touching`
-    (6 m,): the corners whose opposite side each node is on.
+    **Fields**: `surface`: the triangles; `corners`: their corners; `curvature` (n,): Gaussian curvature at the nodes,
+    1/m²; `touching` (6 m,): corners grouped by the nodes of their opposite sides, the group of node i being
+    `touching[first[i]:first[i + 1]]`; `first` (n + 1,): bounds of the groups.
     """
 
     surface: Triangles
@@ -60,7 +65,8 @@ class Geodesics(eqx.Module):
 
     @classmethod
     def create(cls, surface: Triangles | Mesh, face: str | None = None) -> "Geodesics":
-        """Create for a surface, or for a `face` of a shell as in `Triangles.of`. Raises `ValueError` as that does."""
+        """Create for a surface, or for a `face` of a shell as in `Triangles.of`. Raises `ValueError` as `Triangles.of`
+        does."""
         triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
         cells, points = triangles.cells, triangles.points
         node, start, end = (np.roll(cells, -turn, axis=1).ravel() for turn in range(3))
@@ -78,11 +84,11 @@ class Geodesics(eqx.Module):
         *,
         limit: float = np.inf,
     ) -> Float[np.ndarray, "s p"]:
-        """Lengths (s, p), metres, of the shortest ways from `sources` (s, 3) to `targets` (p, 3), places on the
-        surface, or near it, for the nearest of it is taken; to all nodes (s, n) unless targets are given.
+        """Geodesic distances (s, p), metres, from `sources` (s, 3) to `targets` (p, 3), or (s, n) to all nodes if there
+        are no targets. Points off the surface are projected to the nearest point on it.
 
-        Infinite beyond `limit`, metres, where that is given, and between parts that do not hang together. Raises
-        `ValueError` for places farther off the surface than a quarter of its extent.
+        Distances beyond `limit`, metres, and between disconnected parts are infinite. Raises `ValueError` for points
+        farther from the surface than a quarter of its extent.
         """
         begun = sources if isinstance(sources, SurfacePlaces) else self._nearest("sources", sources)
         if isinstance(targets, SurfacePlaces) or targets is None:
@@ -99,7 +105,8 @@ class Geodesics(eqx.Module):
         return found
 
     def _nearest(self, name: str, places: ArrayLike) -> SurfacePlaces:
-        """Places on the surface. Raises `ValueError`, about the argument `name`, for those that are not near it."""
+        """Nearest points on the surface. Raises `ValueError` with the argument's `name` for points that are too far
+        from it."""
         at = self.surface.nearest(places)
         extent = float(np.ptp(self.surface.points, axis=0).max())
         lost = np.flatnonzero(~(at.away <= _OFF * extent))
@@ -112,7 +119,7 @@ class Geodesics(eqx.Module):
         return at
 
     def between(self, places: ArrayLike) -> Float[np.ndarray, "p p"]:
-        """Lengths between all of some places (p, 3), metres: symmetric, zero on the diagonal."""
+        """Geodesic distances (p, p) between all pairs of points (p, 3), metres: symmetric, with a zero diagonal."""
         at = self.surface.nearest(places)
         lengths = self.distances(at, at)
         lengths = (lengths + lengths.T) / 2
@@ -120,23 +127,23 @@ class Geodesics(eqx.Module):
         return lengths
 
     def owners(self, sources: ArrayLike | SurfacePlaces) -> tuple[Int[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Number of the nearest of the `sources` (s, 3) for each node, and the length of the way to it, metres."""
+        """For each node, the index of the nearest of the `sources` (s, 3) and the geodesic distance to it, metres."""
         at = sources if isinstance(sources, SurfacePlaces) else self.surface.nearest(sources)
         nodes = self.surface.cells[at.triangle]
         length = np.linalg.norm(self.surface.points[nodes] - at.points[:, None], axis=-1)
         lengths, owner = np.full(len(self.surface.points), np.inf), np.full(len(self.surface.points), -1)
         number = np.repeat(np.arange(len(nodes)), 3)
-        changed = _lowered(lengths, owner, nodes.ravel(), length.ravel(), number)
+        changed = _lower_distances(lengths, owner, nodes.ravel(), length.ravel(), number)
         while changed.size:
-            _, corner = self._touched(changed, np.zeros_like(changed))
+            _, corner = self._opposite_corners(changed, np.zeros_like(changed))
             start, end, node = self.corners.start[corner], self.corners.end[corner], self.corners.node[corner]
             local = (part[corner] for part in self.corners[3:])
-            through, along = _laid(lengths[start], lengths[end], *local, joined=owner[start] == owner[end])
-            changed = _lowered(lengths, owner, node, through, np.where(along, owner[start], owner[end]))
+            through, along = _distances_across(lengths[start], lengths[end], *local, joined=owner[start] == owner[end])
+            changed = _lower_distances(lengths, owner, node, through, np.where(along, owner[start], owner[end]))
         return owner, lengths
 
     def _from(self, sources: SurfacePlaces, limit: float):
-        """Lengths (s, n), and the mean curvature (s, n) of the ways there."""
+        """Distances (s, n) from the sources to all nodes, and mean curvatures (s, n) along the paths."""
         count = len(self.surface.points)
         lengths = np.full(len(sources.triangle) * count, np.inf)
         bent = np.tile(self.curvature, len(sources.triangle))
@@ -145,11 +152,11 @@ class Geodesics(eqx.Module):
         lengths[place] = np.linalg.norm(self.surface.points[nodes] - sources.points[:, None], axis=-1).ravel()
         changed = place
         while changed.size:
-            source, corner = self._touched(changed % count, changed - changed % count)
+            source, corner = self._opposite_corners(changed % count, changed - changed % count)
             start, end = source + self.corners.start[corner], source + self.corners.end[corner]
             local = (part[corner] for part in self.corners[3:])
             mean = (bent[start] + bent[end]) / 2
-            through, by_start = _laid(lengths[start], lengths[end], *local, curvature=mean)
+            through, by_start = _distances_across(lengths[start], lengths[end], *local, curvature=mean)
             node = self.corners.node[corner]
             place = source + node
             lower = (through < (1 - _ENOUGH) * lengths[place]) & (through <= 2 * limit)
@@ -160,20 +167,21 @@ class Geodesics(eqx.Module):
                 share = np.where(through > 0, np.clip(before / through, 0, 1), 0.0)
             least = through == lengths[place]
             bent[place[least]] = (share * mean[lower] + (1 - share) * self.curvature[node])[least]
-            # Nodes beyond the limit pass nothing on.
+            # Nodes beyond the limit are not propagated.
             changed = np.unique(place[lengths[place] <= limit])
         return lengths.reshape(-1, count), bent.reshape(-1, count)
 
-    def _touched(self, nodes, carried):
-        """The corners opposite to nodes, and what the nodes carry, for each of these corners."""
+    def _opposite_corners(self, nodes, carried):
+        """The corners opposite to the sides at the `nodes`, and for each of these corners the value `carried` by its
+        node."""
         number = self.first[nodes + 1] - self.first[nodes]
         total = np.cumsum(number)
         inside = np.arange(total[-1]) - np.repeat(total - number, number)
         return np.repeat(carried, number), self.touching[np.repeat(self.first[nodes], number) + inside]
 
     def near(self, sources: ArrayLike, targets: SurfacePlaces, limit: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Targets no farther than `limit` metres from each of some `sources` (s, 3) by the way along the surface, as
-        their numbers, and their distances; targets far away are not searched."""
+        """For each of the `sources` (s, 3), the indices of the targets within a geodesic distance of `limit` metres,
+        and their distances. Only targets within `limit` in a straight line are considered."""
         begun = self.surface.nearest(sources)
         tree, found = KDTree(targets.points), []
         for low in range(0, len(begun.triangle), _TOGETHER):
@@ -190,7 +198,8 @@ class Geodesics(eqx.Module):
         return found
 
     def _at(self, sources: SurfacePlaces, lengths: Float[np.ndarray, "s n"], bent, targets: SurfacePlaces, source=None):
-        """Lengths (s, p) inside the triangles; or (p,), of each target from a source with that number."""
+        """Distances (s, p) at points inside triangles; or (p,), if `source` gives the index of the source for each
+        target."""
         cells = self.surface.cells[targets.triangle]
         corners = self.surface.points[cells]
         of = np.arange(len(lengths))[:, None] if source is None else source
@@ -199,9 +208,9 @@ class Geodesics(eqx.Module):
             ends = (of, cells[:, first]), (of, cells[:, second])
             start, end = (lengths[one] for one in ends)
             side, x, y = _in_plane(corners[:, first], corners[:, second], targets.points)
-            through, _ = _laid(start, end, side, x, y, curvature=(bent[ends[0]] + bent[ends[1]]) / 2)
-            # Where ways from two sides meet, the ends' lengths are of different waves, and the third corner is not as
-            # far from what they seem to come from as it is.
+            through, _ = _distances_across(start, end, side, x, y, curvature=(bent[ends[0]] + bent[ends[1]]) / 2)
+            # Where paths from two directions meet, the distances at the ends of a side belong to different waves, and
+            # contradict the distance at the third corner. The path is then taken through a corner.
             with np.errstate(invalid="ignore", over="ignore"):
                 seen, behind, _ = _origin(start, end, side)
                 _, across, off = _in_plane(corners[:, first], corners[:, second], corners[:, third])
@@ -216,16 +225,17 @@ _FIELDS = "triangle", "weights", "points", "away"
 
 
 def _in_plane(start, end, corner):
-    """Length of the side from `start` to `end`, and where the `corner` is, x along the side from its start and y off
-    it; metres, all (c,)."""
+    """Length of the side from `start` to `end`, and coordinates of the `corner`: x along the side from its start, and y
+    perpendicular to it; metres, each (c,)."""
     side = np.linalg.norm(end - start, axis=-1)
     x = ((corner - start) * (end - start)).sum(axis=-1) / side
     return side, x, np.sqrt(np.maximum(((corner - start) ** 2).sum(axis=-1) - x**2, 0.0))
 
 
-def _laid(start, end, side, x, y, *, joined: Any = True, curvature: Any = 0.0):
-    """Lengths at corners from those at the `start` and `end` of their sides, and whether the way comes by the start; in
-    a straight line only where both ends' are `joined`. `curvature`: mean of the way, 1/m²."""
+def _distances_across(start, end, side, x, y, *, joined: Any = True, curvature: Any = 0.0):
+    """Distances at corners, computed from the distances at the `start` and `end` of the opposite sides, and whether the
+    path through the start is the shorter one. Straight lines across a side count only if `joined`: the distances at
+    both of its ends are from the same source. `curvature`: mean Gaussian curvature along the path, 1/m²."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         along = np.sqrt(x**2 + y**2) + start
         back = np.sqrt((side - x) ** 2 + y**2) + end
@@ -233,7 +243,7 @@ def _laid(start, end, side, x, y, *, joined: Any = True, curvature: Any = 0.0):
         crossing = (seen * y + x * behind) / np.where(behind + y > 0, behind + y, 1.0)
         straight = (off >= 0) & (crossing >= 0) & (crossing <= side) & joined & (behind + y > 0)
         length = np.sqrt((x - seen) ** 2 + (y + behind) ** 2)
-        # The wave's sagitta at the crossing, off that of a plane's.
+        # Difference between the sagitta of the wave front at the crossing and that of a front in the plane.
         square = (crossing - seen) ** 2 + off
         across = np.where(square > 0, off / np.where(square > 0, square, 1.0), 0.0)
         length += 0.5 * _flatter(curvature, np.sqrt(square)) * across * crossing * (side - crossing)
@@ -241,16 +251,16 @@ def _laid(start, end, side, x, y, *, joined: Any = True, curvature: Any = 0.0):
 
 
 def _origin(start, end, side):
-    """Where a wave seems to come from that is so far away from the start and the end of a side: along it, and behind
-    it; and the square of the latter, negative where it cannot be."""
+    """Virtual source of a wave with given distances at the start and the end of a side: its coordinate along the side,
+    its distance behind the side, and the square of this distance, which is negative for incompatible distances."""
     seen = (start**2 - end**2 + side**2) / (2 * side)
     off = start**2 - seen**2
     return seen, np.sqrt(np.maximum(off, 0.0)), off
 
 
 def _flatter(curvature, length):
-    """1/length - κ, 1/m, of the front's curvature κ after a way over a Gaussian curvature: √K cot(√K length) on a
-    sphere, with the hyperbolic cotangent on a saddle."""
+    """1/length - κ, in 1/m, where κ is the curvature of the wave front after a path of this length on a surface of
+    Gaussian curvature K: √K cot(√K length) on a sphere, with the hyperbolic cotangent for negative K."""
     angle = np.sqrt(np.abs(curvature)) * length
     small, round_, saddle = angle < 1e-3, np.clip(angle, 1e-3, _FARTHEST), np.clip(angle, 1e-3, 10.0)
     share = np.where(curvature > 0, 1 - round_ / np.tan(round_), 1 - saddle / np.tanh(saddle))
@@ -258,8 +268,9 @@ def _flatter(curvature, length):
 
 
 def _curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]:
-    """Gaussian, of the nodes, 1/m²: what their triangles' angles lack of a full turn, over a third of the triangles'
-    areas, evened out over two rings of neighbours; on the edge that of the nodes inside."""
+    """Gaussian curvature (n,) at the nodes, 1/m²: angle defect, i.e. 2π minus the sum of the angles at the node,
+    divided by a third of the area of its triangles; both are averaged over two rings of neighbours. Nodes on the border
+    do not contribute."""
     count, node = len(surface.points), corners.node
     angle = np.arctan2(corners.y, corners.x), np.arctan2(corners.y, corners.side - corners.x)
     lacking = 2 * np.pi - np.bincount(node, np.pi - angle[0] - angle[1], count)
@@ -276,8 +287,9 @@ def _curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]
     return np.where(area > 0, lacking / np.where(area > 0, area, 1.0), 0.0)
 
 
-def _lowered(lengths, owner, nodes, through, number) -> np.ndarray:
-    """Lower the lengths of `nodes` to the least of what comes `through`, with the owner's number; those that fell."""
+def _lower_distances(lengths, owner, nodes, through, number) -> np.ndarray:
+    """Lower the distances of `nodes` to the minimum of the new distances `through`, and store the owner's index.
+    Returns the nodes whose distance has decreased."""
     lower = through < (1 - _ENOUGH) * lengths[nodes]
     nodes, through, number = nodes[lower], through[lower], number[lower]
     order = np.lexsort((through, nodes))

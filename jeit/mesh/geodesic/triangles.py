@@ -1,4 +1,4 @@
-"""`Triangles`: a triangulated surface in space as arrays, with the point of it that is nearest to any other (NumPy)."""
+"""`Triangles`: a triangulated surface in space as arrays, with the nearest point on it to any given point."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from scipy.spatial import KDTree
 
 from jeit.mesh.mesh import Mesh
 
-# Triangles near a place, by their middles, among which the nearest is.
+# Number of triangles, by nearest centroids, among which the nearest triangle is searched.
 _CANDIDATES = 16
 
 
 class SurfacePlaces(eqx.Module):
-    """p places on a surface: `triangle` (p,), `weights` (p, 3) of its corners, `points` (p, 3) and `away` (p,), how far
-    what was asked for is from the surface; metres."""
+    """p points on a surface.
+
+    **Fields**: `triangle` (p,): index of the triangle; `weights` (p, 3): barycentric coordinates in it; `points` (p,
+    3): positions, metres; `away` (p,): distance of the originally given point from the surface, metres.
+    """
 
     triangle: Int[np.ndarray, " p"]
     weights: Float[np.ndarray, "p 3"]
@@ -24,7 +27,7 @@ class SurfacePlaces(eqx.Module):
     away: Float[np.ndarray, " p"]
 
     def of_nodes(self, triangles: "Triangles", values: ArrayLike) -> np.ndarray:
-        """Values of the nodes (n, …) between them, at the places (p, …)."""
+        """Interpolate values at the nodes (n, …) linearly to the points (p, …)."""
         corners = np.asarray(values)[triangles.cells[self.triangle]]
         return np.einsum("pk,pk...->p...", self.weights, corners)
 
@@ -40,9 +43,10 @@ class Triangles(eqx.Module):
 
     @classmethod
     def of(cls, mesh: Mesh, face: str | None = None) -> "Triangles":
-        """Triangles of a surface, or facets of a solid mesh that have the tag `face`, "inner" or "outer" of a shell.
+        """Triangles of a surface, or the facets of a solid mesh with the tag `face`, such as "inner" or "outer" of a
+        shell.
 
-        Nodes that are none of theirs are left out. Raises `ValueError` for a plane mesh, and a tag that there is not.
+        Unused nodes are removed. Raises `ValueError` for a plane mesh, and for an unknown tag.
         """
         points = np.asarray(mesh.points, float)
         if points.shape[1] != 3:
@@ -72,19 +76,19 @@ class Triangles(eqx.Module):
 
     @property
     def node_areas(self) -> Float[np.ndarray, " n"]:
-        """A third of each node's triangles, m²."""
+        """A third of the area of the triangles at each node, m²."""
         return np.bincount(self.cells.ravel(), np.repeat(self.areas / 3, 3), len(self.points))
 
     @property
     def node_normals(self) -> Float[np.ndarray, "n 3"]:
-        """Outward unit normals of the nodes, means of the triangles' by area."""
+        """Outward unit normals at the nodes: area-weighted means of the normals of the triangles."""
         summed = np.zeros_like(self.points)
         np.add.at(summed, self.cells, self._crossed[:, None])
         return summed / np.linalg.norm(summed, axis=1, keepdims=True)
 
     @property
     def border(self) -> Int[np.ndarray, "b 2"]:
-        """Edges of one triangle only: none of a closed surface."""
+        """Edges (b, 2) that belong to one triangle only; a closed surface has none."""
         edges = self.cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
         _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
         return edges[first[counts == 1]]
@@ -95,7 +99,7 @@ class Triangles(eqx.Module):
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
     def nearest(self, places: ArrayLike) -> SurfacePlaces:
-        """The points of the surface that are nearest to `places` (p, 3), metres."""
+        """Points on the surface nearest to `places` (p, 3), metres."""
         asked = np.asarray(places, float)
         number = min(_CANDIDATES, len(self.cells))
         corners = self.corners
@@ -108,12 +112,12 @@ class Triangles(eqx.Module):
         return SurfacePlaces(near[row, best], weights[row, best], points[row, best], away[row, best])
 
     def normals_at(self, places: SurfacePlaces) -> Float[np.ndarray, "p 3"]:
-        """Outward unit normals at places, between those of the nodes."""
+        """Outward unit normals at points on the surface, interpolated from those at the nodes."""
         between = places.of_nodes(self, self.node_normals)
         return between / np.linalg.norm(between, axis=1, keepdims=True)
 
     def distance_to_border(self, places: ArrayLike) -> Float[np.ndarray, " p"]:
-        """Distances of places (p, 3) from the edge, straight through space, metres; infinite where there is none."""
+        """Straight distances (p,) of points (p, 3) from the border, metres; infinite for a closed surface."""
         border, asked = self.border, np.asarray(places, float)
         if not len(border):
             return np.full(len(asked), np.inf)
@@ -123,7 +127,7 @@ class Triangles(eqx.Module):
         return KDTree(along).query(asked)[0]
 
     def finer(self) -> "Triangles":
-        """Each triangle as four, halved along its sides."""
+        """Divide each triangle into four at the midpoints of its sides."""
         edges = np.sort(self.cells[:, [[1, 2], [2, 0], [0, 1]]], axis=2)
         distinct, number = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
         a, b, c = self.cells.T
@@ -133,7 +137,7 @@ class Triangles(eqx.Module):
 
 
 def _nearest_in_triangles(corners: Float[np.ndarray, "... 3 3"], place: Float[np.ndarray, "... 3"]) -> np.ndarray:
-    """Weights (…, 3) of the corners at the point of each triangle that is nearest to a place."""
+    """Barycentric coordinates (…, 3) of the point of each triangle that is nearest to `place`."""
     first, second = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
     offset = place - corners[..., 0, :]
     aa, bb, ab = (first**2).sum(-1), (second**2).sum(-1), (first * second).sum(-1)

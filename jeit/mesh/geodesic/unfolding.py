@@ -1,9 +1,10 @@
-"""`unfold`: the triangles of a surface round a place, laid into the plane of the triangle that holds the place.
+"""`unfold`: the triangles of a surface around a point, laid into the plane of the triangle that contains the point.
 
-Triangle after triangle is turned about the side that it shares with the one before, on the way that crosses the fewest.
-Where a surface can be laid flat without stretching, as a sheet that was bent can, all ways lead to the same, and
-straight lines there are the shortest ways on the surface: exactly, on its triangles. Elsewhere the result depends on
-the way, and the places where it does are reported. Arrays of either engine, differentiated and batched.
+Starting at this triangle, each next triangle is rotated about the side that it shares with the previous one, along the
+path that crosses the fewest triangles. On a developable surface, such as a bent sheet, the result does not depend on
+the path, and straight lines in the plane are exactly the geodesics on the triangles. On other surfaces the result
+depends on the path, and the points where it does are reported. The functions take arrays of NumPy or JAX and can be
+differentiated and batched.
 """
 
 from __future__ import annotations
@@ -16,20 +17,20 @@ from jaxtyping import Array, Bool, Float, Int
 from jeit.mesh.mesh import Mesh
 from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undifferentiated, while_loop
 
-# Radians that angles round a node may miss a full turn by, where the surface counts as flat or bent only: what float32
-# files, and steps of finite differences, leave of it.
+# Maximum deviation, in radians, of the sum of angles around a node from a full turn on a developable surface: it allows
+# for rounding of float32 files and steps of finite differences.
 _FLAT = 1e-4
-# Ways are joined in pairs, at most so often: to 128 triangles.
+# Maximum number of rounds in which paths are concatenated in pairs: paths of up to 128 triangles.
 _JOININGS = 7
 
 
 class Unfolding(NamedTuple):
-    """Unfolded triangles round L places on a surface of m triangles, metres.
+    """Unfolded triangles around L points on a surface of m triangles; lengths in metres.
 
-    **Fields**: `corners` (m, 3, 2), of each triangle in its own plane; `turn` (L, m, 2), cosine and sine, and `shift`
-    (L, m, 2), from there into the plane of each place's triangle; `place` (L, 2), in that one; `reached` (L, m), where
-    these are known, round the place; `exact` (L,), whether what was reached can be laid flat without stretching, and is
-    no more than 128 triangles away.
+    **Fields**: `corners` (m, 3, 2): corners of each triangle in its own plane; `turn` (L, m, 2): cosine and sine of the
+    rotation, and `shift` (L, m, 2): translation, from that plane into the plane of the triangle that contains each
+    point; `place` (L, 2): position of each point in the latter plane; `reached` (L, m): whether a triangle is unfolded
+    around a point; `exact` (L,): whether the reached triangles are developable and at most 128 triangles away.
     """
 
     corners: Float[Array, "m 3 2"]
@@ -40,19 +41,19 @@ class Unfolding(NamedTuple):
     exact: Bool[Array, " L"]
 
     def squared(self, weights: Float[np.ndarray, "p 3"], which: Int[Array, "m k"]) -> Float[Array, "m k p"]:
-        """Squares of the lengths, m², from k of the places, for each triangle those numbered in `which`, to points of
-        it with these weights of its corners."""
+        """Squared distances (m, k, p), m², from k points to positions in each triangle. `which` (m, k): indices of the
+        points for each triangle; `weights` (p, 3): barycentric coordinates of the positions."""
         xp = namespace(self.corners, self.turn)
         number = xp.arange(len(self.corners))[:, None]
         points = xp.einsum("pi,mid->mpd", weights, self.corners)[:, None]
         turn, shift = self.turn[which, number][:, :, None], (self.shift - self.place[:, None])[which, number]
-        laid = _turned(turn, points) + shift[:, :, None]
+        laid = _rotate(turn, points) + shift[:, :, None]
         return (laid**2).sum(axis=-1)
 
 
 def unfold(mesh: Mesh, places: Float[Array, "L 3"], reach: Float[Array, "L m"]) -> Unfolding:
-    """The triangles of a surface whose middles lie within `reach` of places on it, metres, straight through space, and
-    that hang together with the place's own."""
+    """Unfold the triangles whose centroids lie within a straight distance of `reach` metres of points `places` on the
+    surface and which are connected to the point's own triangle."""
     xp = namespace(mesh, places)
     corners = xp.asarray(mesh.points[mesh.cells])
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -64,7 +65,7 @@ def unfold(mesh: Mesh, places: Float[Array, "L 3"], reach: Float[Array, "L m"]) 
     frames = corners[:, 0], axes, out
     root = _triangles_of(undifferentiated(places), *undifferentiated((frames, local)))
     away = undifferentiated(((places[:, None] - corners.mean(axis=1)) ** 2).sum(axis=-1))
-    # Where it has values, it is none of what is compiled: a sort of constants takes XLA seconds.
+    # If the values are known, compute on the host: XLA would take seconds to evaluate a sort of constants.
     twin, cell = xp.asarray(_twins(on_host(mesh.cells))), xp.arange(len(corners))
     reached, side = _hang_together(twin // 3, away <= undifferentiated(reach) ** 2, root)
     half = 3 * cell + side
@@ -72,22 +73,23 @@ def unfold(mesh: Mesh, places: Float[Array, "L 3"], reach: Float[Array, "L m"]) 
     turn, shift = (one[half] for one in _over_sides(local, twin))
     known = (side >= 0)[..., None]
     turn, shift = xp.where(known, turn, xp.array([1.0, 0.0])), xp.where(known, shift, 0.0)
-    turn, shift, last = _joined(before, turn, shift)
+    turn, shift, last = _concatenate_steps(before, turn, shift)
     place = xp.einsum("ld,lad->la", places - corners[root, 0], axes[root])
     curved = _curved(undifferentiated(local), mesh.cells, twin, mesh.num_points)
     lost = reached & (curved | (last != root[:, None]))
     return Unfolding(local, turn, shift, place, reached, ~lost.any(axis=1))
 
 
-def _turned(turn, points):
-    """Points (…, 2) turned by angles of cosine and sine (…, 2)."""
+def _rotate(turn, points):
+    """Rotate points (…, 2) by angles with the cosine and sine `turn` (…, 2)."""
     cos, sin = turn[..., 0], turn[..., 1]
     x, y = points[..., 0], points[..., 1]
     return namespace(turn, points).stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
 def _triangles_of(places, frames, local) -> Int[Array, " L"]:
-    """The triangle that each place lies in: the nearest, by its height above the plane and how far it is outside."""
+    """Index of the triangle that contains each point: the nearest one, by height above its plane and distance outside
+    it."""
     xp = namespace(places, local)
     origin, axes, out = frames
     offset = places[:, None] - origin
@@ -99,7 +101,8 @@ def _triangles_of(places, frames, local) -> Int[Array, " L"]:
 
 
 def _twins(cells) -> Int[Array, " h"]:
-    """For each side of each triangle, 3 cell + number, the same side in the neighbour; itself on the edge."""
+    """For each side of each triangle, with index 3 cell + number, the index of the same side in the neighbouring
+    triangle; at the border, the side's own index."""
     xp = namespace(cells)
     start, end = cells.reshape(-1), xp.roll(cells, -1, axis=1).reshape(-1)
     low, high = xp.minimum(start, end), xp.maximum(start, end)
@@ -112,8 +115,8 @@ def _twins(cells) -> Int[Array, " h"]:
 
 
 def _hang_together(neighbour, near: Bool[Array, "L m"], root):
-    """Whether the triangles `near` places are reached from the `root` (L,) over sides, and the side (L, m) of each that
-    leads back, −1 of the root and what is not reached."""
+    """Whether the triangles `near` each point can be reached from the triangle `root` (L,) across sides, and the number
+    of the side (L, m) of each that leads back to it; −1 for the root and for triangles that are not reached."""
     xp = namespace(neighbour, near)
     cell = xp.arange(near.shape[1])
     neighbour = neighbour.reshape(-1, 3)
@@ -131,22 +134,23 @@ def _hang_together(neighbour, near: Bool[Array, "L m"], root):
 
 
 def _over_sides(local, twin):
-    """Turn (h, 2) and shift (h, 2) from the plane of each side's triangle into that of its neighbour."""
+    """Rotation (h, 2) and translation (h, 2) from the plane of each side's triangle into that of the neighbour."""
     xp = namespace(local)
     start, end = local.reshape(-1, 2), xp.roll(local, -1, axis=1).reshape(-1, 2)
     own, other = end - start, start[twin] - end[twin]
     turn = xp.stack([(own * other).sum(axis=1), own[:, 0] * other[:, 1] - own[:, 1] * other[:, 0]], axis=1)
     turn = turn / xp.sqrt((turn**2).sum(axis=1, keepdims=True))
-    return turn, end[twin] - _turned(turn, start)
+    return turn, end[twin] - _rotate(turn, start)
 
 
-def _joined(before, turn, shift):
-    """From steps, each from a triangle into the one `before` (L, m), to ways, and where they end, in the place's."""
+def _concatenate_steps(before, turn, shift):
+    """Concatenate the steps from each triangle into the one `before` it (L, m). Returns the rotation and translation of
+    the whole path, and the triangle where it ends."""
     xp = namespace(before, turn)
     row = xp.arange(len(before))[:, None]
     for _ in range(_JOININGS):
         then, moved = turn[row, before], shift[row, before]
-        turn, shift = _turned(then, turn), _turned(then, shift) + moved
+        turn, shift = _rotate(then, turn), _rotate(then, shift) + moved
         before = before[row, before]
         if has_values(before) and (before[row, before] == before).all():
             break
@@ -154,7 +158,7 @@ def _joined(before, turn, shift):
 
 
 def _curved(local, cells, twin, number: int) -> Bool[Array, " m"]:
-    """Whether, for each triangle, the angles round one of its corners inside the surface are no full turn."""
+    """For each triangle, whether the angles around one of its corners inside the surface do not sum to a full turn."""
     xp = namespace(local, cells)
     ahead, back = xp.roll(local, -1, axis=1) - local, xp.roll(local, 1, axis=1) - local
     angle = xp.arctan2(ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0], (ahead * back).sum(axis=-1))

@@ -1,9 +1,9 @@
-"""`Unrolled`: a curved surface laid flat, in metres, with how much that stretches it (NumPy).
+"""`Unrolled`: a curved surface flattened into the plane, in metres, with the stretch of each triangle.
 
-Surfaces that can be laid flat without stretching, cylinders, cones and bent sheets, are laid so, except as far as their
-triangles deviate from them; all others are laid as rigidly as possible: each triangle turned only, and these brought
-together in the least-squares sense, again and again (Liu, Zhang, Xu, Gotsman and Gortler, SGP 2008, from a conformal
-start: Lévy, Petitjean, Ray and Maillot, SIGGRAPH 2002). A closed sleeve is cut along a shortest way from edge to edge,
+Developable surfaces (cylinders, cones, bent sheets) are flattened without stretch, apart from the deviations of their
+triangles from them. All others are flattened as rigidly as possible: rotations of the triangles and positions of the
+nodes are fitted in turn by least squares (Liu, Zhang, Xu, Gotsman and Gortler, SGP 2008), starting from a conformal map
+(Lévy, Petitjean, Ray and Maillot, SIGGRAPH 2002). A sleeve is cut along a shortest path from one open end to the other,
 a closed surface from one end to the other.
 """
 
@@ -23,16 +23,16 @@ from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
 from jeit.mesh.mesh import Mesh
 
 _ROUNDS = 60
-# Height in space per metre on the flat surface from which on it determines which way is up.
+# Minimum slope of a coordinate in space, in metres per metre on the flat surface, for its use as the upward direction.
 _UP = 0.3
 
 
 class Unrolled(eqx.Module):
-    """A surface laid flat; make it with `unroll`.
+    """A surface flattened into the plane; created by `unroll`.
 
-    **Fields**: `surface`; `cells` (m, 3), its triangles in nodes of the flat one, where the cut is two lines; `points`
-    (k, 2), the flat nodes, metres; `nodes` (k,), which of the surface's each is; `stretch` (m, 2), the least and the
-    greatest factor by which each triangle is stretched.
+    **Fields**: `surface`: the triangles in space; `cells` (m, 3): the triangles as indices of flat nodes, in which
+    nodes on the cut occur twice; `points` (k, 2): flat nodes, metres; `nodes` (k,): node of the surface for each flat
+    node; `stretch` (m, 2): minimum and maximum factor by which each triangle is stretched.
     """
 
     surface: Triangles
@@ -43,23 +43,23 @@ class Unrolled(eqx.Module):
 
     @property
     def distortion(self) -> float:
-        """Most that lengths are stretched or shrunk, a share: 0 for what can be laid flat."""
+        """Maximum relative change of lengths by the flattening; 0 for developable surfaces."""
         return float(np.maximum(self.stretch[:, 1] - 1, 1 - self.stretch[:, 0]).max())
 
     @property
     def mean_distortion(self) -> float:
-        """Mean of the same over the surface's area."""
+        """Area-weighted mean over the surface of the maximum relative change of lengths in each triangle."""
         return float(np.average(np.abs(self.stretch - 1).max(axis=1), weights=self.surface.areas))
 
     @property
     def seam(self) -> Float[np.ndarray, "s 2 2"]:
-        """Edges of the flat surface that were cut: none of an open one."""
+        """Segments (s, 2, 2) of the flat outline that arose from the cut; there are none for an open sheet."""
         ends, cut = self._edges
         return self.points[ends[cut]]
 
     @property
     def edge(self) -> Float[np.ndarray, "s 2 2"]:
-        """Edges of the flat surface that are the surface's own."""
+        """Segments (s, 2, 2) of the flat outline that are edges of the original surface."""
         ends, cut = self._edges
         return self.points[ends[~cut]]
 
@@ -69,19 +69,21 @@ class Unrolled(eqx.Module):
         return ends, ~_among(np.sort(self.nodes[ends], axis=1), np.sort(self.surface.border, axis=1))
 
     def flat(self, places: ArrayLike | SurfacePlaces) -> Float[np.ndarray, "p 2"]:
-        """Positions on the flat surface, (p, 2) metres, of places on the surface, (p, 3) metres."""
+        """Positions (p, 2) on the flat surface, metres, of points (p, 3) on the surface, metres."""
         at = places if isinstance(places, SurfacePlaces) else self.surface.nearest(places)
         return np.einsum("pk,pkd->pd", at.weights, self.points[self.cells[at.triangle]])
 
 
 def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut: ArrayLike | None = None) -> Unrolled:
-    """Lay a surface flat, or a `face` of a shell, as it is seen from outside. `cut`: a place (3,), metres, that the cut
-    of a closed sleeve is to pass by; the side of the least x unless given. Raises `ValueError` as `Triangles.of` does,
-    and for surfaces with handles or of which parts do not hang together."""
+    """Flatten a surface, or a `face` of a shell, as seen from outside.
+
+    `cut`: a point (3,), metres, near which a sleeve is to be cut; by default, the side with the smallest x. Raises
+    `ValueError` as `Triangles.of` does, and for surfaces with handles or disconnected parts.
+    """
     triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
     cells, nodes = _cut_open(triangles, cut)
     corners = triangles.corners
-    local = _laid(corners)
+    local = _plane_corners(corners)
     points = _conformal(cells, local, len(nodes))
     points = _rigid(cells, local, points)
     points = _upright(points, triangles.points[nodes])
@@ -89,8 +91,8 @@ def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut: ArrayLike
     return Unrolled(triangles, cells, points, nodes, np.linalg.svd(flat, compute_uv=False)[:, ::-1])
 
 
-def _laid(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3 2"]:
-    """Each triangle in a plane of its own."""
+def _plane_corners(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3 2"]:
+    """Corners of each triangle in its own plane."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length = np.linalg.norm(a, axis=1)
     along = (a * b).sum(axis=1) / length
@@ -104,7 +106,7 @@ def _edges(triangles: Float[np.ndarray, "m 3 2"]) -> Float[np.ndarray, "m 2 2"]:
 
 
 def _conformal(cells, local, count: int) -> np.ndarray:
-    """Least-squares conformal map, its two farthest nodes held: angles are kept as far as they can be."""
+    """Least-squares conformal map, which preserves angles as well as possible; the two farthest nodes are fixed."""
     held = _far_apart(cells, local, count)
     w = np.stack([local[:, 2] - local[:, 1], local[:, 0] - local[:, 2], local[:, 1] - local[:, 0]], axis=1)
     w = w / np.sqrt(np.abs(np.linalg.det(_edges(local))))[:, None, None]
@@ -125,7 +127,7 @@ def _conformal(cells, local, count: int) -> np.ndarray:
 
 
 def _far_apart(cells, local, count: int):
-    """Two nodes far from each other, and how far, along edges."""
+    """Two nodes far from each other, and their distance along edges."""
     length = np.linalg.norm(local[:, [1, 2, 0]] - local, axis=2)
     start, end = cells.ravel(), cells[:, [1, 2, 0]].ravel()
     graph = scipy.sparse.csr_array((length.ravel(), (start, end)), shape=(count, count))
@@ -135,10 +137,11 @@ def _far_apart(cells, local, count: int):
 
 
 def _rigid(cells, local, points: np.ndarray) -> np.ndarray:
-    """As rigid as possible: each triangle turned as the map turns it, then all points moved to suit them best."""
+    """Flatten as rigidly as possible: alternately fit a rotation of each triangle to the map, and the nodes to the
+    rotated triangles."""
     count = len(points)
     next_, after = [1, 2, 0], [2, 0, 1]
-    edge = local[:, next_] - local  # side k from corner k to the next
+    edge = local[:, next_] - local  # side k runs from corner k to the next
     one, other = local - local[:, after], local[:, next_] - local[:, after]
     cross = one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
     weight = (one * other).sum(-1) / cross / 2  # half the cotangent of the angle opposite to side k
@@ -167,8 +170,8 @@ def _rigid(cells, local, points: np.ndarray) -> np.ndarray:
 
 
 def _upright(points: np.ndarray, space: np.ndarray) -> np.ndarray:
-    """Turned so that z is up, or y where z goes neither way, and the middle at the origin; never mirrored: it is seen
-    from outside."""
+    """Rotate so that z points upward, or y or x if z has little slope, and centre at the origin. The map is not
+    mirrored, since the surface is seen from outside."""
     points = points - points.mean(axis=0)
     for axis in (2, 1, 0):
         height = space[:, axis] - space[:, axis].mean()
@@ -191,7 +194,7 @@ def _among(edges, others) -> np.ndarray:
 
 
 def _cut_open(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of a surface that is a disk once cut, and the surface's node of each of theirs."""
+    """Cut a surface so that it becomes a disk. Returns its triangles, and for each new node the original node."""
     cells, count = surface.cells, len(surface.points)
     border = surface.border
     loops, label = _loops(border, count)
@@ -218,7 +221,7 @@ def _cut_open(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _loops(border, count: int):
-    """Number of loops of the border, and the loop of each of its edges."""
+    """Number of loops of the border, and the index of the loop of each border edge."""
     if not len(border):
         return 0, np.zeros(0, int)
     graph = scipy.sparse.csr_array((np.ones(len(border)), border.T), shape=(count, count))
@@ -228,13 +231,13 @@ def _loops(border, count: int):
 
 
 def _way(points, edges, ends, cut, border) -> list[int]:
-    """Nodes of a way along edges from one end to the other, by the side asked for, and off the border between."""
+    """Nodes of a path along edges from one end to the other, near the requested side and off the border."""
     middle = points.mean(axis=0)
     goal = np.asarray(cut, float) if cut is not None else None
     spread = np.ptp(points, axis=0).max()
     between = points[edges].mean(axis=1)
     if goal is None:
-        # What is off the side of the least x costs more: a straight line along that side.
+        # Edges away from the side of the smallest x cost more, which yields a straight line along that side.
         off = (between[:, 0] - points[:, 0].min()) / spread
         aside = np.abs(between[:, 1] - middle[1]) / spread
         cost = 1 + 20 * (off + aside)
@@ -255,8 +258,8 @@ def _way(points, edges, ends, cut, border) -> list[int]:
 
 
 def _split(cells, path: list[int], count: int, *, closed: bool):
-    """Triangles on one side of a way of edges get new nodes along it; ends of the way stay one node where they are
-    inside a closed surface."""
+    """Duplicate the nodes along a path for the triangles on one side of it. On a closed surface, the ends of the path
+    are not duplicated."""
     doubled = path[1:-1] if closed else path
     ahead = set(itertools.pairwise(path))
     onto = set(path)
@@ -269,8 +272,8 @@ def _split(cells, path: list[int], count: int, *, closed: bool):
     cells = cells.copy()
     original = cells.copy()
     for node in doubled:
-        # Triangles round the node, joined across edges that are not of the way, fall into two parts: one side's is the
-        # part with a triangle that runs along the way.
+        # The triangles around the node, joined across edges that are not on the path, form two parts; one side is the
+        # part that contains a triangle traversing the path forwards.
         around = touching[node]
         side = set()
         for number in around:

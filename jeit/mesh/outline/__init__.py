@@ -1,4 +1,4 @@
-"""Outlines in metres, without a mesh: `Domain`, which says what every outline can do, and one file for each."""
+"""Outlines in metres, without a mesh: the base class `Domain`, and the outlines `Disk`, `Polygon` and `Rectangle`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from jeit.mesh.outline.domain import Domain, Pen
 from jeit.mesh.outline.polygon import Polygon
 from jeit.mesh.outline.rectangle import Rectangle
 
-# By the name that `describe` gives them: what a file may ask for.
+# Classes of outlines by the name of the shape that `describe` returns and files contain.
 OUTLINES: dict[str, type[Domain]] = {"disk": Disk, "rectangle": Rectangle, "polygon": Polygon}
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""`Disk`: a circle, meshed in rings where nothing else is asked."""
+"""`Disk`: a circular outline, meshed in concentric rings unless refinement or node positions are requested."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ class Disk(Domain):
     centre: tuple[float, float]
 
     def __init__(self, radius: float, centre: Sequence[float] = (0.0, 0.0)):
-        """`radius` > 0 and `centre` (x, y) in metres; raises `ValueError` otherwise."""
+        """`radius` > 0 and `centre` (x, y) are in metres. Raises `ValueError` otherwise."""
         self.radius = check_length("radius", radius, 2)
         self.centre = check_position("centre", centre)
         check_near_origin("centre", self.centre, self.radius)
 
     @property
     def area(self) -> float:
-        """π R² in m²."""
+        """Area π R² in m²."""
         return np.pi * self.radius**2
 
     @property
     def perimeter(self) -> float:
-        """2 π R in m."""
+        """Circumference 2 π R in m."""
         return 2.0 * np.pi * self.radius
 
     @property
@@ -55,26 +55,27 @@ class Disk(Domain):
         return as_array(xp.asarray(self.centre) + self.radius * xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1))
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """The circle as the polygon inscribed in it."""
+        """Vertices of the polygon with `num_chords` sides that is inscribed in the circle."""
         return (self.boundary(self.perimeter * np.arange(num_chords) / num_chords),)
 
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
-        """True for each of `points` (…, 2) in metres that lies in the disk or on its edge."""
+        """Whether each of `points` (…, 2), in metres, lies in the disk or on its edge."""
         offset = jnp.asarray(points) - jnp.asarray(self.centre)
         return jnp.sum(offset**2, axis=-1) <= self.radius**2 * (1 + 1e-12)
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
-        """R less the distance (p,) of `points` (p, 2) from the centre, metres."""
+        """Distance (p,) of `points` (p, 2) from the circle, metres, negative outside: R minus the distance from the
+        centre."""
         return as_array(self.radius - self._from_centre(points)[1])
 
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
-        """`points` (p, 2) in metres, those outside moved to the circle along their radius."""
+        """Move those of `points` (p, 2), metres, that lie outside the disk radially onto the circle."""
         offset, distance = self._from_centre(points)
         xp = numerics(self, points)
         return as_array(xp.asarray(self.centre) + offset * xp.minimum(1, self.radius / distance[:, None]))
 
     def _from_centre(self, points: ArrayLike) -> tuple[Any, Any]:
-        """Offsets (p, 2) and distances (p,) from the centre, these with a derivative at zero too."""
+        """Offsets (p, 2) and distances (p,) from the centre; the distances are differentiable at the centre, too."""
         xp = numerics(self, points)
         offset = xp.asarray(points) - xp.asarray(self.centre)
         return offset, xp.sqrt((offset**2).sum(axis=1) + 1e-24)
@@ -98,7 +99,7 @@ class Disk(Domain):
         boundary_points: ArrayLike | None = None,
         interior_points: ArrayLike | None = None,
     ) -> Mesh:
-        """A mesh of the disk; arguments are those of `jeit.mesh.disk`, which also says what it raises."""
+        """Mesh the disk. The arguments and the errors raised are those of `jeit.mesh.disk`."""
         middle = np.asarray(self.centre)
         if num_boundary is not None:
             refine = self._finer_rim(num_boundary, refine)
@@ -130,7 +131,8 @@ class Disk(Domain):
         if target.cell_size is None:
             rings = structured.choose_rings(target.num_points)
         else:
-            # Six nodes a ring: cells with legs t and π/3 t have the area of equilateral ones with edge 1.1 t.
+            # With six nodes more on each ring, cells with legs t and π/3 t have the area of equilateral triangles with
+            # edge 1.1 t.
             num_rings = max(1, round(1.1 * self.radius / target.cell_size))
             rings = (num_rings, 6 * num_rings)
         check_total(rings[0] * rings[1] // 2, "cell_size")

@@ -1,4 +1,4 @@
-"""Bodies, which can be meshed, and domains: bodies bounded by an outline."""
+"""Base classes of bodies, which can be meshed, and of domains, which are bodies bounded by an outline."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from jeit_solvers.engines import has_values
 
 
 class Body(eqx.Module):
-    """Base of all bodies: plane outlines (`Domain`), solids above one (`Solid`), and meshes of your own (`OwnMesh`)."""
+    """Base of all bodies: plane outlines (`Domain`), solids above an outline (`Solid`), and given meshes
+    (`OwnMesh`)."""
 
     @property
     @abc.abstractmethod
@@ -28,41 +29,43 @@ class Body(eqx.Module):
 
     @abc.abstractmethod
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """Vertices (k, 2) in metres of the edges of a plane body, the outer one first; none of a solid."""
+        """Vertices (k, 2), in metres, of each boundary loop of a plane body, the outer loop first; empty for a
+        solid."""
 
     @abc.abstractmethod
     def describe(self) -> dict[str, Any]:
-        """The name of the "shape" and its sizes, lengths in metres, in words that JSON and TOML have."""
+        """Name of the "shape" and its sizes, lengths in metres, as values that JSON and TOML can represent."""
 
     @abc.abstractmethod
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
-        """A mesh of it with `num_points` nodes or of `cell_size` metres, finer where `refine` asks, seen from above.
+        """Mesh the body with `num_points` nodes or cells of `cell_size` metres; `refine` requests smaller cells as seen
+        from above.
 
-        Raises `ValueError` on bad or contradicting arguments.
+        Raises `ValueError` for invalid or contradictory arguments.
         """
 
 
-# Greatest distance of an outline from the origin, over its size: ten digits of its shape are left there.
+# Maximum distance of an outline from the origin, divided by its size: beyond it, double precision leaves fewer than ten
+# digits for the shape.
 _FARTHEST = 1e6
 
 
 class Pen(Protocol):
-    """Interface to draw outlines: into a drawing's file, or by a geometry kernel. The first stroke encloses the
-    others."""
+    """Interface to draw outlines, into a drawing file or a geometry kernel. The first stroke encloses the others."""
 
     def circle(self, centre: tuple[float, float], radius: float) -> None:
-        """A circle, in metres."""
+        """Draw a circle; lengths in metres."""
 
     def loop(self, vertices: np.ndarray) -> None:
-        """A closed loop of straight sides with these `vertices` (k, 2) in metres, the first not repeated."""
+        """Draw a closed loop of straight sides with `vertices` (k, 2) in metres, the first of which is not repeated."""
 
 
 class Domain(Body):
-    """An outline in metres, without a mesh: `Disk`, `Rectangle`, `Polygon`, or one of your own.
+    """An outline in metres, without a mesh: `Disk`, `Rectangle`, `Polygon`, or a subclass of your own.
 
-    Readers, layouts, rasters and mesh builders ask for nothing but what stands here, so that a new outline is one
-    class. Arc length runs counter-clockwise along the outer edge. For edges of straight sides, or drawn as chords, each
-    method is a line that calls `jeit.mesh.outline.polygon`; see `Polygon`.
+    Readers, layouts, rasters and mesh builders use only the methods defined here, so a new outline needs only one
+    class. Arc length runs counter-clockwise along the outer edge. For outlines with straight sides, or approximated by
+    chords, each method can be a single call of a function in `jeit.mesh.outline.polyline`; see `Polygon`.
     """
 
     @property
@@ -82,58 +85,58 @@ class Domain(Body):
 
     @abc.abstractmethod
     def boundary(self, arc_length: ArrayLike) -> Float[Array, "... 2"]:
-        """Points (…, 2) on the outer edge at `arc_length` (…) in metres; it wraps round."""
+        """Points (…, 2) on the outer edge at `arc_length` (…) in metres, taken modulo the perimeter."""
 
     @abc.abstractmethod
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """Vertices (k, 2) in metres of the outer edge, counter-clockwise, and of every hole, clockwise.
+        """Vertices (k, 2), in metres, of the outer edge, counter-clockwise, and of every hole, clockwise.
 
-        The first vertex is not repeated. A curved edge becomes `num_chords` chords: a circle,
-        with 120, a polygon that is nowhere more than 0.04 % of the radius inside it.
+        The first vertex is not repeated. A curved edge is replaced by `num_chords` chords; with 120 chords, the polygon
+        of a circle lies at most 0.04 % of the radius inside it.
         """
 
     @abc.abstractmethod
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
-        """True for each of `points` (…, 2) in metres that lies inside."""
+        """Whether each of `points` (…, 2), in metres, lies inside."""
 
     @abc.abstractmethod
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
         """Distance (p,) of `points` (p, 2) from the edge in metres, negative outside.
 
-        To be differentiated almost everywhere; within 1e-12 m of the edge it is smoothed.
+        It is differentiable almost everywhere; within 1e-12 m of the edge it is smoothed.
         """
 
     @abc.abstractmethod
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
-        """`points` (p, 2) in metres, those outside moved to the nearest place on the edge."""
+        """Move those of `points` (p, 2), metres, that lie outside to the nearest point on the edge."""
 
     @abc.abstractmethod
     def describe(self) -> dict[str, Any]:
-        """The name of the "shape" and what it is made from, lengths in metres, in words that JSON and TOML have.
+        """Name of the "shape" and its parameters, lengths in metres, as values that JSON and TOML can represent.
 
-        All but "shape" are the arguments that make the outline again.
+        All entries except "shape" are arguments that create the same outline.
         """
 
     @abc.abstractmethod
     def draw(self, pen: Pen) -> None:
-        """Draw the edge and then the holes: circles as circles, everything else as loops of straight sides."""
+        """Draw the edge and then the holes: circles as circles, all other loops with straight sides."""
 
     @abc.abstractmethod
     def mesh(self, num_points: int | None = None, cell_size: float | None = None, refine: Refinement = None) -> Mesh:
-        """A mesh of triangles with `num_points` nodes or of `cell_size` metres; see `jeit.mesh.disk`.
+        """Mesh the domain with triangles, with `num_points` nodes or cells of `cell_size` metres; see `jeit.mesh.disk`.
 
-        Raises `ValueError` on bad or contradicting arguments.
+        Raises `ValueError` for invalid or contradictory arguments.
         """
 
 
 def numerics(*values: Any) -> Any:
-    """JAX's numpy where any of `values` is being traced, NumPy where all are known."""
+    """The array module to compute with: jax.numpy if any of `values` is being traced, otherwise NumPy."""
     return np if has_values(*values) else jnp
 
 
 def check_length(name: str, value: Any, across: float = 1.0) -> Any:
-    """Check a length in metres and make it a float (traced values pass); `ValueError` unless it is positive. What it is
-    the length of is `across` times as large, and warned of by that."""
+    """Check a length in metres and convert it to a float; traced values are returned unchanged. Raises `ValueError`
+    unless it is positive, and warns if the object is large: `across` is the object's size divided by this length."""
     if not has_values(value):
         return value
     try:
@@ -147,8 +150,8 @@ def check_length(name: str, value: Any, across: float = 1.0) -> Any:
 
 
 def check_near_origin(name: str, far: Any, size: Any) -> None:
-    """Raise `ValueError`, about the argument `name`, for an outline of `size` metres that lies so `far` away, metres,
-    that rounding of its coordinates would be seen in it (traced values pass)."""
+    """Raise `ValueError` with the argument's `name` if an outline of `size` metres is so `far` from the origin, metres,
+    that its coordinates lose accuracy. Traced values are not checked."""
     if has_values(far, size) and float(np.max(np.abs(np.asarray(far)))) > _FARTHEST * float(size):
         away = float(np.max(np.abs(np.asarray(far))))
         raise ValueError(
@@ -158,7 +161,8 @@ def check_near_origin(name: str, far: Any, size: Any) -> None:
 
 
 def check_position(name: str, value: Any) -> Any:
-    """Check a place (x, y) in metres and make it two floats (traced values pass); `ValueError` if it is none."""
+    """Check a position (x, y) in metres and convert it to two floats; traced values are converted without a check.
+    Raises `ValueError` for anything else."""
     if not has_values(value):
         return jnp.asarray(value)
     array = np.asarray(value, dtype=float)

@@ -1,4 +1,4 @@
-"""`Polygon`: straight sides, holes if there are any."""
+"""`Polygon`: an outline of straight sides, possibly with holes."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class Polygon(Domain):
     holes: tuple[Float[Array, "h 2"], ...]
 
     def __init__(self, vertices: ArrayLike, holes: Sequence[ArrayLike] = ()):
-        """`vertices` (k, 2) of the outline and of each of `holes`, in order, in metres, first not repeated.
+        """`vertices` (k, 2) of the outline and of each of `holes`, in order, in metres, the first vertex not repeated.
 
-        Either orientation is taken; the outline is kept counter-clockwise, holes clockwise. Raises
-        `ValueError` on fewer than three or repeated vertices, an outline that crosses or touches itself, and holes that
-        are not inside.
+        Either orientation is accepted; the outline is stored counter-clockwise, holes clockwise. Raises `ValueError`
+        for fewer than three vertices, repeated vertices, an outline that crosses or touches itself, and holes that are
+        not inside.
         """
         if not has_values(vertices, holes):
             self.vertices = jnp.asarray(vertices)
@@ -47,7 +47,7 @@ class Polygon(Domain):
 
     @property
     def area(self) -> Float[Array, ""]:
-        """Enclosed area without the holes, in m² (shoelace formula)."""
+        """Area inside the outline minus that of the holes, in m² (shoelace formula)."""
         return polyline.area(self.loops())
 
     @property
@@ -66,11 +66,11 @@ class Polygon(Domain):
         return polyline.along(self.vertices, arc_length)
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """The vertices, and those of every hole."""
+        """Vertices of the outline and of every hole."""
         return (self.vertices, *self.holes)
 
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
-        """True for each of `points` (…, 2) in metres inside the outline and outside the holes (even-odd rule)."""
+        """Whether each of `points` (…, 2), in metres, lies inside the outline and outside the holes (even-odd rule)."""
         return polyline.contains(self.loops(), points)
 
     def signed_distance(self, points: ArrayLike) -> Float[Array, " p"]:
@@ -78,16 +78,16 @@ class Polygon(Domain):
         return polyline.signed_distance(self.loops(), points)
 
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
-        """`points` (p, 2) in metres, those outside and in holes moved to the nearest place on a side."""
+        """Move those of `points` (p, 2), metres, that lie outside or in a hole to the nearest point on a side."""
         return polyline.nearest(self.loops(), points)
 
     def describe(self) -> dict:
-        """Shape and vertices, and those of the holes if there are any."""
+        """Name of the shape, vertices, and vertices of the holes if there are any."""
         holes = {"holes": [np.asarray(hole).tolist() for hole in self.holes]} if self.holes else {}
         return {"shape": "polygon", "vertices": np.asarray(self.vertices).tolist(), **holes}
 
     def draw(self, pen: Pen) -> None:
-        """A loop for the outline and one for each hole."""
+        """Draw the outline and each hole as a loop."""
         for loop in self.loops():
             pen.loop(np.asarray(loop))
 
@@ -101,7 +101,7 @@ class Polygon(Domain):
         boundary_points: ArrayLike | None = None,
         interior_points: ArrayLike | None = None,
     ) -> Mesh:
-        """A mesh of the polygon; arguments and errors are those of `jeit.mesh.polygon`."""
+        """Mesh the polygon. The arguments and the errors raised are those of `jeit.mesh.polygon`."""
         curves = [closed_line(np.asarray(loop)) for loop in self.loops()]
         target = Target.create(num_points, cell_size)
         return mesh_within(curves, float(self.area), target, refine, boundary_points, interior_points)

@@ -1,8 +1,8 @@
-"""Closed loops of straight sides: what outlines made of them share.
+"""Functions for outlines that consist of closed loops with straight sides.
 
-`loops` holds the vertices (k, 2) in metres of each, first not repeated: the outer one counter-clockwise, holes
-clockwise. Distances are worked out by NumPy where all values are known, for JAX would compile anew for every number of
-points. For checks of loops see `jeit.mesh.topology`.
+`loops` contains the vertices (k, 2) of each loop in metres, the first not repeated: the outer loop counter-clockwise,
+holes clockwise. Distances are computed with NumPy if all values are known, because JAX would compile again for every
+number of points. For checks of loops see `jeit.mesh.topology`.
 """
 
 from __future__ import annotations
@@ -29,14 +29,15 @@ def length(loop: Loop) -> Float[Array, ""]:
 
 
 def area(loops: Sequence[Loop]) -> Float[Array, ""]:
-    """Area inside the first loop less that of the holes, m² (shoelace formula)."""
+    """Area inside the first loop minus that of the holes, m² (shoelace formula)."""
     outer, *holes = (_shoelace(loop) for loop in loops)
     return sum(holes, outer)
 
 
 @either_engine
 def along(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
-    """Points (…, 2) on a loop at `arc_length` (…) in metres from its first vertex; it wraps round."""
+    """Points (…, 2) on a loop at `arc_length` (…) in metres from its first vertex, taken modulo the length of the
+    loop."""
     xp = namespace(loop)
     closed = xp.concatenate([loop, loop[:1]])
     stops = xp.concatenate([xp.zeros(1), xp.cumsum(_side_lengths(loop))])
@@ -46,7 +47,7 @@ def along(loop: Loop, arc_length: ArrayLike) -> Float[Array, "... 2"]:
 
 @either_engine
 def contains(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
-    """True for each of `points` (…, 2) inside the first loop and outside the holes (even-odd rule)."""
+    """Whether each of `points` (…, 2) lies inside the first loop and outside the holes (even-odd rule)."""
     if namespace(loops, points) is np:
         at = np.asarray(points)
         return enclosed(at.reshape(-1, 2), loops).reshape(at.shape[:-1])  # pyright: ignore
@@ -61,19 +62,20 @@ def signed_distance(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " 
     """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
     xp = numerics(loops, points)
     at, inside, place = _nearest_on(xp, loops, points)
-    apart = xp.sqrt(((at - place) ** 2).sum(axis=1) + 1e-24)  # with a derivative at zero too
+    apart = xp.sqrt(((at - place) ** 2).sum(axis=1) + 1e-24)  # differentiable at zero, too
     return jnp.asarray(xp.where(inside, apart, -apart))
 
 
 def nearest(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
-    """`points` (p, 2) inside as they are, others moved to the nearest place on a side."""
+    """Move those of `points` (p, 2) that lie outside to the nearest point on a side; others are returned unchanged."""
     xp = numerics(loops, points)
     at, inside, place = _nearest_on(xp, loops, points)
     return jnp.asarray(xp.where(inside[:, None], at, place))
 
 
 def _nearest_on(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:
-    """`points` (p, 2), which of them lie inside (p,), and the place on a side nearest to each, (p, 2)."""
+    """Convert `points` (p, 2) to an array; also returns whether each lies inside (p,), and the nearest point on a side
+    (p, 2)."""
     chains, at = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
     start = xp.concatenate(chains)
     sides = xp.concatenate([xp.roll(loop, -1, axis=0) for loop in chains]) - start

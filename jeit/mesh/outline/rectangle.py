@@ -1,4 +1,5 @@
-"""`Rectangle`: sides along the axes, meshed in rows where nothing else is asked."""
+"""`Rectangle`: an outline with sides along the axes, meshed in rows unless refinement or node positions are
+requested."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ class Rectangle(Domain):
     centre: tuple[float, float]
 
     def __init__(self, width: float, height: float, centre: Sequence[float] = (0.0, 0.0)):
-        """`width` (along x), `height` (along y) > 0 and `centre` in metres; raises `ValueError` otherwise."""
+        """`width` (along x) and `height` (along y), both positive, and `centre` are in metres. Raises `ValueError`
+        otherwise."""
         self.width = check_length("width", width)
         self.height = check_length("height", height)
         self.centre = check_position("centre", centre)
@@ -41,7 +43,7 @@ class Rectangle(Domain):
 
     @property
     def perimeter(self) -> float:
-        """2 (width + height) in m."""
+        """Perimeter 2 (width + height) in m."""
         return 2.0 * (self.width + self.height)
 
     @property
@@ -61,12 +63,12 @@ class Rectangle(Domain):
         return polyline.along(self.vertices, arc_length)
 
     def loops(self, num_chords: int = 120) -> tuple[Float[Array, "k 2"], ...]:
-        """The corners."""
+        """Vertices of the rectangle."""
         return (self.vertices,)
 
     @either_engine
     def contains(self, points: ArrayLike) -> Bool[Array, "..."]:
-        """True for each of `points` (…, 2) in metres that lies in the rectangle or on its edge."""
+        """Whether each of `points` (…, 2), in metres, lies in the rectangle or on its edge."""
         xp = namespace(self, points)
         offset = abs(xp.asarray(points) - xp.asarray(self.centre))
         half = 0.5 * xp.asarray([self.width, self.height])
@@ -77,11 +79,11 @@ class Rectangle(Domain):
         return polyline.signed_distance(self.loops(), points)
 
     def nearest(self, points: ArrayLike) -> Float[Array, "p 2"]:
-        """`points` (p, 2) in metres, those outside moved to the nearest place on a side."""
+        """Move those of `points` (p, 2), metres, that lie outside to the nearest point on a side."""
         return polyline.nearest(self.loops(), points)
 
     def describe(self) -> dict:
-        """Shape, sides and centre."""
+        """Name of the shape, width, height and centre."""
         sides = {"width": float(self.width), "height": float(self.height)}
         return {"shape": "rectangle", **sides, "centre": [float(x) for x in self.centre]}
 
@@ -99,7 +101,8 @@ class Rectangle(Domain):
         boundary_points: ArrayLike | None = None,
         interior_points: ArrayLike | None = None,
     ) -> Mesh:
-        """A mesh of the rectangle, its sides tagged; arguments and errors are those of `jeit.mesh.rectangle`."""
+        """Mesh the rectangle and tag its sides. The arguments and the errors raised are those of
+        `jeit.mesh.rectangle`."""
         target = Target.create(num_points, cell_size)
         if refine is None and boundary_points is None and interior_points is None:
             mesh = self._rows(target)
@@ -109,7 +112,7 @@ class Rectangle(Domain):
         return self.tagged(mesh)
 
     def tagged(self, mesh: Mesh) -> Mesh:
-        """A mesh of the rectangle, with tags for its sides."""
+        """Add tags for the sides of the rectangle to a mesh of it."""
         return Mesh(mesh.points, mesh.cells, mesh.facets, self._sides(mesh))
 
     def _rows(self, target: Target) -> Mesh:
@@ -120,7 +123,7 @@ class Rectangle(Domain):
         return Mesh.create(points + np.array([left, bottom]), cells)
 
     def _sides(self, mesh: Mesh) -> dict:
-        """Facets of each side by its name."""
+        """Indices of the facets on each side, by the name of the side."""
         left, right, bottom, top = self.extent
         ends = np.asarray(mesh.points)[np.asarray(mesh.facets)]
         tolerance = 1e-9 * max(self.width, self.height)

@@ -1,4 +1,4 @@
-"""Surfaces in space, and shells: sleeves, spheres, bent sheets, and what has a thickness above any of them."""
+"""Surfaces in space (sleeves, spheres, bent sheets) and shells, which give a surface a thickness."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shells: sheets with a thickness, flat, tubular or bent."""
+"""Shells of a given thickness on surfaces in space; bending of sheets; and surfaces of solids."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from jeit.mesh.topology import odd_permutation
 
 
 def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
-    """The boundary triangles of a solid, those of one `tag` or all, as a surface in space that faces outward.
+    """Extract the boundary triangles of a solid, all or those with one `tag`, as a surface in space that faces outward.
 
-    Raises `ValueError` for a mesh that is no solid, for a tag that it does not have, and where the triangles are no
-    surface, as those of a shell are not: it has two, 'inner' and 'outer'.
+    Raises `ValueError` for a mesh that is not a solid, an unknown tag, and triangles that do not form one surface: for
+    a shell, choose 'inner' or 'outer'.
     """
     if mesh.dimension != 3:
         raise ValueError("mesh: only solids have a boundary surface; this one consists of triangles.")
@@ -34,18 +34,21 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
         return Mesh.create(np.asarray(mesh.points)[used], cells.reshape(facets.shape))
 
 
-# Cosine of the angle between triangles at a node beyond which there is an edge, which is not smoothed.
+# Minimum cosine of the angle between the mean normal at a node and those of its triangles: below it, the node lies on a
+# crease, which is not smoothed.
 _CREASE = np.cos(np.radians(50.0))
-# Number of coefficients of the quadratic form fitted to neighbours, and how well they must determine it.
+# Number of coefficients of the quadratic surface fitted to neighbours, and minimum ratio of the smallest to the largest
+# eigenvalue of its normal equations.
 _TERMS, _LEAST = 5, 1e-6
 
 
 def node_normals(mesh: Mesh) -> np.ndarray:
     """Unit normals (n, 3) at the nodes of a surface in space.
 
-    That of a quadratic surface through the neighbours of each node and theirs, to the second order of the cell size on
-    a smooth surface, up to its edge; at creases, and where neighbours are few, the mean of the triangles' normals
-    weighted with their angles. NumPy; not differentiated. Raises `ValueError` for a solid.
+    A quadratic surface is fitted to the first and second neighbours of each node; on a smooth surface its normal is
+    accurate to second order in the cell size, also at the border. At creases, and where there are too few neighbours,
+    the normal is the angle-weighted mean of the normals of the triangles. Computed with NumPy, without derivatives.
+    Raises `ValueError` for a solid.
     """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     facing = np.asarray(normals(mesh))
@@ -67,8 +70,8 @@ def node_normals(mesh: Mesh) -> np.ndarray:
 
 
 def _slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes (n, 3) at each node of a quadratic surface through its neighbours and theirs, as a height over the plane
-    across `normal`; and whether there are enough of them."""
+    """Fit a quadratic surface to the first and second neighbours of each node, as a height above the plane
+    perpendicular to `normal`. Returns its slopes (n, 3) at the nodes, and whether the neighbours determine it."""
     count = len(points)
     pairs = np.concatenate([cells[:, [a, b]] for a in range(3) for b in range(3)])
     near = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)).tocsr()
@@ -96,23 +99,25 @@ def _slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[
     return np.einsum("ni,nij->nj", found, axes[:, :2]), determined
 
 
-# A fold is moved onto a node within this share of the distance of folds, for cells would be cut into slivers.
+# Distance from a fold to a node, divided by the distance between folds, below which the fold is moved onto the node, to
+# avoid slivers.
 _ONTO = 0.1
-# Nodes within this share of the sheet's width of a line are on it.
+# Distance from a node to a line, divided by the width of the sheet, below which the node lies on the line.
 _ON = 1e-12
 
 
 def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = None) -> Mesh:
-    """A flat sheet, rolled round a cylinder of `radius` metres that touches it from below along its middle.
+    """Bend a flat sheet around a cylinder of `radius` metres that touches the sheet from below along its middle.
 
-    Paper bends without stretching, and so does this: the sheet is folded along straight lines, parallel to the
-    cylinder's `axis` ("x" or "y"), and stays flat between them. Every length on it stays what it was, and so do all
-    voltages. Folds run along the rows of nodes where the mesh has such rows (`jeit.mesh.rectangle` has, for axis "x");
-    else there are `num_folds` strips, about one for each cell across, and cells are cut where folds pass through them:
-    `bend(mesh, numpy.inf)` is the flat sheet with the same cells. Fold lines lie on the cylinder. The upper side is the
-    outer one; a negative `radius` bends the sheet upward. Tags stay.
+    Like paper, the sheet is not stretched: it is folded along straight lines parallel to the cylinder's `axis` ("x" or
+    "y") and stays flat between them, so all lengths and all voltages are preserved. The folds run along the rows of
+    nodes if the mesh has rows (`jeit.mesh.rectangle` has them for axis "x"). Otherwise there are `num_folds` strips, by
+    default about one per cell across, and cells are cut where folds cross them; `bend(mesh, numpy.inf)` is the flat
+    sheet with the same cells. Fold lines lie on the cylinder. The upper side becomes the outer one; a negative `radius`
+    bends the sheet upward. Tags are kept.
 
-    Raises `ValueError` for what is no flat sheet, a radius of zero, and a sheet so wide that it would overlap itself.
+    Raises `ValueError` for a mesh that is not a flat sheet, a radius of zero, and a sheet so wide that it would overlap
+    itself.
     """
     if mesh.dimension != 2 or mesh.is_surface:
         raise ValueError("mesh: only a flat (2-D) sheet bends without stretching; this one is not flat.")
@@ -128,13 +133,13 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
     edges = {name: np.asarray(mesh.facets)[np.asarray(index)] for name, index in mesh.tags.items()}
     for line in folds[1:-1]:
         points, cells, edges = _cut(points, cells, edges, points[:, across] - line)
-    out, up = _rolled(points[:, across], folds, float(radius))
+    out, up = _roll_coordinates(points[:, across], folds, float(radius))
     columns = [out, points[:, 1], up] if across == 0 else [points[:, 0], out, up]
     return Mesh.create(np.stack(columns, axis=1), cells, tags=edges)
 
 
 def _folds(places: np.ndarray, corners: np.ndarray, across: int, num_folds: int | None) -> np.ndarray:
-    """Places where the sheet is folded, from one side to the other, both included."""
+    """Positions of the folds across the sheet, including both of its sides."""
     width = np.ptp(places)
     ordered = np.sort(places)
     rows = ordered[np.concatenate([[True], np.diff(ordered) > _ON * width])]
@@ -152,7 +157,7 @@ def _folds(places: np.ndarray, corners: np.ndarray, across: int, num_folds: int 
 def _cut(
     points: np.ndarray, cells: np.ndarray, edges: dict[str, np.ndarray], height: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Points, cells and named edges after all are cut along a line; `height` (n,), distances of the nodes from it."""
+    """Cut cells and named edges along a line; `height` (n,) are the signed distances of the nodes from it."""
     side = np.where(np.abs(height) <= _ON * np.ptp(height), 0, np.sign(height)).astype(int)
     sides = side[cells]
     crossed = (sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)
@@ -190,8 +195,9 @@ def _cut(
     return points, np.concatenate([cells[~crossed], np.array(pieces)]), named
 
 
-def _rolled(places: np.ndarray, folds: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates across and up of places (n,) on the sheet, whose `folds` lie on a circle; the middle stays at 0."""
+def _roll_coordinates(places: np.ndarray, folds: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Horizontal and vertical coordinates of positions (n,) on the sheet after bending. The `folds` lie on a circle;
+    the middle of the sheet stays at 0."""
     middle = (folds[0] + folds[-1]) / 2
     if np.isinf(radius):
         return places - middle, np.zeros_like(places)
@@ -213,7 +219,7 @@ def _rolled(places: np.ndarray, folds: np.ndarray, radius: float) -> tuple[np.nd
 
 
 _TAGS = ("inner", "outer", "side")
-# Number of bisections that find the largest thickness.
+# Number of bisection steps to find the maximum thickness.
 _HALVINGS = 40
 
 
@@ -225,16 +231,17 @@ def shell(
     outward: bool = True,
     normals: ArrayLike | None = None,
 ) -> Mesh:
-    """A skin of `thickness` metres on a surface in space: prisms along the normals at its nodes, cut into tetrahedra.
+    """Mesh a skin of `thickness` metres on a surface in space: prisms along the normals at the nodes, divided into
+    tetrahedra.
 
-    Node k · n + i is node i of the surface, k · thickness / num_layers away from it: `outward`, or inward where that is
-    False. Tags: 'inner', 'outer' and, unless the surface is closed, 'side', and those of the surface as parts of the
-    side. `normals` (n, 3): unit vectors at the nodes, where they are known better than `jeit.mesh.node_normals` finds
-    them.
+    Node k · n + i is node i of the surface displaced by k · thickness / num_layers, `outward`, or inward if that is
+    False. Tags: 'inner', 'outer' and, unless the surface is closed, 'side', and the tags of the surface for the parts
+    of the side. `normals` (n, 3): unit vectors at the nodes, if more accurate ones than those of
+    `jeit.mesh.node_normals` are known.
 
-    Raises `ValueError` for a mesh that is no surface in space, a thickness that is not positive, no layers, a shell so
-    thick that prisms turn inside out, as they do beyond the radius of curvature (the message says where, and how thick
-    it can be), and one that grows into itself.
+    Raises `ValueError` for a mesh that is not a surface in space, a thickness that is not positive, no layers, a shell
+    that intersects itself, and a thickness at which prisms turn inside out, as they do beyond the radius of curvature;
+    the message then states the position and the maximum thickness.
     """
     if not surface.is_surface:
         raise ValueError("surface: a shell is made on a surface in space; on a flat mesh it is jeit.mesh.layer.")
@@ -243,10 +250,10 @@ def shell(
     points, cells, facets = (np.asarray(array) for array in (surface.points, surface.cells, surface.facets))
     count = len(points)
     unstructured.check_total(count * (num_layers + 1), "num_layers")
-    away = node_normals(surface) if normals is None else _checked(normals, count)
+    away = node_normals(surface) if normals is None else _check_normals(normals, count)
     away = away if outward else -away
     solid = stacked_cells(cells, count, num_layers)
-    # Corners were sorted, which turned some prisms; and of three tetrahedra the second counts the other way.
+    # Sorting the corners inverted some prisms, and the second of the three tetrahedra has the opposite orientation.
     upright = np.where(odd_permutation(cells) ^ (not outward), -1.0, 1.0)
     turned = np.tile(np.outer(upright, (1, -1, 1)).ravel(), num_layers)
 
@@ -268,7 +275,7 @@ def shell(
     return mesh
 
 
-def _checked(normals: ArrayLike, count: int) -> np.ndarray:
+def _check_normals(normals: ArrayLike, count: int) -> np.ndarray:
     away = np.asarray(normals, dtype=float)
     if away.shape != (count, 3) or not np.allclose(np.linalg.norm(away, axis=1), 1, atol=1e-6):
         raise ValueError(f"normals: expected unit vectors at the nodes, shape ({count}, 3), got shape {away.shape}.")
@@ -298,7 +305,7 @@ def _check_upright(stacked, solid: np.ndarray, turned: np.ndarray, thickness: fl
     worst = int(np.argmin(_volumes(stacked(high), solid, turned)))
     triangle = worst // 3 % count
     place = stacked(0.0)[solid[worst, 0]].round(6).tolist()
-    most = (1 - 5e-4) * low  # in four digits not more than `low`
+    most = (1 - 5e-4) * low  # does not exceed `low` after rounding to four digits
     raise ValueError(
         f"thickness: {thickness:.4g} m is more than the radius of curvature of the surface at triangle {triangle}, "
         f"near {place} m: the skin turns inside out there. It can be {most:.4g} m thick at most; or let it grow to the "

@@ -1,4 +1,4 @@
-"""Surfaces by name: tubes, forearms, spheres and caps."""
+"""Surfaces of standard shapes: tubes, forearms, spheres and spherical caps."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import check_length
 from jeit.mesh.solids import disk
 
-# Height of a row of equilateral triangles, per edge.
+# Height of a row of equilateral triangles, divided by their edge.
 _ROW = np.sqrt(3) / 2
 _FEWEST_AROUND = 6
-# Places along an ellipse that its arc length is worked out from.
+# Number of points on an ellipse for computing its arc length.
 _SAMPLES = 4096
 
 
@@ -31,13 +31,13 @@ def tube(
     cell_size: float | None = None,
     num_around: int | None = None,
 ) -> Mesh:
-    """Side of an upright cylinder of `radius` and `height` metres round the z axis, from z = 0 up: a sleeve, open at
-    both ends.
+    """Mesh the lateral surface of an upright cylinder of `radius` and `height` metres around the z axis, from z = 0 up:
+    a sleeve, open at both ends.
 
-    Give `num_points`, the number of nodes (1,200 if nothing is said; met within about 5 %), `cell_size` in metres, or
-    `num_around`, the number of nodes round it. Rows of nodes lie on the cylinder, each turned by half a node against
-    the last; node 0 lies at angle 0. Tags: 'bottom', 'top'. A part of a cylinder is a sheet that was bent: `bend`.
-    Raises `ValueError` on bad or contradicting arguments.
+    Give `num_points`, the number of nodes (default 1,200, met within about 5 %), `cell_size` in metres, or
+    `num_around`, the number of nodes around the tube. Rows of nodes lie on the cylinder, alternately rotated by half
+    the distance of nodes; node 0 lies at angle 0. Tags: 'bottom', 'top'. For a part of a cylinder, bend a sheet with
+    `bend`. Raises `ValueError` for invalid or contradictory arguments.
     """
     radius, height = check_length("radius", radius), check_length("height", height)
     around, rows = _counts(2 * np.pi * radius, height, num_points, cell_size, num_around)
@@ -53,11 +53,11 @@ def forearm(
     cell_size: float | None = None,
     num_around: int | None = None,
 ) -> Mesh:
-    """A tapered sleeve round the z axis, from the `wrist` at z = 0 to the `elbow` at z = `length` metres.
+    """Mesh a tapered sleeve around the z axis, from the `wrist` at z = 0 to the `elbow` at z = `length` metres.
 
-    `wrist`, `elbow`: radius of a round section in metres, or half its widths (along x, along y) of an oval one; between
-    them they change evenly. The other arguments are those of `tube`; nodes are spread evenly round each section. Tags:
-    'bottom', 'top'. Raises `ValueError` on bad or contradicting arguments.
+    `wrist`, `elbow`: radius of a circular section in metres, or semi-axes (along x, along y) of an elliptical one; the
+    sections between are interpolated linearly. The other arguments are those of `tube`; nodes are evenly spaced around
+    each section. Tags: 'bottom', 'top'. Raises `ValueError` for invalid or contradictory arguments.
     """
     length = check_length("length", length)
     ends = np.stack([_section("wrist", wrist), _section("elbow", elbow)])
@@ -81,7 +81,7 @@ def _section(name: str, given: float | Sequence[float]) -> np.ndarray:
 def _counts(
     girth: float, height: float, num_points: int | None, cell_size: float | None, num_around: int | None
 ) -> tuple[int, int]:
-    """Nodes round a sleeve, and rows of triangles along it."""
+    """Number of nodes around a sleeve, and number of rows of triangles along it."""
     if num_around is not None:
         if num_points is not None or cell_size is not None:
             raise ValueError("num_around: give it, num_points or cell_size, not two of them.")
@@ -104,14 +104,14 @@ def _counts(
 
 
 def _arc_lengths(a: float, b: float) -> np.ndarray:
-    """Arc length along an ellipse of half-axes a and b, at evenly spaced angles of its parameter."""
+    """Arc length along an ellipse with semi-axes a and b, at evenly spaced values of its angular parameter."""
     angle = np.linspace(0, 2 * np.pi, _SAMPLES + 1)
     corners = np.stack([a * np.cos(angle), b * np.sin(angle)], axis=1)
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
 
 
 def _sleeve(height: float, halves: np.ndarray, around: int) -> Mesh:
-    """Rows of nodes on ellipses of half-axes `halves` (r + 1, 2), evenly along each, joined by triangles."""
+    """Mesh a sleeve from rows of nodes on ellipses with semi-axes `halves` (r + 1, 2), evenly spaced along each."""
     rings = []
     for row, (a, b) in enumerate(halves):
         turn = (np.arange(around) + row % 2 / 2) / around
@@ -132,7 +132,8 @@ def _sleeve(height: float, halves: np.ndarray, around: int) -> Mesh:
 
 
 def _between(low: np.ndarray, high: np.ndarray, ahead: int) -> np.ndarray:
-    """Triangles between two rings of as many nodes; the lower one is `ahead` by half a node, or the upper one."""
+    """Triangles between two rings with equal numbers of nodes, offset by half the distance of nodes; `ahead` tells
+    whether the lower ring is ahead."""
     after_low, after_high = np.roll(low, -1), np.roll(high, -1)
     if ahead:
         return np.concatenate([np.stack([low, after_low, after_high], 1), np.stack([low, after_high, high], 1)])
@@ -140,18 +141,18 @@ def _between(low: np.ndarray, high: np.ndarray, ahead: int) -> np.ndarray:
 
 
 def sphere(radius: float, *, num_points: int | None = None, cell_size: float | None = None) -> Mesh:
-    """A closed sphere of `radius` metres round the origin.
+    """Mesh a closed sphere of `radius` metres around the origin.
 
-    Every triangle of an icosahedron is cut into k² and put onto the sphere, which makes 10 k² + 2 nodes: the number
-    nearest to `num_points` (1,200 if nothing is said) is taken, or edges of about `cell_size` metres. Raises
-    `ValueError` on bad or contradicting arguments.
+    Every triangle of an icosahedron is divided into k² triangles, which are projected onto the sphere. This makes 10 k²
+    + 2 nodes; k is chosen to come closest to `num_points` (default 1,200), or for edges of about `cell_size` metres.
+    Raises `ValueError` for invalid or contradictory arguments.
     """
     radius = check_length("radius", radius)
     target = unstructured.Target.create(num_points, cell_size)
     if target.cell_size is None:
         parts = max(1, round(np.sqrt((target.num_points - 2) / 10)))
     else:
-        # 20 k² triangles of the sphere's area, each (√3 / 4) h².
+        # The area of the sphere is divided into 20 k² triangles of area (√3 / 4) h².
         parts = max(1, round(np.sqrt(4 * np.pi / 20 / (np.sqrt(3) / 4)) * radius / target.cell_size))
     unstructured.check_total(10 * parts**2 + 2, "cell_size")
     corners = _icosahedron()
@@ -168,7 +169,7 @@ def sphere(radius: float, *, num_points: int | None = None, cell_size: float | N
     points = np.concatenate([share @ face for face in faces])
     cells = np.concatenate([own + k * len(share) for k in range(len(faces))])
     points /= np.linalg.norm(points, axis=1, keepdims=True)
-    # Nodes on the icosahedron's edges were made with each of the two faces.
+    # Nodes on the edges of the icosahedron were created once for each of the two faces.
     points, cells = merged(points, cells, 1e-6 / parts)
     return Mesh.create(radius * points, _outward(points, cells))
 
@@ -181,12 +182,12 @@ def cap(
     cell_size: float | None = None,
     refine: Refinement = None,
 ) -> Mesh:
-    """The part of a sphere of `radius` metres round the origin within `angle` radians of its pole, (0, 0, radius).
+    """Mesh the part of a sphere of `radius` metres around the origin within `angle` radians of its pole (0, 0, radius).
 
-    A disk's mesh laid over it, with distances from the pole as they are on the disk: round the edge of a hemisphere
-    cells are π/2 times narrower than they are long. `num_points`, `cell_size` and `refine` are those of
-    `jeit.mesh.disk`, places being (x, y) on the flat disk. Tag: 'edge'. Raises `ValueError` on bad or contradicting
-    arguments.
+    The mesh of a disk is laid onto the sphere so that distances from the pole are preserved; at the edge of a
+    hemisphere, cells are compressed along the edge by a factor of π/2. `num_points`, `cell_size` and `refine` are those
+    of `jeit.mesh.disk`, with positions (x, y) on the flat disk. Tag: 'edge'. Raises `ValueError` for invalid or
+    contradictory arguments.
     """
     radius = check_length("radius", radius)
     if not (isinstance(angle, float | int | np.floating) and 0 < angle < 0.95 * np.pi):
@@ -202,7 +203,7 @@ def cap(
 
 
 def _outward(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Triangles (m, 3) round the origin, turned to face away from it."""
+    """Orient triangles (m, 3) so that they face away from the origin."""
     facing = np.linalg.det(points[cells]) > 0
     return np.where(facing[:, None], cells, cells[:, [0, 2, 1]])
 

@@ -1,1 +1,1 @@
-"""Pictures of bodies and images: meshes, electrodes, conductivity, inclusions, voltages, choices of λ."""
+"""Plots of bodies and images: meshes, electrodes, conductivity, inclusions, voltages, and choices of λ."""

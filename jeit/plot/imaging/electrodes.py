@@ -1,4 +1,4 @@
-"""Electrodes, inclusions and labels drawn on a picture."""
+"""Drawing of electrodes, inclusions and labels on plots."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ _STYLES = ((-1, RESISTIVE, "dashed", "resistive"), (1, CONDUCTIVE, "solid", "con
 
 
 def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *, ax: Axes | None = None) -> Axes:
-    """Outline the regions of a segmentation (rows, columns), see `jeit.image.segment`: resistive ones dashed.
+    """Draw the outlines of the regions of a segmentation (rows, columns), see `jeit.image.segment`; outlines of
+    resistive regions are dashed.
 
     `extent`: (x_min, x_max, y_min, y_max) in metres. Raises `ValueError` for labels that are not (rows, columns).
     """
@@ -45,7 +46,8 @@ def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *,
 
 
 def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
-    """Outlines of bodies in a sheet, see `jeit.inverse.shapes`: of resistive ones dashed. Metres."""
+    """Draw the outlines of bodies in a sheet, see `jeit.inverse.shapes`, on axes in metres; outlines of resistive
+    bodies are dashed."""
     ax = axes_or_new(ax)
     for sign, _, style, name in _STYLES:
         for number, one in enumerate(one for one in stars if one.sign == sign):
@@ -55,8 +57,8 @@ def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
 
 
 def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) -> Axes:
-    """Mark every inclusion with its sign at its centroid and a dashed circle: of its area, or in 3-D the equator of the
-    ball of its volume, wherever the slice is."""
+    """Mark every inclusion by its sign at its centroid and a dashed circle of the same area. In 3-D, the circle has the
+    radius of a ball of the same volume, whatever the height of the slice."""
     ax = axes_or_new(ax)
     halo = [withStroke(linewidth=3, foreground="white")]
     for inclusion in inclusions:
@@ -75,11 +77,11 @@ METAL = "#b8860b"
 def draw_electrodes(
     mesh: Mesh, electrodes: AbstractElectrodes, *, numbers: bool = True, ax: Axes | None = None, first: int = 1
 ) -> Axes:
-    """Draw `electrodes` seen from above, and their numbers, counted from `first`, beside them.
+    """Draw `electrodes` as seen from above, with their numbers, beginning with `first`.
 
-    Arcs are drawn along the boundary of `mesh`, discs and patches at their size, points as dots. Numbers stand outside
-    the outline for electrodes on the edge of a 2-D mesh, in discs, and beside dots. Raises `ValueError` for electrodes
-    that do not know where they are.
+    Arcs are drawn along the boundary of `mesh`, discs and patches to scale, and points as dots. Numbers are outside the
+    outline for electrodes on the edge of a 2-D mesh, inside discs, and beside dots. Raises `ValueError` for electrodes
+    without known places.
     """
     ax = axes_or_new(ax)
     pen = _Pen()
@@ -98,8 +100,8 @@ def draw_electrodes(
 
 
 def draw_shapes(mesh: Mesh, shapes: ElectrodeShapes, *, ax: Axes) -> None:
-    """Draw electrodes of a plane mesh that are known as polygons, and their numbers from 1: lines of two corners along
-    its edge, dots, and what has a size."""
+    """Draw electrodes of a plane mesh given as polygons, with their numbers from 1. Polygons of two corners are lines
+    along the edge, and polygons of one corner dots."""
     for corners in shapes.polygons():
         if len(corners) == 2:
             ax.plot(*corners.T, color=METAL, linewidth=5, solid_capstyle="butt", zorder=3)
@@ -112,7 +114,8 @@ def draw_shapes(mesh: Mesh, shapes: ElectrodeShapes, *, ax: Axes) -> None:
 
 
 class _Pen:
-    """Collects what is drawn, by kind; and of each electrode its middle, and whether its number stands beside it."""
+    """Collector of electrodes to draw, by kind, with the centre of each electrode and whether its number is beside
+    it."""
 
     def __init__(self):
         self.arcs: list[np.ndarray] = []
@@ -142,23 +145,23 @@ class _Pen:
         self._number(middle, beside=True)
 
 
-# Distance of a number from its electrode, and distance from the edge within which an electrode lies on it, over the
-# size of the body.
+# Distance of a number from its electrode, and maximum distance of an electrode from the edge for it to lie on the edge,
+# both divided by the size of the body.
 _AWAY, _ON_EDGE = 0.058, 0.02
-# Distance of numbers that are aligned by their beginning, not their middle, over that distance.
+# Factor of this distance for texts that are not centred.
 _CLOSER = 0.7
-# Free outside the outline, over that distance, or else the number stands inside.
+# Minimum free distance outside the outline, divided by the distance of a number, for the number to be outside.
 _ROOM = 1.6
 
 
 def draw_numbers(
     ax: Axes, mesh: Mesh, places: Float[np.ndarray, "L 2"], beside: Bool[np.ndarray, " L"], first: int
 ) -> None:
-    """Number electrodes at `places`, counted from `first`: on them, or where that would hide them `beside` them.
+    """Draw the numbers of electrodes at `places`, beginning with `first`: on the electrode, or `beside` it.
 
-    Beside one on the edge of a sheet is outward along the normal, or inward where a notch is too narrow; beside one
-    inside it is above; and beside one of a solid, seen from above, away from the middle. Electrodes above each other
-    share a place for their numbers.
+    Beside means, for an electrode on the edge of a sheet, outside along the normal, or inside if a notch is too narrow;
+    for an electrode within a sheet, above it; and for a solid seen from above, away from the middle. Electrodes above
+    each other share one text.
     """
     corners = np.asarray(mesh.points)[:, :2]
     away = _AWAY * np.ptp(corners, axis=0).max()
@@ -171,7 +174,7 @@ def draw_numbers(
     rim = [withStroke(linewidth=2, foreground="white")]
     for one in at_one_place(places, 0.1 * away):
         k = one[0]
-        effects = rim if inside[k] or not beside[k] else None  # the image lies behind
+        effects = rim if inside[k] or not beside[k] else None  # a white rim where the text is on the image
         style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": INK, "zorder": 4}
         text = ", ".join(str(k + first) for k in one)
         if len(one) > 1:
@@ -181,14 +184,16 @@ def draw_numbers(
 
 
 def _beside(shift: Float[np.ndarray, " 2"]) -> str:
-    """Alignment of several numbers, which are wide, beside their electrode: off it, not across it."""
+    """Horizontal alignment of a text of several numbers beside an electrode, so that it does not cover the
+    electrode."""
     if abs(shift[0]) < 0.8 * abs(shift[1]):
         return "center"
     return "left" if shift[0] > 0 else "right"
 
 
 def at_one_place(places: Float[np.ndarray, "L 2"], near: float) -> list[list[int]]:
-    """Electrodes within `near` of each other, as rings round a tank have them, seen from above: together."""
+    """Group electrodes within a distance `near` of each other, such as those of several rings of a tank seen from
+    above."""
     together: list[list[int]] = []
     for k, place in enumerate(places):
         for one in together:
@@ -201,14 +206,14 @@ def at_one_place(places: Float[np.ndarray, "L 2"], near: float) -> list[list[int
 
 
 def _off_the_edge(mesh: Mesh, places, away: float) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
-    """Shifts of numbers (L, 2) on a sheet, and whether they end inside it."""
+    """Shifts (L, 2) of numbers from their electrodes on a sheet, and whether each number is inside the sheet."""
     start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
     shift, inside = np.tile([0.0, 0.7 * away], (len(places), 1)), np.ones(len(places), bool)
     for k, place in enumerate(places):
         distance = _distances(place, start, end)
         if distance.min() > _ON_EDGE / _AWAY * away:
             continue
-        # At a corner two edges are nearest: the number stands along the bisector.
+        # At a corner two edges are nearest, and the number is placed along the bisector.
         nearest = distance <= distance.min() + 1e-6 * away
         outward = _normals(start[nearest], end[nearest]).sum(axis=0)
         outward /= max(np.linalg.norm(outward), 1e-12)
@@ -218,7 +223,7 @@ def _off_the_edge(mesh: Mesh, places, away: float) -> tuple[Float[np.ndarray, "L
 
 
 def _off_the_middle(corners, places, away: float) -> Float[np.ndarray, "L 2"]:
-    """Shifts of numbers (L, 2) away from the middle of a body, none for those near it."""
+    """Shifts (L, 2) of numbers away from the middle of a body; zero for electrodes near the middle."""
     offset = places - (corners.min(axis=0) + corners.max(axis=0)) / 2
     distance = np.linalg.norm(offset, axis=1, keepdims=True)
     reach = distance > 0.3 * np.ptp(corners, axis=0).max()
@@ -226,23 +231,23 @@ def _off_the_middle(corners, places, away: float) -> Float[np.ndarray, "L 2"]:
 
 
 def _normals(start, end) -> Float[np.ndarray, "b 2"]:
-    """Outward unit normals of edges with the body on their left."""
+    """Outward unit normals of edges that have the body on their left."""
     along = (end - start) / np.linalg.norm(end - start, axis=1, keepdims=True)
     return np.stack([along[:, 1], -along[:, 0]], axis=1)
 
 
 def _distances(place, start, end) -> Float[np.ndarray, " b"]:
-    """Distances of a place from every edge."""
+    """Distance of a place from every edge."""
     along = end - start
     fraction = np.clip(np.sum((place - start) * along, axis=1) / np.sum(along**2, axis=1), 0, 1)
     return np.linalg.norm(start + fraction[:, None] * along - place, axis=1)
 
 
 def _free(place, direction, start, end, least: float) -> float:
-    """Distance from a place, in a unit direction, to the next edge farther off than `least`."""
+    """Distance from a place along a unit direction to the first edge that is farther away than `least`."""
     along, offset = end - start, start - place
     across = direction[0] * along[:, 1] - direction[1] * along[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):  # edges along the direction are not met
+    with np.errstate(divide="ignore", invalid="ignore"):  # edges parallel to the direction give infinity or NaN
         far = (offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / across
         where = (offset[:, 0] * direction[1] - offset[:, 1] * direction[0]) / across
     return float(np.min(far[(far > least) & (where >= 0) & (where <= 1)], initial=np.inf))

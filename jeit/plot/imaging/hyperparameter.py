@@ -1,4 +1,4 @@
-"""Draw what a hyperparameter does: curves of its rules, and figures of merit."""
+"""Plots of the choice of a hyperparameter, with the curves of the rules, and of figures of merit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jeit.image.merit import FiguresOfMerit
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.plot.axes import INK, SERIES_COLOURS, SERIES_MARKERS, SOFT, axes_or_new, draw_horizontal_grid, soften_axes
 
-# A colour for each rule; numbers that were given, and rules not known here, are drawn in the colour of ink.
+# Colour of each rule; given numbers and other rules are drawn in the colour `INK`.
 COLOURS = {
     "gcv": "#d1495b",
     "l-curve": "#1f6fb4",
@@ -22,9 +22,9 @@ COLOURS = {
     "noise-figure": "#157f3b",
     "best-resolution": "#7b4fa3",
 }
-# Least distance of named points on the L-curve, over its width and height.
+# Minimum distance of labelled points on the L-curve, relative to its width and height.
 _APART = 0.06
-# The criterion of each rule, the scale of its axis, and what is looked for.
+# For each rule: name of its criterion, scale of the axis, and which value is sought.
 _CRITERIA = {
     "gcv": ("prediction error (σ²)", "log", "least"),
     "l-curve": ("curvature of the L-curve", "linear", "greatest"),
@@ -37,11 +37,11 @@ _CRITERIA = {
 def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the curves used in choosing a hyperparameter, and the point chosen.
 
-    One `Choice`: for "l-curve" the L-curve, ‖residual‖ against ‖image‖ with the corner marked; for other rules their
-    criterion against λ. Several, by name, as from `jeit.inverse.compare_rules`: the L-curve with all of them marked,
-    where there were data, and the criterion of each; these plots are insets of the axes returned. A choice at the edge
-    of its grid is drawn hollow. Raises `ValueError` where there is nothing to draw: for numbers that were given,
-    and for what is no choice.
+    For one `Choice`, the L-curve is drawn for "l-curve", ‖residual‖ against ‖image‖ with the corner marked, and the
+    criterion against λ for other rules. For several choices by name, as from `jeit.inverse.compare_rules`, the L-curve
+    with all choices is drawn, if there were data, and the criterion of each; these plots are insets of the returned
+    axes. A choice at the edge of its grid is drawn hollow. Raises `ValueError` for hyperparameters that were given as
+    numbers, which have no curve, and for objects that are not choices.
     """
     several = list(choices.values()) if isinstance(choices, Mapping) else [choices]
     for one in several:
@@ -68,7 +68,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
     left = 0.0
     if with_data:
         left = 0.54
-        # Any of them has the whole curve; the one with most candidates draws it best.
+        # Every choice has the whole curve; the one with the most candidates has the finest.
         longest = max(with_data, key=lambda choice: choice.candidates.size)
         _draw_l_curve(ax.inset_axes((0, 0, 0.46, 1)), longest, several)
     height = 1 / len(rules)
@@ -86,7 +86,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
 
 
 def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
-    """The L-curve, its points at whole decades of λ, and all choices, named in the free corner of the L."""
+    """Draw the L-curve, its points at powers of ten of λ, and all choices, with labels in the free corner of the L."""
     values, residual, penalty = (np.asarray(array) for array in (curve.candidates, curve.residual, curve.penalty))
     ax.loglog(residual, penalty, color=SOFT, linewidth=1.8, zorder=1)
     exponents = np.arange(np.ceil(np.log10(values[0])), np.floor(np.log10(values[-1])) + 1, dtype=int)
@@ -169,7 +169,7 @@ def _tidy(ax: Axes, ticks: int = 6) -> None:
             axis.set_major_locator(MaxNLocator(number))
 
 
-# Field, title, unit on the axis, factor to that unit, and the value that a perfect image would have, if there is one.
+# For each figure of merit: field, title, unit on the axis, factor to that unit, and value for a perfect image, or None.
 _PANELS = (
     ("amplitude_response", "Amplitude response", "image / truth", 1.0, 1.0),
     ("position_error", "Position error", "mm (+ is towards the centre)", 1e3, 0.0),
@@ -184,10 +184,10 @@ def plot_figures_of_merit(
 ) -> Axes:
     """Draw the five GREIT figures of merit of one or several reconstructions against the distance of the targets.
 
-    `figures`: the name of each reconstruction, for the legend, with its figures for many targets (T,), as
-    `jeit.image.figures_of_merit` gives them. Lines go through the mean of targets at the same distance; grey dashes
-    are what a perfect image has. The five plots are insets of the axes returned. Raises `ValueError` for no figures,
-    more than six reconstructions, or figures of a single image.
+    `figures`: figures for T targets, from `jeit.image.figures_of_merit`, by name of the reconstruction for the legend.
+    Lines connect the means of targets at the same distance; dashed grey lines show the values of a perfect image. The
+    five plots are insets of the returned axes. Raises `ValueError` without figures, for more than six reconstructions,
+    and for figures of a single image.
     """
     check_kind("figures", figures, Mapping, "{name: figures}, as of jeit.image.figures_of_merit")
     if not 1 <= len(figures) <= len(SERIES_COLOURS):
@@ -213,7 +213,7 @@ def plot_figures_of_merit(
             panel.plot(place, mean, color=colour, linewidth=1.6, zorder=3)
             panel.plot(distance[shown], value[shown], marker, color=colour, markersize=3.2, zorder=3)
         _dress(panel, heading, unit, reach)
-        if number >= 2:  # the lowest of its column
+        if number >= 2:  # the lowest plot of its column
             panel.set_xlabel("Target's distance from the centre (mm)", fontsize=9, color=INK)
     styles = zip(figures, SERIES_COLOURS, SERIES_MARKERS, strict=False)
     lines = [Line2D([], [], color=colour, marker=marker, markersize=5, label=name) for name, colour, marker in styles]
@@ -223,7 +223,7 @@ def plot_figures_of_merit(
 
 
 def _means(distance: np.ndarray, value: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Distances in order, and the mean of the values at each; those closer than `tolerance` are one."""
+    """Sorted distances, rounded to multiples of `tolerance`, and the mean of the values at each."""
     ring, inverse = np.unique(np.round(distance / tolerance), return_inverse=True)
     return ring * tolerance, np.bincount(inverse, value) / np.bincount(inverse)
 
@@ -233,7 +233,7 @@ def _dress(panel: Axes, heading: str, unit: str, reach: float) -> None:
     panel.set_ylabel(unit, fontsize=9, color=INK)
     panel.set_xlim(0, reach)
     low, high = panel.get_ylim()
-    panel.set_ylim(min(low, 0), high)  # from zero: what varies little should look so
+    panel.set_ylim(min(low, 0), high)  # from zero, so that small variations look small
     soften_axes(panel)
     panel.tick_params(length=3, labelsize=9)
     draw_horizontal_grid(panel)

@@ -1,4 +1,4 @@
-"""Draw meshes, and images on them: conductivity, its change, complex admittivity, sensitivity."""
+"""Plots of meshes and of images on them: conductivity, its change, complex admittivity, and sensitivity."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions
 def plot_mesh(
     mesh: Mesh, electrodes: AbstractElectrodes | None = None, *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw a 2-D mesh with its outline, and `electrodes` numbered; of a 3-D mesh its surface, seen from above.
+    """Draw a 2-D mesh with its outline, or the surface of a 3-D mesh as seen from above, and numbered `electrodes`.
 
-    Raises `ValueError` for what is neither.
+    Raises `ValueError` for arguments of another type, and for a surface in space.
     """
     check_body(mesh, electrodes)
     ax = axes_or_new(ax)
@@ -47,7 +47,8 @@ def plot_mesh(
 
 
 def check_body(mesh: Mesh, electrodes: AbstractElectrodes | None) -> None:
-    """Raises `ValueError` for what is no mesh, a surface in space, and what are no electrodes, if any are given."""
+    """Check a mesh and, if given, electrodes. Raises `ValueError` for objects of another type, and for a surface in
+    space."""
     check_kind("mesh", mesh, Mesh, "a Mesh, such as Disk(0.05).mesh()")
     check_flat(mesh, "pictures seen from above")
     if electrodes is not None:
@@ -55,7 +56,7 @@ def check_body(mesh: Mesh, electrodes: AbstractElectrodes | None) -> None:
 
 
 def draw_outline(mesh: Mesh, ax: Axes) -> None:
-    """The boundary of a 2-D mesh, holes included."""
+    """Draw the boundary of a 2-D mesh, including holes."""
     edges = np.asarray(mesh.points)[np.asarray(mesh.facets)]
     ax.add_collection(LineCollection(list(edges), colors=INK, linewidths=0.9, capstyle="round", zorder=2))
 
@@ -63,8 +64,8 @@ def draw_outline(mesh: Mesh, ax: Axes) -> None:
 def draw_slice_outline(
     pixels: Float[np.ndarray, "rows columns"], extent: tuple[float, float, float, float], ax: Axes
 ) -> None:
-    """The edge of a slice through a solid, sampled on `pixels`, NaN outside it; `extent` in metres."""
-    # A rim of nothing all round, for the edge to be closed where it touches the picture's.
+    """Draw the edge of a slice through a solid, given by `pixels` that are NaN outside it; `extent` in metres."""
+    # Pad by one pixel, so that the edge is closed where it touches the border of the picture.
     shown = np.pad(np.isfinite(pixels).astype(float), 1)
     width, height = (extent[1] - extent[0]) / pixels.shape[1], (extent[3] - extent[2]) / pixels.shape[0]
     wider = (extent[0] - width, extent[1] + width, extent[2] - height, extent[3] + height)
@@ -72,8 +73,8 @@ def draw_slice_outline(
 
 
 def slice_text(mesh: Mesh, height: float | None = None, what: str = "slice") -> str:
-    """Text of the height of a slice, z = `height` metres or half way up: "slice at z = 20.0 mm"; empty for a plane
-    mesh."""
+    """Text for a slice at z = `height` metres (default: half the height), such as "slice at z = 20.0 mm"; empty for a
+    plane mesh."""
     if mesh.dimension == 2:
         return ""
     z = np.asarray(mesh.points)[:, 2]
@@ -91,13 +92,16 @@ def plot_image(
     height: float | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw `values` on the mesh: per cell (m,), flat; or per node (n,), shaded.
+    """Draw `values` on a mesh, per cell (m,) or, interpolated, per node (n,).
 
-    `electrodes` are drawn at their place and width, and numbered. `inclusions`: marked. `scale`: how values become
-    colours; values are changes of conductivity in S (3-D: S/m) unless it says otherwise, as `ColourScale(difference=
-    False)` does for conductivity itself. `height`: z in metres of the slice through a 3-D mesh, half way up unless
-    given. Raises `ValueError` for values of another shape, complex or not finite, a height beside the mesh, and things
-    of another kind.
+    - `electrodes`: drawn to scale and numbered.
+    - `inclusions`: marked by their sign and a circle.
+    - `scale`: colour scale; default: for changes of conductivity in S (3-D: S/m). For conductivity itself, use
+      `ColourScale(difference=False)`.
+    - `height`: z in metres of the slice through a 3-D mesh; default: half the height.
+
+    Raises `ValueError` for values that have another shape, are complex or not finite, for a height outside the mesh,
+    and for arguments of another type.
     """
     check_body(mesh, electrodes)
     check_scale(scale)
@@ -124,7 +128,7 @@ def plot_image(
         extent = extent_of(points)
         triangles = Triangulation(points[:, 0], points[:, 1], np.asarray(mesh.cells))
         colours = scale.of(image, "S")
-        # Cell edges in the cells' own colour: without them the background shines through the seams.
+        # Edges in the colour of their cell prevent gaps between cells, through which the background would be visible.
         flat = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
         style = flat if image.shape == (mesh.num_cells,) else {"shading": "gouraud"}
         drawn = ax.tripcolor(triangles, colours.factor * image, **style, **colours.keywords)
@@ -144,11 +148,11 @@ def plot_raster(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a raster (rows, columns), row 0 at the top, NaN left blank; arguments as in `plot_image`.
+    """Draw a raster (rows, columns), row 0 at the top, with NaN blank; other arguments as in `plot_image`.
 
-    `extent`: (x_min, x_max, y_min, y_max) in metres. `mesh`: the mesh it was sampled from, for its outline and the
-    `electrodes`. Raises `ValueError` for a raster without a finite value, for electrodes without their mesh, and for
-    things of another kind.
+    `extent`: (x_min, x_max, y_min, y_max) in metres. `mesh`: the mesh of the raster, for its outline and the
+    `electrodes`. Raises `ValueError` for a raster without finite values, for electrodes without a mesh, and for
+    arguments of another type.
     """
     check_scale(scale)
     if mesh is not None:
@@ -190,12 +194,12 @@ def plot_admittivity(
     figure: Figure | None = None,
     **options: Any,
 ) -> tuple[Axes, Axes]:
-    """Draw σ and ωε of complex `values` (m,) or (n,) in two pictures of one figure; S (3-D: S/m).
+    """Draw σ and ωε of complex `values`, (m,) or (n,) in S (3-D: S/m), side by side in one figure.
 
-    `difference`: whether values are changes, centred at zero. `limits`: values at the ends of the two colour bars, the
-    largest magnitude of each part unless given; a part that is much the smaller so shows, and its bar says how small.
-    `figure`: to draw in, a new one unless given. Other options as for `plot_image`. Raises `ValueError` for values that
-    are not complex, and as `plot_image` does.
+    `difference`: whether values are changes, with colours centred at zero. `limits`: values at the ends of the two
+    colour bars; default: the maximum magnitude of each part, so that a much smaller part is visible, too. `figure`: the
+    figure to draw in; default: a new one. Other options as for `plot_image`. Raises `ValueError` for values that are
+    not complex, and as `plot_image`.
     """
     image: Any = np.asarray(values)
     if not np.iscomplexobj(image):
@@ -224,9 +228,10 @@ def plot_admittivity(
 def plot_sensitivity(
     model: ForwardModel, conductivity, *, title: str | None = None, height: float | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw ‖∂v/∂σ_e‖ / |e| of every cell, over all channels and relative to the largest, in decibels.
+    """Draw the sensitivity ‖∂v/∂σ_e‖ / |e| of every cell e, with the norm over all channels, relative to the maximum
+    and in decibels.
 
-    Divided by the cell's area (3-D: volume), so that it does not show the mesh. `conductivity` as in
+    The division by the area (3-D: volume) |e| makes the sensitivity independent of the mesh. `conductivity` as in
     `model.voltages`, scalar or per cell, in S (3-D: S/m); `height` as in `plot_image`. Raises `ValueError` for a
     conductivity per node.
     """
@@ -235,7 +240,7 @@ def plot_sensitivity(
         raise ValueError("conductivity: give a scalar or one value per cell, for a sensitivity per cell.")
     density = np.linalg.norm(jacobian, axis=0) / np.asarray(measures(model.mesh))
     decibels = 20 * np.log10(np.maximum(density / density.max(), 1e-12))
-    # Beside the ends of electrodes the field is singular: the scale begins where 1 % of the cells are brighter.
+    # The field is singular at the ends of electrodes, so 0 dB is set to the value exceeded in 1 % of the cells.
     ceiling = np.quantile(decibels, 0.99)
     quantity = "Sensitivity per area (dB)" if model.mesh.dimension == 2 else "Sensitivity per volume (dB)"
     return plot_image(

@@ -1,8 +1,7 @@
-"""Draw series of frames: images side by side, and time courses.
+"""Plots of series of frames: images side by side on a contact sheet, single frames of a film, and curves over time.
 
-Frames of a stream: some side by side on a contact sheet, or one after the other, all on one colour scale.
-
-A frame that was refused has no image: its body is grey, and says so.
+All images of a stream have one colour scale. A refused frame has no image; its body is drawn grey, with the text
+"refused".
 """
 
 from __future__ import annotations
@@ -35,17 +34,17 @@ from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import check_body, draw_outline, draw_slice_outline, slice_text
 from jeit_solvers.engines import as_array
 
-# Pixels along a side of a picture, and the grey of a body without an image.
+# Number of pixels along a side of an image, and colour of a body without an image.
 _PIXELS, _GREY = 160, "#dfe2e6"
 SHEET_FRAMES = 12
-"""Default greatest number of frames of a contact sheet."""
-# Refused frames that are named beneath it.
+"""Default of the maximum number of frames of a contact sheet."""
+# Maximum number of refused frames named below a contact sheet.
 _NAMED = 6
 
 
 class FrameCount(NamedTuple):
-    """Number of frames of a stream, of which some are drawn: the `number`, how many were `refused`, and the `names` of
-    the first of those."""
+    """Counts of the frames of a stream. **Fields**: `number`: number of frames; `refused`: number of refused frames;
+    `names`: names of the first refused frames."""
 
     number: int
     refused: int
@@ -53,15 +52,15 @@ class FrameCount(NamedTuple):
 
 
 def chosen_frames(number: int, most: int) -> list[int]:
-    """Numbers of `most` of `number` frames, or of all, evenly apart, the first and the last among them."""
+    """Numbers of at most `most` evenly spaced frames out of `number`, including the first and the last."""
     return [int(one) for one in np.unique(np.linspace(0, number - 1, min(number, most)).round())]
 
 
 class FramePicture:
-    """One frame at a time on `ax`: `show` draws the next in the place of the last.
+    """Picture of one frame at a time on `ax`; `show` replaces the image by the next one.
 
-    `fitted`: the scale for all frames; `number` the electrodes or not. What is drawn is sampled on a raster, of a solid
-    half way up.
+    `fitted`: colour scale of all frames; `number`: whether electrodes are numbered; `bar`: whether a scale bar is
+    drawn. Images are sampled on a raster, in a solid at half its height.
     """
 
     def __init__(
@@ -94,7 +93,7 @@ class FramePicture:
         self.refused = ax.text(*middle, "refused", **style)  # pyright: ignore[reportArgumentType]
 
     def show(self, change: Float[np.ndarray, " m"], title: str) -> None:
-        """The change of conductivity of a frame, per cell; of a refused one NaN."""
+        """Show a frame. `change`: change of conductivity per cell (m,), NaN for a refused frame."""
         imaged = bool(np.isfinite(change).all())
         if imaged:
             self.drawn.set_data(self.fitted.factor * np.asarray(self.raster.sample(as_array(change))))
@@ -104,7 +103,7 @@ class FramePicture:
 
 
 def fit_scale(changes: Float[np.ndarray, "F m"], mesh: Mesh, scale: ColourScale = CHANGE) -> FittedScale:
-    """One scale for all frames that were imaged. Raises `ValueError` where none was."""
+    """Fit one colour scale to all imaged frames. Raises `ValueError` if all frames were refused."""
     check_scale(scale)
     finite = changes[np.isfinite(changes)]
     if not finite.size:
@@ -122,12 +121,16 @@ def plot_frames(
     most: int = SHEET_FRAMES,
     count: FrameCount | None = None,
 ) -> Figure:
-    """A contact sheet of a stream: some of its frames, evenly chosen, on one colour scale, each with its title.
+    """Draw a contact sheet of a stream: evenly spaced frames with titles and one colour scale.
 
-    `changes` (F, m): of conductivity, S (3-D: S/m, drawn half way up), a row of NaN for a frame that was refused, shown
-    as such. `titles`: one a frame, their numbers unless given, from 0. `most`: frames on the sheet. `count`: of all
-    frames, where `changes` are only some. The scale is that of all frames, drawn or not. Raises `ValueError` for
-    changes of another shape, another number of titles than of frames, and where every frame was refused.
+    - `changes`: (F, m), changes of conductivity, S (3-D: S/m, drawn at half the height); rows of NaN are refused
+      frames.
+    - `titles`: one per frame; default: the numbers of the frames from 0.
+    - `most`: maximum number of frames on the sheet.
+    - `count`: counts of all frames, if `changes` has only some of them.
+
+    The colour scale is fitted to all frames, not only those drawn. Raises `ValueError` for changes of another shape,
+    another number of titles, and if every frame was refused.
     """
     check_body(mesh, electrodes)
     values = np.asarray(changes)
@@ -159,7 +162,7 @@ def plot_frames(
 
 
 def _count_text(count: FrameCount, chosen: int, mesh: Mesh) -> str:
-    """Text about frames that the sheet does not show, and about refused ones."""
+    """Text on the number of frames drawn and on refused frames."""
     parts = [] if chosen == count.number else [f"{chosen} of {count.number} frames"]
     if count.refused:
         some = ", ".join(count.names[:_NAMED]) + (" …" if count.refused > _NAMED else "")
@@ -167,9 +170,9 @@ def _count_text(count: FrameCount, chosen: int, mesh: Mesh) -> str:
     return "; ".join([*parts, *filter(None, [slice_text(mesh, what="slices")])])
 
 
-# Share of the largest amplitude below which no phase is drawn; and times its noise.
+# Minimum amplitude for the phase to be drawn: as a share of the maximum amplitude, and as a multiple of its noise.
 _SHARE, _NOISE = 0.15, 3.0
-# Frames that a spectrum takes, as `jeit.image.oscillation`.
+# Minimum number of frames for a spectrum, as for `jeit.image.oscillation`.
 _FEWEST = 5
 
 
@@ -181,11 +184,11 @@ def plot_series(
     *,
     height: float | None = None,
 ) -> Figure:
-    """The standard deviation over time; amplitude and phase of each oscillation, the phase only where the amplitude is
-    above its noise and 15 % of the largest; and the mean change of every region over time, with its spectrum where
-    there are frames enough for one.
+    """Draw a series of images: the standard deviation over time; amplitude and phase of each oscillation; and the mean
+    change of every region over time, with its spectrum if there are enough frames.
 
-    `regions`: (m,) booleans by name. `height`: z in metres of the slice through a 3-D mesh, half way up unless given.
+    The phase is drawn where the amplitude exceeds three times its noise and 15 % of the maximum. `regions`: (m,)
+    booleans by name. `height`: z in metres of the slice through a 3-D mesh; default: half the height.
     """
     check_body(series.mesh, electrodes)
     rows = max(len(oscillations), 1)
@@ -214,7 +217,7 @@ def plot_series(
 
 
 class _Maps:
-    """Draws values per cell, sampled once."""
+    """Maps of values per cell, sampled on a common raster."""
 
     def __init__(self, series: ImageSeries, electrodes: AbstractElectrodes | None, height: float | None):
         self.mesh, self.unit, self.electrodes = series.mesh, series.unit, electrodes
@@ -246,7 +249,7 @@ class _Maps:
 
 
 def _spectrum(mean: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Frequencies and amplitudes; None where there are too few frames for more than one."""
+    """Frequencies and amplitudes of a curve; None if there are too few frames for more than one frequency."""
     if np.isfinite(mean).sum() < _FEWEST:
         return None
     frequencies, amplitude = amplitude_spectrum(mean, times)
@@ -254,7 +257,7 @@ def _spectrum(mean: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _draw_curves(ax: Axes, means: Mapping[str, np.ndarray], times: np.ndarray, factor: float, unit: str) -> None:
-    """Mean changes over time."""
+    """Draw the mean change of each region over time."""
     for name, mean in means.items():
         ax.plot(times, factor * mean, linewidth=1.2, label=name)
     ax.set(xlabel="Time (s)", ylabel=f"Mean change ({unit})", title="regions over time")
@@ -264,7 +267,7 @@ def _draw_curves(ax: Axes, means: Mapping[str, np.ndarray], times: np.ndarray, f
 
 
 def _draw_spectra(ax: Axes, spectra: Mapping, oscillations: Sequence[Oscillation], unit: str) -> None:
-    """Spectra of those, in their colours."""
+    """Draw the spectra of the regions, in the same order of colours as their curves."""
     for frequencies, amplitude in spectra.values():
         ax.plot(frequencies, amplitude, linewidth=1.2)
     for one in oscillations:

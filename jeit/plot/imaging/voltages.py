@@ -1,4 +1,4 @@
-"""Voltages, measured against modelled."""
+"""Plot that compares measured and modelled voltages."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ def plot_voltages(
 ) -> Axes:
     """Draw measured and modelled voltages (M,), in volts, channel by channel, and their difference below.
 
-    `protocol`: marks where each drive begins. `mask`: True for the channels to draw. The difference is in per cent of
-    the root mean square voltage; the title gives the relative misfit ‖modelled - measured‖ / ‖measured‖. The two plots
-    are insets of the axes returned. Raises `ValueError` for arguments of different lengths.
+    `protocol`: if given, the first channel of each drive is marked. `mask`: True for the channels to draw. The
+    difference is in per cent of the root mean square voltage; the title gives the relative misfit
+    ‖modelled - measured‖ / ‖measured‖. The two plots are insets of the returned axes. Raises `ValueError` for arguments
+    of different lengths, and for drawn voltages that are not finite.
     """
     measured, modelled = np.asarray(measured), np.asarray(modelled)
     used = np.ones(measured.shape, bool) if mask is None else np.asarray(mask, bool)

@@ -1,1 +1,1 @@
-"""Pictures of bodies in space: surfaces, solids, and slices through them."""
+"""Plots of bodies in space: surfaces, solids, and slices through solids."""

@@ -1,4 +1,4 @@
-"""The surroundings of an image in space: the body's translucent hull, and numbered electrodes on it."""
+"""Parts of plots in space besides the image: the translucent hull of the body, and numbered electrodes on it."""
 
 from __future__ import annotations
 
@@ -16,31 +16,32 @@ from jeit.plot.imaging.electrodes import METAL, at_one_place
 from jeit.plot.solid.scene import BODY, Scene, draw_number
 
 _HULL = 0.1
-# Cosine of the angle between facets beyond which their edge is one of the body.
+# Cosine of the angle between the normals of two facets, below which their common edge is drawn as an edge of the body.
 _SHARP = 0.85
-# Distance by which electrodes count as nearer than the surface under them, and distance of numbers, over the size of
-# the body.
+# Divided by the size of the body: distance by which electrodes are drawn nearer to the viewer than the surface under
+# them, and distance of numbers from electrodes.
 _BEFORE, _AWAY = 0.06, 0.045
-# Least distance of readable numbers, over the size of the body.
+# Minimum distance between numbers, so that they are readable, divided by the size of the body.
 _CLEAR = 0.03
-# Share of the visible body beyond which electrodes hide too much, and their opacity in that case.
+# Share of the visible body that electrodes may cover before they are drawn translucent, and their opacity then.
 _HIDES, _GLASS = 0.4, 0.16
 
 
 def size_of(mesh: Mesh) -> float:
-    """The longest side of the box round a mesh, metres."""
+    """Longest side of the bounding box of a mesh, metres."""
     return float(np.ptp(np.asarray(mesh.points), axis=0).max())
 
 
 def add_hull(scene: Scene, mesh: Mesh) -> None:
-    """The boundary of a solid, that one looks through, with its edges and its outline."""
+    """Add the translucent boundary of a solid to a scene, with its edges and its outline."""
     points, triangles = np.asarray(mesh.points), surface_triangles(mesh)
     scene.add_triangles(points, triangles, np.array(to_rgba(BODY, _HULL)), smooth=True, lit=False)
     scene.add_lines(points[visible_edges(points, triangles, scene.camera.toward)], SOFT, 0.9)
 
 
 def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarray:
-    """Edges (s, 2) of a surface that a draughtsman draws: sharp ones, open ones, and where it turns out of sight."""
+    """Edges (s, 2) of a surface to draw as lines, as seen from the direction `toward`: sharp edges, edges of an open
+    boundary, and the outline, where the surface turns away from the viewer."""
     normal = np.cross(
         points[triangles[:, 1]] - points[triangles[:, 0]], points[triangles[:, 2]] - points[triangles[:, 0]]
     )
@@ -51,7 +52,7 @@ def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarr
     edges, of = edges[order], of[order]
     pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
     first, second = normal[of[pair]], normal[of[pair + 1]]
-    # A surface seen from the side within rounding is on neither side of its outline.
+    # Facets parallel to the line of sight, within rounding errors, face neither to the viewer nor away.
     side = np.stack([first @ toward, second @ toward])
     side = np.where(np.abs(side) < 1e-9, 0, side)
     drawn = (np.sum(first * second, axis=1) < _SHARP) | ((side > 0).any(axis=0) & (side <= 0).any(axis=0))
@@ -61,9 +62,10 @@ def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarr
 
 
 def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, through: bool = False) -> None:
-    """Electrodes on a surface: those on the side that is looked at over all behind it, others under it.
+    """Add electrodes on a surface to a scene: in front of the surface on the side facing the viewer, behind it on the
+    other side.
 
-    To look `through` them, those in front are as glass if they would hide much of the body.
+    `through`: whether the electrodes in front become translucent if they would hide much of the body.
     """
     surface, size = Draped(points, triangles), float(np.ptp(points, axis=0).max())
     polygons = shapes.polygons()
@@ -83,14 +85,15 @@ def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, 
 
 
 def _seen_area(scene: Scene, corners: Float[np.ndarray, "*m k 3"]) -> float:
-    """Area of polygons on the page, m²."""
+    """Total area of polygons as projected onto the page, m²."""
     x, y = np.moveaxis(scene.camera.on_page(corners.reshape(-1, 3)).reshape(*corners.shape[:-1], 2), -1, 0)
     twice = (x * np.roll(y, -1, axis=-1) - np.roll(x, -1, axis=-1) * y).sum(axis=-1)
     return float(np.abs(twice).sum() / 2)
 
 
 def _rims(polygons, electrode, near: float) -> list[np.ndarray]:
-    """Edges of each polygon on the rim of its electrode: those that no other polygon of the electrode has."""
+    """Whether each edge of each polygon is on the rim of its electrode: no other polygon of the electrode shares it.
+    Corners closer than `near` are taken as equal."""
     keys = []
     for corners, number in zip(polygons, electrode.tolist(), strict=True):
         places = [tuple(place) for place in np.round(corners / near).astype(np.int64).tolist()]
@@ -103,9 +106,10 @@ def _rims(polygons, electrode, near: float) -> list[np.ndarray]:
 def number_electrodes(
     ax: Axes, scene: Scene, points, triangles, shapes: ElectrodeShapes, *, behind: bool = True
 ) -> None:
-    """Numbers from 1 beside electrodes, outward; faint ones on the side that is not looked at, if `behind` is shown.
+    """Draw the numbers of electrodes, from 1, outwards of each electrode. Numbers on the side facing away are faint, or
+    are left out unless `behind`.
 
-    Electrodes that are seen behind each other share a place for their numbers, away from the middle of the picture.
+    Electrodes seen close to each other share one text.
     """
     middles = shapes.middles()
     normals = Draped(points, triangles).normals(middles)
@@ -119,7 +123,7 @@ def number_electrodes(
         some = np.flatnonzero(faint == side)
         for one in at_one_place(places[some], clear):
             place = places[some[one]].mean(axis=0)
-            # Electrodes behind have no number where one in front has its own.
+            # Numbers of electrodes behind are left out where they would overlap a number in front.
             if side and len(near) and np.linalg.norm(near - place, axis=1).min() <= clear:
                 continue
             outward = "right" if place[0] < left else "left" if place[0] > right else "center"
@@ -128,7 +132,7 @@ def number_electrodes(
 
 
 def _number_text(numbers: list[int]) -> str:
-    """Rising numbers, three or more that follow each other as "4–6"."""
+    """Text of sorted numbers, with three or more consecutive numbers as a range, such as "4–6"."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and number == runs[-1][-1] + 1:

@@ -1,4 +1,4 @@
-"""Curved skins as they are in space, with values on them and electrodes as discs."""
+"""Plots of curved skins in space, with values on the surface and electrodes as discs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jeit.plot.solid.body import size_of
 from jeit.plot.solid.scene import FROM_THE_CORNER, Camera, Scene, bare_in_space
 from jeit.plot.solid.shaded_surface import BODY, checked_values, colours_of, mappable
 
-# Distance by which marks count as nearer than the surface that they are on, over the skin's size.
+# Tolerance for marks being hidden by the surface on which they lie: distance divided by the size of the skin.
 _BEFORE = 0.02
 
 
@@ -36,11 +36,13 @@ def plot_curved_skin(
 ) -> Axes:
     """Draw the surface of a curved skin in space, with its electrodes as discs on it.
 
-    `values`: one for each triangle of `layout.surface`, flat, or for each of its nodes; grey without. `marks`: places
-    (p, 3), metres, by what the legend calls them, drawn at the nearest place of the surface, as those on the other face
-    of a layer are not on it; those on the far side are left out. `camera`: from where it is seen.
-    `scale`: how values become colours; changes of sheet conductivity in S unless it says otherwise. Raises `ValueError`
-    for values of another shape or not finite, and things of another kind.
+    - `values`: one per triangle or per node of `layout.surface`; without values, the surface is grey.
+    - `marks`: points (p, 3) in metres by name in the legend, drawn at the nearest points of the surface. Points hidden
+      by the surface are left out.
+    - `camera`: direction of view.
+    - `scale`: colour scale; default: for changes of sheet conductivity in S.
+
+    Raises `ValueError` for values that have another shape or are not finite, and for arguments of another type.
     """
     check_kind("layout", layout, SurfaceLayout, "a SurfaceLayout, skin.layout of a curved skin")
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
@@ -55,7 +57,7 @@ def plot_curved_skin(
         colours = colours_of(fitted, image if len(image) == len(cells) else image[cells].mean(axis=1))
     scene.add_triangles(points, cells, colours, smooth=True)
     surface = Draped(points, cells)
-    # Pieces are sorted by their middles: a disc counts as nearer than the triangles that it lies on.
+    # Pieces are sorted by the depth of their centres, so discs are moved in front of the triangles on which they lie.
     before = float(np.sqrt(np.asarray(measures(mesh)).max()))
     for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
         (outward,) = surface.normals(corners.mean(axis=0)[None])
@@ -70,7 +72,7 @@ def plot_curved_skin(
         ax.plot(*camera.on_page(seen).T, "o", color=colour, markersize=5, markeredgecolor="white", label=name, zorder=5)
     bare_in_space(ax, camera, points, numbered=False)
     if marks:
-        # Under the axes: in them are the arrows that say where x, y and z point.
+        # The legend is below the axes, since the arrows of x, y and z are inside.
         ax.legend(
             loc="upper center",
             bbox_to_anchor=(0.5, 0.0),
@@ -87,7 +89,7 @@ def plot_curved_skin(
 
 
 def _on_this_side(mesh, places, camera: Camera):
-    """Places that nothing of the surface hides: none of it lies nearer to the viewer on the same ray."""
+    """Select the points that the surface does not hide: no part of it is nearer to the viewer on the same ray."""
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
     flat, deep = camera.on_page(corners), camera.nearness(corners)
     seen = []

@@ -1,4 +1,4 @@
-"""A solid image, or one on a surface, to turn round and cut with the mouse: through PyVista, where it is installed."""
+"""Interactive views of solid images, which can be rotated and cut with the mouse; needs PyVista."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def view_solid(
     scale: ColourScale = CHANGE,
     off_screen: bool = False,
 ) -> pyvista.Plotter:
-    """A scene of a solid image: hull, isosurfaces, electrodes with their numbers, a plane to drag through the body and
-    a colour bar; arguments as for `plot_isosurfaces`. Call `show()` of what is returned, or, made `off_screen`,
-    `screenshot("view.png")`.
+    """Create an interactive view of a solid image: hull, isosurfaces, numbered electrodes, a slice that can be dragged
+    through the body, and a colour bar. Lengths are in millimetres.
 
-    Lengths are in millimetres. Raises `ImportError` where PyVista is not installed, `ValueError` as `plot_isosurfaces`.
+    Arguments as for `plot_isosurfaces`. Call `show()` of the returned plotter, or, if created with `off_screen`,
+    `screenshot("view.png")`. Raises `ImportError` if PyVista is not installed, and `ValueError` as `plot_isosurfaces`.
     """
     check_drawn(mesh, electrodes, scale)
     surfaces = level_surfaces(mesh, values, levels, both=scale.difference)
@@ -56,7 +56,8 @@ def view_solid(
     points = 1e3 * np.asarray(mesh.points)
     plotter = pv.Plotter(off_screen=off_screen, window_size=list(_SIZE))
     if not off_screen:
-        plotter.enable_depth_peeling()  # translucent things in their order; without a graphics card they vanish by it
+        # Depth peeling sorts translucent surfaces; without a graphics card it would make them disappear.
+        plotter.enable_depth_peeling()
     hull = pv.PolyData.from_regular_faces(points, np.asarray(mesh.facets))
     plotter.add_mesh(hull, color=BODY, opacity=0.12, name="hull")
     plotter.add_mesh(hull.extract_feature_edges(30), color=INK, line_width=1.5, name="edges")
@@ -70,7 +71,7 @@ def view_solid(
         plotter.add_mesh(shell, scalars="value", opacity=opacity, **options, **look)
     grid = pv.UnstructuredGrid({pv.CellType.TETRA: np.asarray(mesh.cells)}, points)
     grid.cell_data["value"] = fitted.factor * cell_values(mesh, values)
-    # The label takes two lines: VTK cuts off text that is wider than the bar, and with it the unit.
+    # The label has two lines, since VTK cuts off text wider than the bar, such as the unit.
     what, bracket, unit = fitted.label.rpartition(" (")
     bar = {"title": f"{what}\n{bracket.strip()}{unit}", "color": INK, "vertical": True, "n_labels": 5, "fmt": "%.3g"}
     bar |= {"title_font_size": 16, "label_font_size": 14, "position_x": 0.86, "position_y": 0.25, "height": 0.5}
@@ -92,7 +93,7 @@ def view_solid(
 
 
 def can_view() -> str:
-    """Why an interactive view cannot be opened here; nothing where it can."""
+    """Reason why an interactive view cannot be opened on this machine; empty if it can."""
     if find_spec("pyvista") is None:
         return f"PyVista is not installed: {how_to_install('view')}"
     if sys.platform in ("darwin", "win32") or os.environ.get("WAYLAND_DISPLAY"):
@@ -103,12 +104,13 @@ def can_view() -> str:
 
 
 def _answers(display: str) -> bool:
-    """Whether an X server listens at a display of this machine; True of another machine's, and of what is none."""
+    """Whether an X server listens at a display of this machine; True for displays of other machines and for other
+    texts."""
     host, _, rest = display.rpartition(":")
     number = rest.partition(".")[0]
     if host not in ("", "unix", "localhost") or not number.isdecimal() or len(number) > 4:
         return True
-    # Where X11 servers listen on every system (Xtrans); PyVista's own check asks a program that may not be installed.
+    # Standard addresses of X11 servers (Xtrans). PyVista's own check calls a program that may not be installed.
     path = f"/tmp/.X11-unix/X{number}"
     local = [(socket.AF_UNIX, path), (socket.AF_UNIX, "\0" + path)]
     for family, address in [(socket.AF_INET, (host, 6000 + int(number)))] if host == "localhost" else local:
@@ -120,14 +122,15 @@ def _answers(display: str) -> bool:
 
 
 def _add_electrodes(plotter: pyvista.Plotter, pv: Any, shapes: ElectrodeShapes) -> None:
-    """Electrodes as polygons of metal, dots as balls, with their numbers."""
+    """Add electrodes to the plotter as polygons in the colour of metal, or as balls if they are points, with their
+    numbers."""
     size = 1e3 * float(np.ptp(shapes.corners, axis=0).max())
     pieces = []
     for corners in shapes.polygons():
         if len(corners) == 1:
             pieces.append(pv.Sphere(radius=0.012 * size, center=1e3 * corners[0]))
         else:
-            # Round the middle: a patch bent round a wall is no plane polygon.
+            # Triangles around the centre, since a patch on a curved wall is not a plane polygon.
             ring = np.arange(len(corners))
             fan = np.stack([ring, np.roll(ring, -1), np.full(len(ring), len(ring))], axis=1)
             pieces.append(pv.PolyData.from_regular_faces(1e3 * np.vstack([corners, corners.mean(axis=0)]), fan))

@@ -1,4 +1,4 @@
-"""Isosurfaces of images of solids, and the outlines of the body around them."""
+"""Plots of isosurfaces of solid images, with the hull of the body and outlines of inclusions."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _DASHED = {"fill": False, "edgecolor": INK, "linewidth": 1, "linestyle": (0, (4,
 
 
 def draw_seen(ax: Axes, camera: Camera, inclusion: Inclusion) -> None:
-    """The outline that is seen of an inclusion, and its sign at its centroid."""
+    """Draw the outline of an inclusion as seen by the camera, and its sign at its centroid."""
     x, y = camera.on_page(np.array(inclusion.centroid))
-    if inclusion.form is None:  # a ball is seen as a disc of its radius from every side
+    if inclusion.form is None:  # a ball, whose outline is a circle from every side
         ax.add_patch(Circle((x, y), inclusion.radius, **_DASHED))
     else:
         _draw_round(ax, camera.on_page(inclusion.form.surface().points))
@@ -36,7 +36,7 @@ def draw_seen(ax: Axes, camera: Camera, inclusion: Inclusion) -> None:
 
 
 def draw_cut(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
-    """The outline that a plane cuts an inclusion in, and its sign in the middle of that."""
+    """Draw the outline of the section of an inclusion by a plane, and its sign in the middle."""
     if inclusion.form is not None:
         surface = inclusion.form.surface()
         cut = passed_edges(surface.triangles, plane.distance(surface.points)).at_corners(surface.points)
@@ -54,7 +54,7 @@ def draw_cut(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
 
 
 def _draw_round(ax: Axes, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "k 2"]:
-    """A dashed line round points of what is convex; its corners."""
+    """Draw the convex hull of points as a dashed line, and return its corners."""
     corners = points[ConvexHull(points, qhull_options="QJ").vertices]
     ax.add_patch(Polygon(corners, **_DASHED))
     return corners
@@ -62,7 +62,7 @@ def _draw_round(ax: Axes, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray,
 
 HALF = (0.5,)
 OUTER = 0.3
-# Least peak that is drawn, over the strongest change of either sign, as for inclusions.
+# Minimum peak of a sign for its isosurfaces to be drawn, relative to the maximum change of either sign.
 _LEAST_PEAK = 0.3
 
 
@@ -77,14 +77,18 @@ def plot_isosurfaces(
     scale: ColourScale = CHANGE,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the surfaces on which an image of a solid has given shares of the strongest change of either sign.
+    """Draw isosurfaces of a solid image, at given shares of the maximum change of each sign.
 
-    `values` per cell (m,) or per node (n,); changes of conductivity in S/m unless `scale` says otherwise. `levels`:
-    shares from 0 to 1; the greatest is drawn solid, others translucent round it; a sign that is nowhere 0.3 times as
-    strong as the other is left out. Of a scale that is not of differences they are shares of the way from the least to
-    the greatest value. `electrodes` are drawn on the body and numbered, `inclusions` marked by their sign, and the
-    outlines of their form, or of balls of their volume. Raises `ValueError` for values of another shape, levels that
-    are no shares, a mesh that is no solid, and things of another kind.
+    - `values`: per cell (m,) or per node (n,); changes of conductivity in S/m, or as described by `scale`.
+    - `electrodes`: drawn on the body and numbered.
+    - `levels`: shares between 0 and 1. The surface of the highest level is opaque, others are translucent. A sign whose
+      maximum is less than 0.3 of that of the other sign is left out. For absolute images (see
+      `ColourScale.difference`), levels are fractions of the range from minimum to maximum.
+    - `inclusions`: drawn as their sign and the outline of their form, or of a ball of their volume.
+    - `camera`: direction of view.
+
+    Raises `ValueError` for values of another shape, levels out of range, a mesh that is not a solid, and arguments of
+    another type.
     """
     check_drawn(mesh, electrodes, scale)
     fitted = scale.of(np.asarray(values), "S/m")
@@ -107,7 +111,8 @@ def draw_in_space(
     fitted: FittedScale,
     planes: Sequence[Plane] = (),
 ) -> Axes:
-    """As `plot_isosurfaces` without a colour bar, in a scale that is fitted; with the outlines of cuts by `planes`."""
+    """Draw isosurfaces as `plot_isosurfaces`, but with a fitted colour scale, without a colour bar, and with the
+    outlines of sections by `planes`. Raises `ValueError` as `plot_isosurfaces`."""
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
     scene = Scene(camera)
     add_hull(scene, mesh)
@@ -138,9 +143,10 @@ def draw_in_space(
 def level_surfaces(
     mesh: Mesh, values: ArrayLike, levels: Sequence[float], *, both: bool
 ) -> list[tuple[float, float, TriangleSurface]]:
-    """The surfaces at shares of the strongest change of each sign, if `both` are asked for, or else of the way from the
-    least value to the greatest: the value on each, its share, and the surface. Raises `ValueError` for levels that are
-    no shares.
+    """Compute isosurfaces; return the value, the level and the surface of each.
+
+    `levels`: shares of the maximum change of each sign if `both`, otherwise fractions of the range from minimum to
+    maximum. Raises `ValueError` for levels that are not between 0 and 1.
     """
     shares = check_levels(levels)
     image = node_values(mesh, np.asarray(values))
@@ -157,7 +163,7 @@ def level_surfaces(
 
 
 def check_levels(levels: Sequence[float]) -> list[float]:
-    """Shares of the strongest change. Raises `ValueError` for others."""
+    """Check levels, and return them as a list. Raises `ValueError` unless they are between 0 and 1."""
     shares: Float[np.ndarray, " k"] | Sequence = np.atleast_1d(np.asarray(levels, dtype=object))
     if len(shares) == 0 or not all(is_number(one) and 0 < one < 1 for one in shares):
         given = ", ".join(describe(one) for one in shares[:4]) or "none"
@@ -166,7 +172,8 @@ def check_levels(levels: Sequence[float]) -> list[float]:
 
 
 def check_drawn(mesh: Mesh, electrodes, scale: ColourScale) -> None:
-    """Raises `ValueError` for what is no solid, no electrodes or no scale."""
+    """Check a solid mesh, electrodes and a colour scale. Raises `ValueError` for arguments of another type, and for a
+    mesh that is not a solid."""
     check_solid(mesh)
     check_scale(scale)
     if electrodes is not None:

@@ -1,4 +1,4 @@
-"""Overview of a solid image: isosurfaces in space, and slices through the strongest change."""
+"""Overview of a solid image: isosurfaces in space, and slices through the maximum change."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from jeit.plot.solid.shaded_surface import mappable
 from jeit.plot.solid.slices import cell_values, draw_slice, dress_slice
 
 _MOST_LISTED = 5
-"""Of iterative images."""
+"""Maximum number of inclusions listed in the caption."""
 
 
 def plot_solid(
@@ -36,10 +36,11 @@ def plot_solid(
     scale: ColourScale = CHANGE,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw a solid image as isosurfaces in space beside three slices at right angles through its strongest change: the
-    centre of the first of `inclusions`, or else the cell of the strongest value. Their outlines are drawn in space.
+    """Draw a solid image as isosurfaces in space, beside three perpendicular slices through its maximum change: the
+    centroid of the first of `inclusions`, or else the cell with the maximum change. The outlines of the slices are
+    drawn in space, too.
 
-    All arguments as for `plot_isosurfaces`, and errors too. A new figure is made unless one is given.
+    `figure`: the figure to draw in; default: a new one. Other arguments and errors as for `plot_isosurfaces`.
     """
     check_drawn(mesh, electrodes, scale)
     image = cell_values(mesh, values)
@@ -61,7 +62,7 @@ def plot_solid(
         draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted)
         seen = plane.on_page(np.asarray(mesh.points))
         x, y = (seen.min(axis=0) + seen.max(axis=0)) / 2
-        # All slices to one scale of lengths, whichever side is longest.
+        # All slices have the same scale of lengths.
         dress_slice(panel, plane, (x - half, x + half, y - half, y + half), cross=True)
     _caption(figure.add_subplot(grid[1, 2]), place, levels, inclusions, difference=scale.difference)
     if scale.bar:
@@ -71,14 +72,15 @@ def plot_solid(
 
 
 def strongest_place(mesh: Mesh, image: np.ndarray, inclusions: Sequence[Inclusion] = ()) -> np.ndarray:
-    """Place of the cuts (3,): the centre of the first inclusion, or of the cell of the strongest value."""
+    """Common point (3,) of the slices: the centroid of the first inclusion, or else that of the cell whose value
+    differs most from the median."""
     if inclusions:
         return np.array(inclusions[0].centroid)
     return np.asarray(centroids(mesh))[np.abs(image - (np.median(image))).argmax()]
 
 
 def _caption(ax: Axes, place, levels, inclusions: Sequence[Inclusion], *, difference: bool) -> None:
-    """Caption: what is drawn, and the inclusions found, in words."""
+    """Draw a caption that describes the slices, the isosurfaces and the inclusions."""
     ax.set_axis_off()
     shares = ", ".join(f"{100 * share:g}" for share in sorted(levels))
     of = "of the strongest change" if difference else "of the way from least to greatest"

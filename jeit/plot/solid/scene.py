@@ -1,7 +1,7 @@
-"""Scenes in space: the camera, and what is drawn in it.
+"""Scenes in space: a camera, and triangles, polygons and lines drawn as seen by it.
 
-matplotlib's own axes in space sort whole objects, so that electrodes show through bodies. Here every piece is sorted
-among all others, and seen along parallel rays, so that the picture has a true scale.
+The 3-D axes of matplotlib sort whole objects by depth, so that electrodes would be visible through bodies. Here all
+pieces are sorted by depth, and the projection is parallel, so that one scale bar applies to the whole picture.
 """
 
 from __future__ import annotations
@@ -18,18 +18,21 @@ from matplotlib.patheffects import withStroke
 from jeit.arguments import describe, is_number
 from jeit.plot.axes import INK, draw_scale_bar
 
-# Direction of the light, from over the viewer's left shoulder: to the right and up on the page, and towards the viewer.
+# Direction towards the light, above and to the left of the viewer: components to the right and up on the page, and
+# towards the viewer.
 _LIGHT = np.array([-0.35, 0.5, 0.79])
+# Minimum brightness of surfaces.
 _DARKEST = 0.66
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A direction to look from, far away, so that lengths across it are true and one scale bar is right everywhere.
+    """Direction of view of a parallel projection, in which lengths perpendicular to the view are true to scale.
 
-    **Fields**: `azimuth`, degrees round z from the x axis towards y, where the viewer stands; `elevation`, degrees
-    above the plane z = 0. −90 and 0 look at the front, along y; elevation 90 looks down. Raises `ValueError` for what
-    is no angle, and an elevation beyond 90 degrees.
+    **Fields**: `azimuth`: angle of the viewer around the z axis, in degrees from the x axis towards y; `elevation`:
+    angle of the viewer above the plane z = 0, in degrees. Azimuth −90 with elevation 0 is the view of the front, along
+    y; elevation 90 is the view from above. Raises `ValueError` for values that are not angles, and for elevations
+    beyond 90 degrees.
     """
 
     azimuth: float = -60.0
@@ -44,31 +47,32 @@ class Camera:
 
     @property
     def toward(self) -> Float[np.ndarray, "3"]:
-        """The direction to the viewer."""
+        """Unit vector towards the viewer."""
         round_z, above = np.radians(self.azimuth), np.radians(self.elevation)
         return np.array([np.cos(above) * np.cos(round_z), np.cos(above) * np.sin(round_z), np.sin(above)])
 
     @property
     def right(self) -> Float[np.ndarray, "3"]:
-        """The direction to the right on the page."""
+        """Unit vector to the right on the page."""
         round_z = np.radians(self.azimuth)
         return np.array([-np.sin(round_z), np.cos(round_z), 0.0])
 
     @property
     def up(self) -> Float[np.ndarray, "3"]:
-        """The direction up the page."""
+        """Unit vector upwards on the page."""
         return np.cross(self.toward, self.right)
 
     def on_page(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 2"]:
-        """Places (…, 3) as seen, metres to the right and up."""
+        """Project points (…, 3) onto the page: coordinates (…, 2) to the right and upwards, metres."""
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
     def nearness(self, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-        """Coordinate of places (…, 3) towards the viewer, metres."""
+        """Coordinate (…) of points (…, 3) towards the viewer, metres."""
         return points @ self.toward
 
     def light(self, normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
-        """Brightness (m,), from dark to 1, of surfaces with these normals (any length), lit from both sides alike."""
+        """Brightness (m,) of surfaces with the given normals of any length, from `_DARKEST` to 1; both sides of a
+        surface are lit alike."""
         length = np.maximum(np.linalg.norm(normals, axis=-1), 1e-300)
         direction = normals / length[:, None]
         direction = direction * np.where(direction @ self.toward < 0, -1.0, 1.0)[:, None]
@@ -87,7 +91,7 @@ BODY = "#b9bec6"
 
 
 class Scene:
-    """Collects what is to be seen by a `camera`, and draws it on axes in one stroke."""
+    """Collection of triangles and lines as seen by a `camera`, which are drawn together, sorted by depth."""
 
     def __init__(self, camera: Camera):
         self.camera = camera
@@ -107,8 +111,9 @@ class Scene:
         lit: bool = True,
         before: Float[np.ndarray, "m"] | float = 0.0,
     ) -> None:
-        """Triangles in colours (m, 4) of their own, darker where they are turned from the light. `smooth`: lit as if
-        rounded where they meet. `before`: metres that they count as nearer than they are."""
+        """Add triangles with colours (m, 4). `smooth`: whether to light them as a smooth surface; `lit`: whether to
+        darken triangles turned away from the light; `before`: distance in metres by which they are moved towards the
+        viewer when sorted by depth."""
         corners = points[triangles]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         if smooth:
@@ -120,15 +125,16 @@ class Scene:
         if lit:
             face[:, :3] *= self.camera.light(normals)[:, None]
         nearness = self.camera.nearness(corners.mean(axis=1)) + before
-        # Edges in the colour of the face close the seams; of translucent ones they would show as a net.
+        # Edges in the colour of their face close gaps. Translucent triangles have none, as they would be visible as a
+        # net.
         solid = face[:, 3] > 0.99
         self._add(corners[:, [0, 1, 2, 2]], nearness, face, np.where(solid[:, None], face, 0), 0.7 * solid)
 
     def add_polygon(
         self, corners: Float[np.ndarray, "k 3"], colour, *, before: float, rim: Bool[np.ndarray, " k"]
     ) -> None:
-        """A convex patch of a surface, in pieces that are sorted each for itself, `before` metres nearer than they are;
-        its edges that are on the `rim` as lines."""
+        """Add a convex polygon on a surface, divided into pieces that are sorted separately; `before` as in
+        `add_triangles`. Edges on the `rim` are drawn as lines."""
         middle = corners.mean(axis=0)
         ring = np.arange(len(corners))
         points = np.concatenate([corners, (corners + middle) / 2, middle[None]])
@@ -145,7 +151,7 @@ class Scene:
         self.add_lines(edges, INK, 0.5, before=before + abs(before) * 0.05)
 
     def add_lines(self, ends: Float[np.ndarray, "s 2 3"], colour, width: float, *, before: float = 0.0) -> None:
-        """Lines from one end to the other, `width` in points."""
+        """Add lines between pairs of `ends`, `width` in points; `before` as in `add_triangles`."""
         edge = np.broadcast_to(to_rgba(colour), (len(ends), 4))
         nearness = self.camera.nearness(ends.mean(axis=1)) + before
         self._add(ends[:, [0, 1, 1, 0]], nearness, np.zeros((len(ends), 4)), edge, np.full(len(ends), width))
@@ -158,7 +164,7 @@ class Scene:
         self._width.append(width)
 
     def draw(self, ax: Axes) -> None:
-        """Draw all that was collected, from the farthest to the nearest."""
+        """Draw all pieces, from the farthest to the nearest."""
         if not self._corners:
             return
         order = np.argsort(np.concatenate(self._nearness), kind="stable")
@@ -180,7 +186,8 @@ class Scene:
 
 
 def bare_in_space(ax: Axes, camera: Camera, points: Float[np.ndarray, "n 3"], *, numbered: bool) -> None:
-    """Equal scales and no frame round what is seen of `points`; below it a scale bar, and which way the axes point."""
+    """Set equal scales and limits around the projected `points`, remove the frame, and draw a scale bar and arrows of
+    the axes below. `numbered`: whether to leave space for numbers of electrodes."""
     seen = camera.on_page(points)
     (left, low), (right, high) = seen.min(axis=0), seen.max(axis=0)
     size = max(right - left, high - low)
@@ -195,8 +202,11 @@ def bare_in_space(ax: Axes, camera: Camera, points: Float[np.ndarray, "n 3"], *,
 
 
 def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple[float, float], length: float) -> None:
-    """Arrows with letters, which way x, y and z point on the page, each as long as it is seen; what points at the
-    viewer is left out. All in metres on the page."""
+    """Draw arrows with letters for the x, y and z axes at `place` on the page, in metres; axes that point towards the
+    viewer are left out.
+
+    `directions`: (3, 2), projected unit vectors; `length`: length of an arrow that is not shortened by projection.
+    """
     for letter, direction in zip(_LETTERS, directions, strict=True):
         if np.hypot(*direction) < 0.15:
             continue
@@ -209,7 +219,7 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple
             "shrinkB": 0,
         }
         ax.annotate("", xy=tuple(tip), xytext=place, arrowprops=style, annotation_clip=False)
-        # The letter stands beyond the tip, as far off however short the arrow is seen.
+        # The distance of the letter from the tip does not depend on the length of the arrow.
         x, y = tip + 0.3 * length * direction / np.hypot(*direction)
         ax.text(x, y, letter, ha="center", va="center", fontsize=8, color=INK)
 
@@ -217,7 +227,7 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple
 def draw_number(
     ax: Axes, place: Float[np.ndarray, "2"], text: str, *, fontsize: float, faint: bool, align: str = "center"
 ) -> None:
-    """A number on the page, with a rim that parts it from what is behind; `align`: what of it is at `place`."""
+    """Draw a number on the page with a white rim; `align`: horizontal alignment relative to `place`."""
     x, y = place
     ax.text(
         x, y, text, ha=align, va="center", fontsize=fontsize, color=INK, alpha=0.45 if faint else 1.0,
@@ -226,6 +236,6 @@ def draw_number(
 
 
 def mark_sign(ax: Axes, x: float, y: float, sign: int) -> None:
-    """A plus or a minus in the middle of what is more or less conductive."""
+    """Draw a plus at a conductive, or a minus at a resistive inclusion."""
     marker = "+" if sign > 0 else "_"
     ax.plot(x, y, marker=marker, color=INK, markersize=8, markeredgewidth=1.4, zorder=4, path_effects=_HALO)

@@ -1,4 +1,4 @@
-"""Surfaces of triangles in space, with values on them, in light and shade from any side."""
+"""Shaded plots of triangulated surfaces in space with values on them."""
 
 from __future__ import annotations
 
@@ -28,12 +28,15 @@ def plot_surface(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a surface in space: `points` (n, 3) metres, `triangles` (m, 3) into them.
+    """Draw a surface in space.
 
-    `values`: one for each triangle, flat, or for each point, smooth; grey without. `electrodes`: what
-    `jeit.electrodes.shapes_of` makes of them, drawn on it and numbered. `camera`: from where it is seen.
-    `scale`: how values become colours; changes of sheet conductivity in S unless it says otherwise. Raises `ValueError`
-    for arrays of other shapes, values that are not finite and things of another kind.
+    - `points`: (n, 3), metres; `triangles`: (m, 3), indices of points.
+    - `values`: one per triangle or per point; without values, the surface is grey.
+    - `electrodes`: from `jeit.electrodes.shapes_of`, drawn on the surface and numbered.
+    - `camera`: direction of view.
+    - `scale`: colour scale; default: for changes of sheet conductivity in S.
+
+    Raises `ValueError` for arrays of other shapes, values that are not finite, and arguments of another type.
     """
     places, faces = checked_surface(points, triangles)
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")
@@ -63,7 +66,8 @@ def plot_surface(
 
 
 def checked_surface(points: ArrayLike, triangles: ArrayLike) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3"]]:
-    """Points and triangles of a surface as arrays. Raises `ValueError`."""
+    """Check the points and triangles of a surface, and return them as arrays. Raises `ValueError` for other shapes,
+    points that are not finite, and indices out of range."""
     places, faces = np.asarray(points), np.asarray(triangles)
     if places.ndim != 2 or places.shape[1] != 3 or not np.issubdtype(places.dtype, np.number):
         raise ValueError(f"points has shape {places.shape}; give (n, 3), metres.")
@@ -77,7 +81,8 @@ def checked_surface(points: ArrayLike, triangles: ArrayLike) -> tuple[Float[np.n
 
 
 def checked_values(values: ArrayLike, num_points: int, num_triangles: int) -> Float[np.ndarray, " k"]:
-    """Values of a surface per triangle or per point, as an array. Raises `ValueError`."""
+    """Check the values of a surface per triangle or per point, and return them as an array. Raises `ValueError` for
+    another shape and for complex values."""
     image = np.asarray(values)
     if image.shape not in ((num_triangles,), (num_points,)):
         raise ValueError(
@@ -90,12 +95,12 @@ def checked_values(values: ArrayLike, num_points: int, num_triangles: int) -> Fl
 
 
 def colours_of(fitted: FittedScale, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 4"]:
-    """Colours (m, 4) of values in a scale."""
+    """Colours (m, 4) of values in a fitted colour scale."""
     return colormaps[fitted.keywords["cmap"]](_normalised(fitted)(fitted.factor * np.asarray(values)))
 
 
 def mappable(fitted: FittedScale) -> ScalarMappable:
-    """The mappable from which a colour bar is drawn."""
+    """Create a matplotlib mappable with the fitted colour scale, for a colour bar."""
     return ScalarMappable(_normalised(fitted), fitted.keywords["cmap"])
 
 

@@ -1,4 +1,4 @@
-"""Slices through a solid image: one at any plane, or a grid of them along an axis."""
+"""Plots of slices through a solid image: one slice by any plane, or a grid of slices along an axis."""
 
 from __future__ import annotations
 
@@ -36,12 +36,14 @@ def plot_slice(
     scale: ColourScale = CHANGE,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw where a plane cuts a solid image: every cell that it passes, as it is cut, and the outline of the body.
+    """Draw the section of a solid image by a plane: the sections of all cells, and the outline of the body.
 
-    `values` per cell (m,), or per node (n,), of which cells have the mean; changes of conductivity in S/m unless
-    `scale` says otherwise, and as strong as anywhere in the body at the ends of the colour bar. `electrodes` are drawn
-    where the plane passes them, `inclusions` as what it cuts off their form, or a ball of their volume. Raises
-    `ValueError` for a plane beside the body, values of another shape, and things of another kind.
+    - `values`: per cell (m,), or per node (n,), which are averaged in each cell; changes of conductivity in S/m, or as
+      described by `scale`. The colour scale is fitted to the whole body.
+    - `electrodes`: drawn where the plane intersects them.
+    - `inclusions`: drawn as the section of their form, or of a ball of their volume.
+
+    Raises `ValueError` for a plane that misses the body, values of another shape, and arguments of another type.
     """
     check_drawn(mesh, electrodes, scale)
     image = cell_values(mesh, values)
@@ -64,10 +66,10 @@ def plot_slices(
     scale: ColourScale = CHANGE,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw a grid of slices across `axis`, all to one scale of lengths and one of colours.
+    """Draw a grid of slices perpendicular to `axis`, with common scales of lengths and colours.
 
-    `at`: how many, evenly from one end of the body to the other, or where, metres. Other arguments as for `plot_slice`;
-    raises `ValueError` as that does.
+    `at`: number of slices, evenly spaced over the body, or their coordinates on the axis in metres. Other arguments as
+    for `plot_slice`. Raises `ValueError` as `plot_slice`.
     """
     check_drawn(mesh, electrodes, scale)
     planes = planes_along(mesh, axis, at)
@@ -97,8 +99,8 @@ def plot_slices(
 
 
 def planes_along(mesh: Mesh, axis: str, at: Sequence[float] | int) -> list[Plane]:
-    """Planes across an axis: so many, evenly spaced with half a space at either end, or at these places in metres.
-    Raises `ValueError`."""
+    """Planes perpendicular to an axis. `at`: number of planes, evenly spaced with half a spacing at both ends, or their
+    coordinates in metres. Raises `ValueError` for an unknown axis, and for too many or no planes."""
     if axis not in AXES:
         raise ValueError(f"axis must be 'x', 'y' or 'z'; it is {describe(axis)}.")
     along = np.asarray(mesh.points)[:, AXES.index(axis)]
@@ -123,7 +125,8 @@ def draw_slice(
     inclusions: Sequence[Inclusion],
     fitted: FittedScale,
 ) -> ScalarMappable:
-    """The cut, its outline, electrodes and inclusions, in a scale that is fitted; what a colour bar is drawn of."""
+    """Draw a section with its outline, electrodes and inclusions in a fitted colour scale; return the mappable for a
+    colour bar."""
     cut = cut_by_plane(mesh, plane)
     cells = PolyCollection(cut.polygons, edgecolors="face", linewidths=0.4)  # pyright: ignore[reportArgumentType]
     cells.set_array(fitted.factor * image[cut.cell])
@@ -140,8 +143,8 @@ def draw_slice(
 
 
 def dress_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, float], *, cross: bool) -> None:
-    """Equal scales over a `window` (left, right, low, high), a title and, if a `cross` is asked for, a scale bar and
-    which way the axes point."""
+    """Set equal scales over a `window` (left, right, low, high), and draw a title and, if `cross`, a scale bar and
+    arrows of the axes."""
     left, right, low, high = window
     size = max(right - left, high - low)
     room = 0.08 * size
@@ -157,13 +160,14 @@ def dress_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, float
 
 
 def window_of(ax: Axes) -> tuple[float, float, float, float]:
-    """Limits of the drawing on axes, (left, right, low, high)."""
+    """Extent (left, right, low, high) of the data drawn on axes."""
     box = ax.dataLim
     return box.x0, box.x1, box.y0, box.y1
 
 
 def cell_values(mesh: Mesh, values: ArrayLike) -> np.ndarray:
-    """Values per cell (m,), of values per node the mean of each cell's. Raises `ValueError` for another shape."""
+    """Values per cell (m,); values per node are averaged in each cell. Raises `ValueError` for another shape and for
+    complex values."""
     image = np.asarray(values)
     if image.shape not in ((mesh.num_cells,), (mesh.num_points,)):
         raise ValueError(
@@ -182,7 +186,7 @@ def _shapes(mesh: Mesh, electrodes) -> ElectrodeShapes | None:
 
 
 def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, away: float, middle) -> None:
-    """Draw a thick line where a plane passes electrodes, and their numbers outward of it."""
+    """Draw a thick line where a plane intersects an electrode, and the number of the electrode outwards of it."""
     found: dict[int, list[np.ndarray]] = {}
     for corners, number in zip(shapes.polygons(), shapes.electrode, strict=True):
         height = plane.distance(corners)
@@ -198,16 +202,17 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, away: 
         ends = np.concatenate(lines)
         place = ends.mean(axis=0)
         if np.ptp(ends, axis=0).max() < 0.1 * away:
-            continue  # a corner
-        # Across the line that it is seen as, away from the middle of the cut.
+            continue  # only a corner of the electrode is cut
+        # The number is placed perpendicular to the line, away from the middle of the section.
         outward = np.linalg.svd(ends - place)[2][1]
         place = place + away * outward * np.sign(outward @ (place - middle))
         draw_number(ax, place, str(number + 1), fontsize=7, faint=False)
 
 
 def _columns(number: int, tall: float) -> int:
-    """Columns of a grid of panels that are `tall` times as high as wide, for a page wider than it is high."""
+    """Number of columns of a grid of `number` panels on a landscape page; `tall`: ratio of height to width of a
+    panel."""
     best = max(1, round(float(np.sqrt(1.6 * number * tall))))
-    # Among similar numbers of columns, the one that leaves the fewest places empty.
+    # Among similar numbers of columns, the one with the fewest empty places is chosen.
     near = range(max(1, best - 1), best + 2)
     return min(number, min(near, key=lambda columns: (-number % columns, abs(columns - best))))

@@ -18,14 +18,14 @@ _LOUDNESS = {"auto": None, "counts": True, "ignored": False}
 
 
 class _ByArguments(TyperCommand):
-    """A command that is called by the name of its group, and says so in its help and its errors."""
+    """Command that is called by the name of its group, also in its help and its errors."""
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         return super().make_context(parent.info_name, args, parent=parent.parent, **extra)
 
 
 class _RecordingFirst(TyperGroup):
-    """A group whose first command needs no name: whatever begins with neither another's name nor --help is for it."""
+    """Group that runs its first command unless the first argument is --help or the name of another command."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] != "--help" and args[0] not in self.commands:
@@ -164,7 +164,7 @@ def fit(
         raise ValueError(f"--output {output} lies in the folder of clips, where it would be a class; give another.")
     make_folder(output, LISTENER_FILES)
     console = plain_console()
-    # Unfinished trainings; deleted when all is done.
+    # Folder of unfinished trainings, deleted at the end.
     under_way = output / "training"
     with Steps(console, quiet=quiet) as step:
         step("read")

@@ -1,4 +1,4 @@
-"""Commands of networks that image touches: learning one, and imaging with it."""
+"""Commands for networks that image touches: train a network, and image frames with it."""
 
 from __future__ import annotations
 

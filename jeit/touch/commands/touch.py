@@ -21,7 +21,7 @@ touch.command()(watch)
 touch.command()(health)
 
 
-# Number of nodes of the mesh of images; contacts are located between its cells.
+# Number of nodes of the mesh for images; contacts are located more finely than its cells.
 _NODES = 400
 
 

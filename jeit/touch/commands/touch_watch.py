@@ -167,7 +167,8 @@ def watch(
         def show(one) -> None:
             if one.note and not quiet:
                 console.print(f"  note: {one.note}", soft_wrap=True)
-            # Live, a touch is named with the first frame after it; of a file it is reported once, with its final name.
+            # In a live stream, a touch is printed once it is classified; in a file, once it has ended, with its final
+            # prediction.
             ended = one.ended if stream != "-" else () if one.named is None else (one.named,)
             for touch in () if quiet else ended:
                 console.print(_line(touch))

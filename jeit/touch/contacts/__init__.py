@@ -1,4 +1,4 @@
-"""Find contacts in images of change, follow them from frame to frame, and estimate the load of each."""
+"""Find contacts in images of change, track them from frame to frame, and estimate their loads."""
 
 from __future__ import annotations
 

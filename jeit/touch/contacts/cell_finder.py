@@ -1,4 +1,4 @@
-"""Detect contacts on a mesh: smoothed images, regions of cells above a level, and their outlines."""
+"""Detect contacts on a mesh: smooth the image, find the regions of cells above a level, and trace their outlines."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from jeit.mesh.geodesic import Triangles
 from jeit.touch.contacts.finder import AbstractFinder, Contact, check_finder, check_share
 from jeit.touch.contacts.image_noise import ImageNoise
 
-# Standard deviations beyond which a Gaussian is taken as zero.
+# Number of standard deviations beyond which a Gaussian is treated as zero.
 _REACH = 3.0
-# Default length, as a share of the root of the mesh's area.
+# Default smoothing length, divided by the square root of the mesh's area.
 _SHARE = 0.03
 
 
 def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
-    """Matrix (m, m) that takes an image to means over the cells round each, by area and a Gaussian.
+    """Compute the matrix (m, m) that smooths an image: Gaussian means over the neighbourhood of each cell.
 
-    `length` is its standard deviation, metres: 3 % of the root of the mesh's area if None; 0 changes nothing. Raises
-    `ValueError` for a length that is none, or as wide as the mesh.
+    Cells are weighted by their areas and by a Gaussian of the distance between centroids. `length`: its standard
+    deviation, metres; None: 3 % of the square root of the mesh's area; 0: no smoothing. Raises `ValueError` if the
+    length is negative, or not less than the square root of the mesh's area.
     """
     centres, areas = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
     widest = float(np.sqrt(areas.sum()))
@@ -44,10 +45,10 @@ def gaussian_means(mesh: Mesh, length: float | None) -> sparse.csr_array:
 
 
 def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c 3"]) -> Float[np.ndarray, "k d"]:
-    """Outline of a set of cells: vertices (k, d), in metres, of the longest loop of its boundary edges.
+    """Outline of a set of cells: vertices (k, d), metres, of the longest loop of its boundary edges.
 
-    Boundary edges belong to one of the `cells` (c, 3) only. Cells have the same orientation, and so have their edges,
-    so that the boundary edges follow one another; where the set touches itself in a node, the loop takes either way.
+    Boundary edges belong to only one of the `cells` (c, 3). All cells must have the same orientation, so that boundary
+    edges follow one another. Where the set touches itself in a node, the loop may continue either way.
     """
     edges = np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
     _, which, number = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -70,16 +71,19 @@ def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c
 class CellFinder(AbstractFinder):
     """Find every peak of an image, with the cells around it that exceed `level` times the peak.
 
-    The centroid is weighted by the excess above that level, which is zero at the region's edge, so that it does not
-    jump when a cell joins or leaves. A peak counts if it is at least `least_peak` times the strongest, and stands
-    `least_prominence` times its own height above the saddle to a higher one: less is an artefact, or a shoulder.
+    The centroid is weighted by the excess above this threshold, which is zero at the region's edge, so that the
+    centroid does not jump when a cell joins or leaves the region. A peak counts if it is at least `least_peak` times
+    the strongest peak, and rises at least `least_prominence` times its own height above the saddle to a higher peak;
+    weaker peaks are artefacts or shoulders.
 
-    The defaults have the least error on simulated skins (`python -m benchmarks contacts`).
+    The defaults give the smallest error on simulated skins (`python -m benchmarks contacts`).
 
-    The mesh is a flat sheet or a surface in space; contacts of the latter are (3,), on it.
+    The mesh is a flat sheet or a surface in space; on a surface, centroids are points (3,) on it.
 
-    **Fields**: those; `smoothing` (m, m), applied first; of the mesh `cells` (m, 3), `points` (n, d), `centres` (m, d),
-    `areas` (m,) and facets they share, `shared` (m, 3); and its `surface`, of a mesh in space.
+    **Fields**: `smoothing` (m, m): matrix that smooths images first; `cells` (m, 3), `points` (n, d): the mesh;
+    `centres` (m, d), `areas` (m,): centroids and areas of the cells; `shared` (m, 3): numbers of the facets that each
+    cell shares with another; `surface`: the surface of a mesh in space, otherwise None; `level`, `least_peak`,
+    `least_prominence`: thresholds for peaks; `floor`, `sign`: see `AbstractFinder`.
     """
 
     smoothing: sparse.csr_array
@@ -106,10 +110,11 @@ class CellFinder(AbstractFinder):
         floor: float = 5.0,
         sign: int = 1,
     ):
-        """`smoothing`: standard deviation in metres of the Gaussian that images are smoothed by, 3 % of the root of the
-        mesh's area unless given. `floor`, `sign`: see `AbstractFinder`.
+        """Create a finder for images on a mesh.
 
-        Raises `ValueError` for a mesh of three dimensions, a smoothing that is no length, and shares that are none.
+        `smoothing`: standard deviation, metres, of the Gaussian that smooths images, by default 3 % of the square root
+        of the mesh's area; `floor`, `sign`: see `AbstractFinder`. Raises `ValueError` for a three-dimensional mesh, an
+        invalid smoothing length, and thresholds that are not from 0 to below 1.
         """
         check_finder(mesh, sign, floor, flat=False)
         for name, value in (("level", level), ("least_peak", least_peak), ("least_prominence", least_prominence)):
@@ -136,7 +141,7 @@ class CellFinder(AbstractFinder):
         area, centre = self.areas[region], self.centres[region]
         weight = area * (change[region] - level)
         centroid = weight @ centre / weight.sum()
-        # Derivative of Σ a (v − level v_peak) x / Σ a (v − level v_peak) by v.
+        # Derivative of the centroid Σ a (v − level v_peak) x / Σ a (v − level v_peak) with respect to the values v.
         slope = np.zeros(self.centres.shape)
         slope[region] = area[:, None] * (centre - centroid) / weight.sum()
         slope[peak] -= self.level * slope[region].sum(axis=0)

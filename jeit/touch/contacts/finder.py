@@ -15,11 +15,11 @@ from jeit.touch.contacts.image_noise import ImageNoise
 class Contact(eqx.Module):
     """A contact in an image.
 
-    **Fields**: `centroid` (x, y), metres, on a surface in space (x, y, z); `area`, m², of the region; `peak`, the
-    strongest change in it, in the unit of the image and with its sign; `integral` of the change over the region, that
-    unit times m²; `contour` (k, d), metres, the region's outline, open (the last point is not the first again);
-    `deviation`, metres: the root mean square distance by which noise of the image moves the centroid, to first order
-    (`ImageNoise` describes the noise). It includes neither the blur of the image nor its errors without noise.
+    **Fields**: `centroid`: (x, y), or (x, y, z) on a surface in space, metres; `area`: area of the region, m²; `peak`:
+    strongest change in the region, with its sign, in the unit of the image; `integral`: integral of the change over the
+    region, in that unit times m²; `contour` (k, d): outline of the region, metres, in which the first point is not
+    repeated; `deviation`: root mean square displacement of the centroid by noise of the image (see `ImageNoise`), to
+    first order, metres. It includes neither the blur of the image nor systematic errors.
     """
 
     centroid: Float[np.ndarray, " d"]
@@ -31,10 +31,10 @@ class Contact(eqx.Module):
 
 
 class AbstractFinder(eqx.Module):
-    """Finds contacts in images on one mesh; all that does not depend on the image is computed in advance.
+    """Finds contacts in images on one mesh; everything that does not depend on the image is computed in advance.
 
-    **Fields**: `smoothing` (m, m), applied to images first; `sign`, +1 where touched skin conducts better, -1 where
-    worse; `floor`, how many standard deviations a cell must exceed to belong to a contact.
+    **Fields**: `smoothing` (m, m): matrix that smooths images first; `sign`: 1 if touched skin conducts better, -1 if
+    it conducts worse; `floor`: number of standard deviations that a cell must exceed to belong to a contact.
     """
 
     smoothing: eqx.AbstractVar[sparse.csr_array]
@@ -48,26 +48,26 @@ class AbstractFinder(eqx.Module):
 
     @abstractmethod
     def find(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> list[Contact]:
-        """Find contacts in a `change` (m,), with the sign in which contacts are positive."""
+        """Find contacts in a `change` (m,) whose sign makes contacts positive."""
 
     def above_noise(
         self, change: Float[np.ndarray, " m"], noise: ImageNoise
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """A change (m,) smoothed, and the same with zeros where it is below the floor."""
+        """Return the smoothed change (m,), and a copy of it that is zero below the noise floor."""
         change = self.smoothing @ change
-        # No smoothed cell deviates more than this, however cells are correlated.
+        # Upper bound of the standard deviation of a smoothed cell, whatever the correlation between cells.
         return change, np.where(change > self.floor * (self.smoothing @ noise.deviation), change, 0.0)
 
 
 def find_contacts(
     finder: AbstractFinder, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None
 ) -> list[Contact]:
-    """Contacts in an image, strongest first.
+    """Find the contacts in an image, strongest first.
 
     `finder`: `CellFinder(mesh)` or `RasterFinder(mesh)` for the mesh of the image. `image` (m,): change of conductivity
-    in every cell, S (3-D: S/m), as `LinearReconstruction.image` gives it. `noise` of such images; of the image itself
-    unless given, see `ImageNoise.of_image`. Changes of the other sign than the finder's are left out. Raises
-    `ValueError` for an image of another mesh, NaN, and noise of another mesh.
+    in every cell, S (3-D: S/m), as `LinearReconstruction.image` computes it. `noise`: noise of these images, by default
+    estimated from the image itself (see `ImageNoise.of_image`). Changes of the sign opposite to the finder's are
+    ignored. Raises `ValueError` for an image of another mesh, NaN, and noise of another mesh.
     """
     check_kind("finder", finder, AbstractFinder, "a finder, such as CellFinder(mesh)")
     change = checked_image(finder, image)
@@ -75,15 +75,17 @@ def find_contacts(
 
 
 def turned(finder: AbstractFinder, found: list[Contact]) -> list[Contact]:
-    """Restore the sign of contacts found in a change in which they are positive; strongest first."""
+    """Restore the original sign of contacts found in a change that makes them positive; sort them, strongest first."""
     if finder.sign < 0:
         found = [eqx.tree_at(lambda one: (one.peak, one.integral), one, (-one.peak, -one.integral)) for one in found]
     return sorted(found, key=lambda one: -abs(one.peak))
 
 
 def checked_noise(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> ImageNoise:
-    """Noise of a change (m,), estimated from it if None. Raises `ValueError` for what is none, and noise of another
-    mesh."""
+    """Return the `noise` of a change (m,), estimated from the change if None.
+
+    Raises `ValueError` for noise of another mesh, and for anything but `ImageNoise`.
+    """
     if noise is None:
         return ImageNoise.of_image(change)
     check_kind("noise", noise, ImageNoise, "ImageNoise, such as ImageNoise.of_frames(reconstruction, frames)")
@@ -93,8 +95,10 @@ def checked_noise(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> 
 
 
 def checked_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
-    """An image with the sign in which contacts are positive. Raises `ValueError` for what is no image on the finder's
-    mesh."""
+    """Return an image multiplied by the finder's sign, so that contacts are positive.
+
+    Raises `ValueError` unless the image is real, finite, and on the finder's mesh.
+    """
     values = np.asarray(image)
     if values.shape != (finder.num_cells,):
         raise ValueError(
@@ -111,8 +115,8 @@ def checked_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
 def check_finder(mesh: Mesh, sign: int, floor: float, *, flat: bool = True) -> None:
     """Check the arguments of a finder.
 
-    Raises `ValueError` for what is no 2-D mesh, and a surface in space where it must be flat, a sign that is none, and
-    a floor that is negative.
+    Raises `ValueError` for a mesh that is not two-dimensional, for a surface in space if `flat`, for a sign other than
+    1 and -1, and for a negative floor.
     """
     check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
     if flat:
@@ -128,6 +132,6 @@ def check_finder(mesh: Mesh, sign: int, floor: float, *, flat: bool = True) -> N
 
 
 def check_share(name: str, value) -> None:
-    """Check a share. Raises `ValueError` for what is not between 0 and 1."""
+    """Check that a value is a fraction, from 0 to below 1. Raises `ValueError` otherwise."""
     if not (is_number(value) and 0 <= value < 1):
         raise ValueError(f"{name} must be a share, from 0 to below 1; it is {describe(value)}.")

@@ -1,4 +1,4 @@
-"""Noise of linear images of an untouched skin: the standard deviation of each cell, and their covariance."""
+"""Noise of linear images of an untouched skin: standard deviations and covariance of the cells."""
 
 from __future__ import annotations
 
@@ -12,27 +12,30 @@ from scipy import sparse
 from jeit.arguments import check_kind, counted, real_array
 from jeit.inverse.linear.one_step import LinearReconstruction
 
-# With fewer frames the deviation of the next one is not known.
+# Minimum number of frames for estimating the standard deviation.
 _LEAST_FRAMES = 10
-# Of normal noise: the standard deviation over the median of the absolute value; the number of deviations within which a
-# cell is kept, and the standard deviation over that of the cells kept.
+# For normal noise: ratio of the standard deviation to the median absolute value; number of standard deviations within
+# which cells are kept; ratio of the standard deviation of all cells to that of the cells kept.
 _NORMAL, _OFF, _WITHIN = 1.4826, 3.0, 1.0136
-# The greatest number of rounds of clipping.
+# Maximum number of rounds of clipping.
 _ROUNDS = 20
 
 
 class ImageNoise(eqx.Module):
-    """Standard deviation of every cell, `deviation` (m,), in the unit of the image, and their covariance, if known.
+    """Noise of linear images.
 
-    `factor` (r, m), whose product factorᵀ factor is the covariance; None where it is not known.
+    **Fields**: `deviation` (m,): standard deviation of every cell, in the unit of the image; `factor` (r, m): matrix
+    whose product factorᵀ factor is the covariance of the cells, None if the covariance is unknown.
     """
 
     deviation: Float[np.ndarray, " m"]
     factor: Float[np.ndarray, "r m"] | None = None
 
     def __check_init__(self):
-        """Check the fields. Raises `ValueError` for deviations that are negative or not finite, and factors of other
-        cells."""
+        """Check the fields.
+
+        Raises `ValueError` for deviations that are negative or not finite, and a factor for another number of cells.
+        """
         wanted = "an array (m,), one number a cell, zero or more and finite, in the unit of the image"
         check_kind("deviation", self.deviation, (np.ndarray, jax.Array), wanted)
         deviation = real_array("deviation", self.deviation, wanted)
@@ -46,11 +49,11 @@ class ImageNoise(eqx.Module):
 
     @classmethod
     def of_frames(cls, reconstruction: LinearReconstruction, frames: Float[np.ndarray, "n M"]) -> "ImageNoise":
-        """Estimate the noise from repeated frames (n, M) volts of the untouched skin, ten at least.
+        """Estimate the noise from at least ten repeated frames (n, M), volts, of the untouched skin.
 
-        Their deviations from the mean are imaged. Frames that span as long as readings will last include drift, which
-        frames of one moment do not. Raises `ValueError` for fewer frames, other channels, NaN, and frames that are all
-        the same.
+        The deviations of the frames from their mean are imaged. The noise includes drift only if the frames span as
+        long a time as later readings. Raises `ValueError` for fewer frames, another number of channels, NaN, and frames
+        that are all the same.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
         frames = real_array("frames", frames, "voltages (n, M)")
@@ -66,11 +69,10 @@ class ImageNoise(eqx.Module):
 
     @classmethod
     def of_channels(cls, reconstruction: LinearReconstruction, deviation: ArrayLike) -> "ImageNoise":
-        """Compute the noise from the standard deviation of each channel, (M,) or one number, volts; channels
-        independent.
+        """Compute the noise from the standard deviations of independent channels, (M,) or one number for all, volts.
 
-        The difference of two such frames deviates by √2 times as much. Raises `ValueError` for those that are negative,
-        not finite, all zero, or of another number of channels.
+        The difference of two frames has √2 times the standard deviation of one frame. Raises `ValueError` for
+        deviations that are negative, not finite, all zero, or for another number of channels.
         """
         check_kind("reconstruction", reconstruction, LinearReconstruction, "a linear one, such as of one_step(...)")
         number = reconstruction.num_measurements
@@ -85,10 +87,10 @@ class ImageNoise(eqx.Module):
     def of_image(cls, image: Float[np.ndarray, " m"]) -> "ImageNoise":
         """Estimate the noise from an image (m,) alone, with or without contacts, by sigma clipping.
 
-        It is the standard deviation, the same for all cells, after cells more than three deviations from the median are
-        removed repeatedly. Artefacts of a contact all over an image, and ringing, count as noise, so that weak contacts
-        beside strong ones are not found; and cells that are noisier than most are taken for contacts. Raises
-        `ValueError` for an image that is not (m,), finite and real.
+        All cells get the same standard deviation: that of the cells that remain after removing, repeatedly, those more
+        than three standard deviations from the median. Artefacts of a contact all over the image, and ringing, count as
+        noise, so that weak contacts beside strong ones are missed. Cells that are noisier than most are mistaken for
+        contacts. Raises `ValueError` for an image that is not (m,), finite and real.
         """
         values = np.asarray(image)
         if values.ndim != 1 or not values.size or values.dtype.kind not in "iuf" or not np.isfinite(values).all():
@@ -100,9 +102,10 @@ class ImageNoise(eqx.Module):
         return cls(np.sqrt((factor**2).sum(axis=0)), factor)
 
     def distance(self, slope: Float[np.ndarray, "m 2"]) -> float:
-        """Root mean square displacement, metres, of a place whose derivative by the image is `slope` (m, 2).
+        """Root mean square displacement, metres, of a position by the noise.
 
-        The slope is in metres over the image's unit. Where the covariance of cells is not known, it is the upper bound.
+        `slope` (m, 2): derivative of the position with respect to the image, metres per unit of the image. If the
+        covariance of the cells is unknown, the result is an upper bound.
         """
         if self.factor is None:
             return float(np.linalg.norm(self.deviation @ np.abs(slope)))
@@ -111,7 +114,7 @@ class ImageNoise(eqx.Module):
     def smoothed(self, smoothing: sparse.csr_array) -> Float[np.ndarray, " m"]:
         """Standard deviation (m,) of the image after smoothing by a matrix (m, m).
 
-        Where the covariance of cells is not known, it is the upper bound.
+        If the covariance of the cells is unknown, the result is an upper bound.
         """
         if self.factor is None:
             return smoothing @ self.deviation
@@ -119,7 +122,10 @@ class ImageNoise(eqx.Module):
 
 
 def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
-    """Standard deviation of the values within three deviations of the median, initially from the median distance."""
+    """Standard deviation of the values within three standard deviations of the median.
+
+    For clipping, the standard deviation is estimated from the median distance from the median.
+    """
     kept = values
     for _ in range(_ROUNDS):
         middle = np.median(kept)

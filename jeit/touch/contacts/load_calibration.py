@@ -1,9 +1,12 @@
 """Load calibration: estimate the load of a contact, in newtons, from its peak in an image, with its uncertainty.
 
-peak = s exp(b ρ² + c ρ⁴) F / (F + F½), ρ = distance from the middle of the skin / its radius,
+The peak is modelled as a function of the load F,
 
-rises with the load F and saturates, as conductivity under pressure does, and is greater near the electrodes. It is
-valid for one indenter, or similar ones: a wider contact under the same load has another peak.
+peak = s exp(b ρ² + c ρ⁴) F / (F + F½),
+
+where ρ is the distance of the contact from the middle of the skin, divided by the skin's radius. The peak rises with
+the load and saturates, as conductivity under pressure does, and is larger near the electrodes. A calibration is valid
+for one indenter, or similar ones: a wider contact under the same load has another peak.
 """
 
 from __future__ import annotations
@@ -19,29 +22,31 @@ from scipy.optimize import least_squares
 from jeit.arguments import check_kind, check_metres, describe, real_array
 from jeit.touch.contacts.finder import Contact
 
-# Parameters s, b, c and F½, and some degrees of freedom to estimate the goodness of fit.
+# Minimum number of contacts: one for each parameter s, b, c and F½, and four degrees of freedom for the scatter.
 _FEWEST = 8
-# Calibrated peaks end below the curve's saturation, where the load is undetermined.
+# Maximum ratio of a peak to the saturated peak; near saturation, the load is undetermined.
 _HIGHEST = 0.98
-# Relative to the radius: the greatest distance of a contact from the middle, and the least width of a contact in an
-# image.
+# Divided by the skin's radius: maximum distance of a contact from the middle; minimum width of the widest contact.
 _FARTHEST, _NARROWEST = 10.0, 1e-3
 
 
 class Load(eqx.Module):
-    """A `force` in newtons, and its standard deviation `deviation`, newtons."""
+    """Estimated load of a contact.
+
+    **Fields**: `force`: the load, newtons; `deviation`: its standard deviation, newtons.
+    """
 
     force: float
     deviation: float
 
 
 class LoadCalibration(eqx.Module):
-    """A fitted relation of peaks to loads.
+    """Fitted relation between peaks and loads.
 
-    **Fields**: `centre` (2,) and `radius` of the skin, metres; `parameters` (4,): log s, b, c and log F½, with their
-    `covariance` (4, 4); `sign` of the peaks, 1 or -1; `scatter`, standard deviation of the logarithm of a peak about
-    the curve; of the calibrated contacts, `loads`, least and greatest, newtons, `farthest` ρ, and `highest`, the
-    greatest share of saturation.
+    **Fields**: `centre` (2,), `radius`: centre and radius of the skin, metres; `parameters` (4,): log s, b, c and log
+    F½; `covariance` (4, 4): covariance of the parameters; `sign`: sign of the peaks, 1 or -1; `scatter`: standard
+    deviation of the logarithm of a peak about the curve; `loads`: minimum and maximum load of the calibrated contacts,
+    newtons; `farthest`: their maximum ρ; `highest`: their maximum ratio of a peak to the saturated peak.
     """
 
     centre: Float[np.ndarray, "2"]
@@ -58,11 +63,11 @@ class LoadCalibration(eqx.Module):
     def fit(
         cls, contacts: Sequence[Contact], loads: ArrayLike, *, radius: float, centre: ArrayLike = (0.0, 0.0)
     ) -> "LoadCalibration":
-        """Fit to `contacts` (n) under known `loads` (n,) newtons, eight at least, at several places.
+        """Fit the relation to at least eight `contacts` (n) under known `loads` (n,), newtons, at several places.
 
-        The logarithm of the peaks is fitted by least squares; `radius` of the skin and its `centre`, metres. Raises
-        `ValueError` for fewer, loads that are not positive or all the same, peaks of both signs, and a curve that does
-        not fit.
+        The logarithms of the peaks are fitted by least squares. `radius`, `centre`: radius and centre of the skin,
+        metres. Raises `ValueError` for fewer contacts, loads that are not positive or all the same, peaks of both
+        signs, and a curve that does not fit.
         """
         check_metres("radius", radius)
         check_kind("contacts", contacts, (list, tuple), "a list of them, one for each load")
@@ -96,7 +101,8 @@ class LoadCalibration(eqx.Module):
         def left(parameters):
             return _log_peak(parameters, distance, loads) - logarithm
 
-        # Weak priors, of a thousandth of a reading each, where places or loads do not determine a parameter.
+        # Weak priors, each with the weight of a thousandth of a reading, for parameters that places or loads do not
+        # determine.
         weak = np.sqrt(1e-3) * np.array([0.0, 0.3, 0.3, 0.3])
         found = least_squares(lambda parameters: np.concatenate([left(parameters), weak * (parameters - begin)]), begin)
         if not found.success:
@@ -109,11 +115,11 @@ class LoadCalibration(eqx.Module):
         return cls(centre, float(radius), found.x, covariance, sign, scatter, span, float(distance.max()), highest)
 
     def load(self, contact: Contact) -> Load:
-        """Estimate the load of a contact, newtons, and its standard deviation, from that of the fit and the scatter
-        about it.
+        """Estimate the load of a contact, newtons, and its standard deviation.
 
-        Raises `ValueError` for a peak beyond those calibrated, where the curve does not determine the load, for one of
-        the other sign, and for a place farther out.
+        The standard deviation includes the uncertainty of the parameters and the scatter of peaks about the curve.
+        Raises `ValueError` for a peak above the calibrated ones, where the curve does not determine the load, for a
+        peak of the other sign, and for a contact farther from the centre than the calibrated ones.
         """
         check_kind("contact", contact, Contact, "a Contact, as of find_contacts")
         if contact.peak * self.sign <= 0:
@@ -129,14 +135,15 @@ class LoadCalibration(eqx.Module):
             )
         scale, first, second, half = self.parameters
         share = abs(contact.peak) / np.exp(scale + first * distance**2 + second * distance**4)
-        # A peak within two standard deviations of the curve is no evidence of a greater load.
+        # A peak less than two standard deviations above the calibrated ones is no evidence of a larger load.
         if share > min(self.highest * np.exp(2 * self.scatter), max(self.highest, _HIGHEST)):
             raise ValueError(
                 f"contact: its peak {describe(contact.peak)} is {share / self.highest:.2f} times the highest that was "
                 f"calibrated there, by {self.loads[1]:g} N; calibrate with greater loads."
             )
         force = float(np.exp(half) * share / (1 - share))
-        # d log F / d log peak = 1 / (1 − share); by the parameters: minus that times ∂ log peak, and F½ as it is.
+        # Derivatives of log F with respect to log peak: 1 / (1 − share); with respect to log s, b and c: minus that,
+        # times the derivative of log peak; with respect to log F½: 1.
         steep = 1 / (1 - share)
         slope = np.array([-steep, -steep * distance**2, -steep * distance**4, 1.0])
         variance = slope @ self.covariance @ slope + (steep * self.scatter) ** 2
@@ -144,6 +151,6 @@ class LoadCalibration(eqx.Module):
 
 
 def _log_peak(parameters, distance, loads):
-    """Logarithms of peaks at distances ρ under loads, newtons."""
+    """Logarithms of the peaks of contacts at distances ρ under loads in newtons."""
     scale, first, second, half = parameters
     return scale + first * distance**2 + second * distance**4 + np.log(loads / (loads + np.exp(half)))

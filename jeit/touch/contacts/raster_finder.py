@@ -1,8 +1,8 @@
-"""Find contacts on a raster, by OpenCV: region of interest, grey, adaptive threshold, opening, contours, centroids.
+"""Find contacts on a raster with OpenCV: region of interest, grey levels, threshold, opening, contours, centroids.
 
 The steps are those of Chen et al., "New flexible tactile sensor based on electrical impedance tomography",
-Micromachines 13 (2022) 185. The paper does not state sizes: those here have less error than a constant of 10, an
-opening of 5 pixels and no smoothing, on simulated skins (`python -m benchmarks contacts`).
+Micromachines 13 (2022) 185. The paper does not state sizes. Those used here give smaller errors on simulated skins than
+a constant of 10, an opening of 5 pixels and no smoothing (`python -m benchmarks contacts`).
 """
 
 from __future__ import annotations
@@ -23,17 +23,18 @@ from jeit.touch.contacts.cell_finder import gaussian_means
 from jeit.touch.contacts.finder import AbstractFinder, Contact, check_finder, checked_image, checked_noise, turned
 from jeit.touch.contacts.image_noise import ImageNoise
 
-# Width in pixels of the band along a contact's edge in which cells may join or leave it.
+# Width in pixels of the band along a contact's edge in which cells may join or leave the contact.
 _EDGE = 15
-# Along a side: more pixels need much memory, and no image has as many cells.
+# Maximum number of pixels along a side: more would need much memory, and no image has as many cells.
 _MOST_PIXELS = 4096
 
 
 class RasterStages(eqx.Module):
-    """The result of every step of `RasterFinder`; all (rows, columns), row 0 at the top.
+    """Results of the steps of `RasterFinder`; arrays are (rows, columns), with row 0 at the top.
 
-    **Fields**: `region`, the change on the pixels of the skin, NaN beside it; `grey`, 0 to 255; `threshold` and
-    `opened`, whether a pixel is kept; `contacts`; `extent` (x_min, x_max, y_min, y_max), metres.
+    **Fields**: `region`: change on the pixels of the skin, NaN beside the skin; `grey`: grey levels, 0 to 255;
+    `threshold`: whether each pixel is above the adaptive threshold; `opened`: whether it remains after opening;
+    `contacts`: the contacts found; `extent`: (x_min, x_max, y_min, y_max), metres.
     """
 
     region: Float[np.ndarray, "rows columns"]
@@ -47,13 +48,13 @@ class RasterStages(eqx.Module):
 class RasterFinder(AbstractFinder):
     """Finds contacts by an adaptive threshold on a raster.
 
-    Grey levels are from the floor to the image's greatest change; pixels are kept that are `constant` levels above the
-    Gaussian mean of the `block` around them; they are opened by an ellipse; each contact is an external contour, with
-    the centroid of what it encloses.
+    Grey levels are proportional to the change, up to 255 for the image's maximum; pixels below the noise floor are
+    black. Pixels are kept if they are `constant` levels above the Gaussian mean of the `block` around them. They are
+    then opened with an ellipse. Each external contour is a contact, whose centroid is that of the enclosed pixels.
 
-    **Fields**: `raster` of the mesh; `smoothing` (m, m), applied first; `block` and `opening`, odd numbers of pixels;
-    `constant`, grey levels; `floor` and `sign`, see `AbstractFinder`: what exceeds the noise by less is black, or empty
-    frames would have contacts.
+    **Fields**: `raster`: raster of the mesh; `smoothing` (m, m): matrix that smooths images first; `block`, `opening`:
+    widths of the block and the ellipse, odd numbers of pixels; `constant`: number of grey levels; `floor`, `sign`: see
+    `AbstractFinder`; without a floor, contacts would be found in images without any.
     """
 
     raster: Raster
@@ -76,10 +77,11 @@ class RasterFinder(AbstractFinder):
         floor: float = 5.0,
         sign: int = 1,
     ):
-        """`pixels` along a side of the raster; `smoothing`, metres, see `CellFinder`.
+        """Create a finder for images on a mesh.
 
-        Raises `ImportError` without OpenCV, and `ValueError` for a mesh of three dimensions and sizes that are no odd
-        numbers of pixels.
+        `pixels`: number of pixels along a side of the raster; `smoothing`: metres, see `CellFinder`. Raises
+        `ImportError` without OpenCV, and `ValueError` for a three-dimensional mesh and sizes that are not odd numbers
+        of pixels.
         """
         _opencv()
         check_finder(mesh, sign, floor)
@@ -101,14 +103,15 @@ class RasterFinder(AbstractFinder):
         return self._stages(change, noise).contacts if clear.any() else []
 
     def stages(self, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None) -> RasterStages:
-        """Compute every step for an image (m,) and its noise; both, and errors, as of `find_contacts`."""
+        """Compute the results of all steps for an image (m,) and its noise; arguments and errors are those of
+        `find_contacts`."""
         change = checked_image(self, image)
         found = self._stages(change, checked_noise(change, noise))
         own = self.sign * found.region, turned(self, found.contacts)
         return eqx.tree_at(lambda stages: (stages.region, stages.contacts), found, own)
 
     def _stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
-        """Compute the steps for a change with the sign in which contacts are positive."""
+        """Compute the results of all steps for a `change` (m,) whose sign makes contacts positive."""
         opencv = _opencv()
         cell = np.asarray(self.raster.cell)
         inside = cell >= 0
@@ -116,8 +119,9 @@ class RasterFinder(AbstractFinder):
         region, clear = np.where(inside, change[cell], np.nan), np.where(inside, clear[cell], 0.0)
         highest = clear.max()
         grey = np.rint(255 * clear / (highest or 1.0)).astype(np.uint8)
-        # OpenCV keeps pixels above the mean less its constant. Pixels beside the skin have the value of the nearest
-        # pixel on it: if they were black, all of the skin's rim would exceed the mean.
+        # OpenCV keeps pixels above the local mean minus its constant, so that a negative constant is passed. Pixels
+        # beside the skin are set to the mean of the skin's pixels nearby: if they were black, the whole rim of the skin
+        # would exceed the local mean.
         size = (self.block, self.block)
         weight = np.maximum(opencv.GaussianBlur(inside * 1.0, size, 0), 1e-12)
         near = opencv.GaussianBlur(grey * 1.0, size, 0) / weight
@@ -132,7 +136,7 @@ class RasterFinder(AbstractFinder):
         ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (self.opening, self.opening))
         opened = opencv.morphologyEx(threshold, opencv.MORPH_OPEN, ellipse)
         contours, _ = opencv.findContours(opened, opencv.RETR_EXTERNAL, opencv.CHAIN_APPROX_NONE)
-        stray = self._stray(cell[inside], (grey - near - self.constant)[inside] * highest / 255, noise)
+        stray = self._membership_noise(cell[inside], (grey - near - self.constant)[inside] * highest / 255, noise)
         contacts = [
             self._contact(opencv, region, contour[:, 0], stray, weight, clear > 0, noise) for contour in contours
         ]
@@ -144,8 +148,9 @@ class RasterFinder(AbstractFinder):
     ) -> Contact | None:
         """Describe the contact that a contour (k, 2) of columns and rows encloses.
 
-        `stray`: see `_stray`; `weight` (rows, columns) of the skin in the means that pixels are compared with, of those
-        that are `clear` of noise.
+        Returns None if the contour encloses no pixel of the skin. `stray`: see `_membership_noise`; `weight` (rows,
+        columns): weight of the skin's pixels in the local means; `clear` (rows, columns): whether pixels are above the
+        noise floor.
         """
         filled = np.zeros(region.shape, np.uint8)
         opencv.drawContours(filled, [contour[:, None]], -1, 1, opencv.FILLED)
@@ -155,33 +160,37 @@ class RasterFinder(AbstractFinder):
         place = self.raster.pixel_centres()
         centroid, area = place[within].mean(axis=0), float(self.raster.pixel_area * within.sum())
         (together, alone), size = stray, (self.block, self.block)
-        # Cells join and leave only at the edge: what is inside a contour counts whatever its grey level.
+        # Cells join and leave a contact only at its edge: everything inside the contour counts, whatever its grey
+        # level.
         ellipse = opencv.getStructuringElement(opencv.MORPH_ELLIPSE, (_EDGE, _EDGE))
         edge = (opencv.dilate(filled, ellipse) > opencv.erode(filled, ellipse)) & np.isfinite(region)
         cell = np.asarray(self.raster.cell)
         lever = np.where(edge[..., None], (place - centroid) * self.raster.pixel_area / area, 0.0)
         follows = np.where(edge, together[cell], 0.0)[..., None] * lever
-        # The threshold moves too: with the mean of the surrounding pixels.
+        # Noise moves the threshold too, through the local mean of the pixels.
         spread = opencv.GaussianBlur((follows / weight[..., None]).astype(np.float32), size, 0)
-        slope = self._on_cells(follows - spread * clear[..., None])
-        moved = noise.distance(self.smoothing.T @ slope), np.linalg.norm(alone[:, None] * self._on_cells(lever))
+        slope = self._sum_over_cells(follows - spread * clear[..., None])
+        moved = noise.distance(self.smoothing.T @ slope), np.linalg.norm(alone[:, None] * self._sum_over_cells(lever))
         column, row = contour.T
         change = region[within]
         integral = float(self.raster.pixel_area * change.sum())
         return Contact(centroid, area, float(change.max()), integral, place[row, column], float(np.hypot(*moved)))
 
-    def _on_cells(self, values: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "m 2"]:
-        """Sums over each cell's pixels."""
+    def _sum_over_cells(self, values: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "m 2"]:
+        """Sum values of pixels over the pixels of each cell."""
         cell = np.asarray(self.raster.cell)
         own, weights = cell[cell >= 0], values[cell >= 0].T
         return np.stack([np.bincount(own, one, minlength=self.num_cells) for one in weights], axis=-1)
 
-    def _stray(self, cell: np.ndarray, above: np.ndarray, noise: ImageNoise) -> tuple[np.ndarray, np.ndarray]:
-        """Uncertainty of the membership of every cell: from its smoothed value (m,), and in addition (m,).
+    def _membership_noise(
+        self, cell: np.ndarray, above: np.ndarray, noise: ImageNoise
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Uncertainty of the membership of every cell: slope (m,) with respect to its value, and independent part (m,).
 
-        A raster changes by whole cells: one of mean `above` over the threshold, whose smoothed value has standard
-        deviation σ, is in with probability p = Φ(z), z = above / σ. Its membership follows the value by φ(z) / σ on
-        average, and deviates from that by √(p (1 − p) − φ(z)²), each cell independently.
+        Whole cells are inside or outside a contact. A cell whose smoothed value exceeds the threshold by `above` on
+        average, with standard deviation σ, is inside with probability p = Φ(z), z = above / σ. On average, its
+        membership changes with its value at the rate φ(z) / σ; the rest has the standard deviation √(p (1 − p) −
+        φ(z)²), independently for each cell.
         """
         number = np.bincount(cell, minlength=self.num_cells)
         mean = np.bincount(cell, above, minlength=self.num_cells) / np.maximum(number, 1)

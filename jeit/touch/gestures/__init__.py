@@ -1,4 +1,4 @@
-"""Classify gestures: segment a stream of images into touches, compute features of each, and predict its gesture."""
+"""Classify gestures: segment a stream of images into touches, compute their features, and predict their gestures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Features of touches: the seven of Silvera Tawil et al. (2011), table II, and more of the touch's course."""
+"""Features of touches: the seven of Silvera Tawil et al. (2011), table II, and further ones of a touch's time
+course."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ from jaxtyping import Float
 from jeit.arguments import check_kind
 from jeit.touch.gestures.segmentation import ChangeCourse, StreamTouch
 
-# Names and units; "image" stands for that of the images of change: siemens (a sheet's) or S/m.
+# Unit of each feature; "image" stands for the unit of the images of change: siemens for a sheet, otherwise S/m.
 FEATURES = {
     "greatest change": "image",
     "least change": "image",
@@ -20,20 +21,20 @@ FEATURES = {
     "rate of change": "image/s",
     "displacement": "m",
 }
-"""The seven features of a touch, by name, each with its unit; "image" stands for that of the images."""
+"""Names of the seven features of a touch, and their units; "image" stands for the unit of the images."""
 
-# The number of instants of a touch, from onset to end, at which P is taken.
+# Number of instants, evenly spaced from onset to end of a touch, at which the maximum change P is sampled.
 _PLACES = 16
-_MORE = (
+_FURTHER = (
     "area", "area spread", "path length", "farthest", "speed", "fastest", "straightness", "peaks", "rise", "decay",
     "roughness", "pauses", "centre of gravity", "breadth",
 )  # fmt: skip
-COURSE_FEATURES = (*FEATURES, *_MORE, *(f"course {one + 1}" for one in range(_PLACES)))
-"""Names of the features of `course_features`: the seven, more of the same course, and P from onset to end."""
+COURSE_FEATURES = (*FEATURES, *_FURTHER, *(f"course {one + 1}" for one in range(_PLACES)))
+"""Names of the features of `course_features`: the seven, further ones of the time course, and samples of P."""
 
 SEQUENCE_PLACES = 32
 SEQUENCE_VALUES = ("change", "share", "mean", "area", "half", "speed", "distance", "along")
-"""Values of `sequence_features` at each of `SEQUENCE_PLACES` instants of a touch, from onset to end."""
+"""Quantities that `sequence_features` samples at each of `SEQUENCE_PLACES` instants of a touch, from onset to end."""
 SEQUENCE_FEATURES = (
     *COURSE_FEATURES, *(f"{name} {one + 1}" for one in range(SEQUENCE_PLACES) for name in SEQUENCE_VALUES)
 )  # fmt: skip
@@ -42,7 +43,10 @@ SEQUENCE_FEATURES = (
 
 @dataclass(frozen=True)
 class TouchFeatures:
-    """Features of n touches: `values` (n, k), a column for each of `names`, in `units`."""
+    """Features of n touches.
+
+    **Fields**: `values` (n, k): one column for each feature; `names`: names of the k features; `units`: their units.
+    """
 
     values: Float[np.ndarray, "n k"]
     names: tuple[str, ...]
@@ -54,44 +58,49 @@ class TouchFeatures:
 
 
 def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
-    """The seven features of n touches, with x_e the change of element e, P(t) = max_e x_e, and t* when it is greatest.
+    """Compute the seven features of n touches.
 
-    Greatest P; least x_e, of all elements and frames of the touch; share of the elements with x_e ≥ P / 2 at t*; mean
-    x_e at t* over the elements above the level that a touch exceeds; duration, s, of the frames above it;
-    mean of |dP/dt|, 0 of one frame; distance of the last centroid from the first, m. Silvera Tawil et al. (2011),
-    table II and section IV-A. Raises `ValueError` for what is no list of touches.
+    Let x_e be the change of element e, P(t) = max_e x_e the maximum change at time t, and t* the time at which P is
+    largest. The features, in the order of `FEATURES`, are: P at t*; minimum of x_e over all elements and frames of the
+    touch; fraction of the elements with x_e ≥ P / 2 at t*; mean of x_e at t* over the elements above the touch level;
+    duration from the first to the last frame above the level, s; mean of |dP/dt|, 0 for a single frame; distance
+    between the first and the last centroid, m. Silvera Tawil et al. (2011), table II and section IV-A. Raises
+    `ValueError` if `touches` is not a list of touches.
     """
     courses = _courses(touches)
-    values = np.array([_seven(one) for one in courses]).reshape(len(courses), len(FEATURES))
+    values = np.array([_seven_features(one) for one in courses]).reshape(len(courses), len(FEATURES))
     return TouchFeatures(values, tuple(FEATURES), tuple(FEATURES.values()))
 
 
 def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
-    """Compute the seven features of n touches and more of their courses, `COURSE_FEATURES`.
+    """Compute the features `COURSE_FEATURES` of n touches: the seven of `touch_features` and further ones.
 
-    They are: mean and spread of the contact's area; the path's length, its farthest distance from its beginning, mean
-    and greatest speed, and displacement over length; peaks of P a touch; how fast P rises to its greatest and falls
-    from there; how rough it is; the share of frames below half of it; the mean and the spread in time of P; and P / max
-    P at instants evenly spread in time. Raises `ValueError` for what is no list of touches.
+    These are: mean of the contact area, and its standard deviation divided by the mean; length of the centroid's path,
+    maximum distance of the centroid from its start, mean speed, 90 % quantile of the speed, and displacement divided by
+    path length; number of peaks of P above half its maximum; time from onset to the maximum of P, and from there to the
+    end; total variation of P / max P; fraction of frames with P below half its maximum; mean and standard deviation of
+    time, divided by the duration and weighted by P; P / max P at instants evenly spaced in time. Raises `ValueError` if
+    `touches` is not a list of touches.
     """
     courses = _courses(touches)
     seven = touch_features(touches)
-    values = np.array([_more(one) for one in courses]).reshape(len(courses), len(_MORE) + _PLACES)
+    values = np.array([_further_features(one) for one in courses]).reshape(len(courses), len(_FURTHER) + _PLACES)
     units = ("m²", "1", "m", "m", "m/s", "m/s", "1", "1", "s", "s", "1", "1", "1", "1", *["1"] * _PLACES)
     return TouchFeatures(np.hstack([seven.values, values]), COURSE_FEATURES, (*seven.units, *units))
 
 
 def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> TouchFeatures:
-    """Compute `course_features` of n touches and their whole course, `SEQUENCE_FEATURES`.
+    """Compute the features `SEQUENCE_FEATURES` of n touches: those of `course_features`, and a sampled time course.
 
-    The course has, at instants evenly spread in time: P; P / max P; mean change and area in contact; the share of
-    elements above half of P; the centroid's speed, its distance from where it began, and its position along the line
-    that it mainly moves along, initially forwards. Raises `ValueError` for what is no list of touches.
+    The following quantities are sampled at instants evenly spaced in time: P; P / max P; mean change in contact;
+    contact area; fraction of elements above half of P; speed of the centroid; distance of the centroid from its start;
+    position of the centroid along its main direction of movement, with the sign that makes the largest displacement
+    positive. Raises `ValueError` if `touches` is not a list of touches.
     """
     courses = _courses(touches)
     whole = course_features(touches)
     wide = SEQUENCE_PLACES * len(SEQUENCE_VALUES)
-    values = np.array([_sequence(one).ravel() for one in courses]).reshape(len(courses), wide)
+    values = np.array([_sampled_course(one).ravel() for one in courses]).reshape(len(courses), wide)
     units = ("image", "1", "image", "m²", "1", "m/s", "m", "m") * SEQUENCE_PLACES
     return TouchFeatures(np.hstack([whole.values, values]), SEQUENCE_FEATURES, (*whole.units, *units))
 
@@ -103,7 +112,7 @@ def _courses(touches) -> list[ChangeCourse]:
     return [one.course for one in touches]
 
 
-def _seven(course: ChangeCourse) -> list[float]:
+def _seven_features(course: ChangeCourse) -> list[float]:
     at = int(course.peak.argmax())
     passed = np.diff(course.seconds)
     rate = np.mean(np.abs(np.diff(course.peak)) / passed) if passed.size else 0.0
@@ -118,8 +127,8 @@ def _seven(course: ChangeCourse) -> list[float]:
     ]
 
 
-def _more(course: ChangeCourse) -> list[float]:
-    there = np.isfinite(course.centroid[:, 0])  # no centroid in a bridged frame
+def _further_features(course: ChangeCourse) -> list[float]:
+    there = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
     place, seconds = course.centroid[there], course.seconds[there]
     steps = np.linalg.norm(np.diff(place, axis=0), axis=1)
     length, moved = float(steps.sum()), float(np.linalg.norm(place[-1] - place[0]))
@@ -151,11 +160,11 @@ def _more(course: ChangeCourse) -> list[float]:
     ]
 
 
-def _sequence(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
-    """`SEQUENCE_VALUES` at `SEQUENCE_PLACES` instants."""
+def _sampled_course(course: ChangeCourse) -> Float[np.ndarray, "T c"]:
+    """Sample the quantities `SEQUENCE_VALUES` at `SEQUENCE_PLACES` instants of a touch."""
     seconds = course.seconds
     when = np.linspace(seconds[0], seconds[-1], SEQUENCE_PLACES)
-    there = np.isfinite(course.centroid[:, 0])  # no centroid in a bridged frame
+    there = np.isfinite(course.centroid[:, 0])  # a frame below the level has no centroid
     place = np.stack([np.interp(when, seconds[there], one[there]) for one in course.centroid.T], axis=1)
     steps = np.linalg.norm(np.diff(place, axis=0, prepend=place[:1]), axis=1)
     speed = steps / max((seconds[-1] - seconds[0]) / (SEQUENCE_PLACES - 1), 1e-9)

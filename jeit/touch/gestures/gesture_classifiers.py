@@ -23,14 +23,15 @@ from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 
 def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest:
-    """Fit LogitBoost as in the paper, `LogitBoostClassifier()`, converted to a forest, which is faster to evaluate."""
+    """Fit a `LogitBoostClassifier()`, as Silvera Tawil et al. (2011) do, and convert it to a forest, which is
+    faster."""
     from jeit.touch.gestures.logit_boost import LogitBoostClassifier
 
     return Forest.of_stumps(LogitBoostClassifier().fit(features, label))
 
 
 def temporal_network(features: Float[np.ndarray, "n k"], label: np.ndarray) -> TemporalNetwork:
-    """Fit a small network to the course of touches, with features from `sequence_features`."""
+    """Fit a small neural network to features computed by `sequence_features`."""
     return TemporalNetwork.fit(features, label, whole=len(COURSE_FEATURES), values=len(SEQUENCE_VALUES))
 
 
@@ -39,24 +40,28 @@ GESTURE_CLASSIFIERS: dict[str, Callable[..., Any]] = {
     **CLASSIFIERS,
     "temporal-network": temporal_network,
 }
-"""Classifiers by name: the paper's, the nine of learnt skins, and a network on the course."""
+"""Functions that fit classifiers, by name: LogitBoost, the nine of learnt skins, and a network for the time course."""
 
 FORMS: dict[str, Callable[..., Any]] = {
     "seven": touch_features,
     "course": course_features,
     "sequence": sequence_features,
 }
-"""Forms of features of a touch: the paper's seven, those and more of its course, or all of the course."""
+"""Functions that compute features of touches, by name: the seven, those with more of the time course, and all."""
 
 
 def forms_of(method: str) -> tuple[str, ...]:
-    """The forms of features that a classifier takes, of those in `FORMS`."""
+    """Return the names in `FORMS` of the features that a classifier can be fitted to."""
     return ("sequence",) if method == "temporal-network" else ("seven", "course")
 
 
 @dataclass(frozen=True)
 class Scale:
-    """A common scale of features: sign(x) log(1 + |x| / size), less its `mean`, over its `deviation`, all (k,)."""
+    """Transform of features x to a common scale: (sign(x) log(1 + |x| / size) − mean) / deviation.
+
+    **Fields**: `size` (k,): scale of each feature; `mean` (k,), `deviation` (k,): mean and standard deviation of
+    sign(x) log(1 + |x| / size).
+    """
 
     size: Float[np.ndarray, " k"]
     mean: Float[np.ndarray, " k"]
@@ -64,7 +69,7 @@ class Scale:
 
     @classmethod
     def of(cls, values: Float[np.ndarray, "n k"]) -> "Scale":
-        """Learn the scale from features (n, k), with `size` the median of |x|; constant features become zero."""
+        """Estimate the scale from features (n, k); `size` is the median of |x|. Constant features become zero."""
         size = np.median(np.abs(values), axis=0)
         size = np.where(size > 0, size, np.maximum(np.abs(values).max(axis=0), 1e-300))
         logs = np.sign(values) * np.log1p(np.abs(values) / size)
@@ -72,17 +77,19 @@ class Scale:
         return cls(size, logs.mean(axis=0), np.where(deviation > 1e-12, deviation, 1.0))
 
     def __call__(self, values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
-        """Scale features."""
+        """Scale features (n, k)."""
         return (np.sign(values) * np.log1p(np.abs(values) / self.size) - self.mean) / self.deviation
 
 
 def held_out_odds(
     method: str, values: Float[np.ndarray, "n k"], right: Int[np.ndarray, " n"], folds: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n C"]:
-    """Log-odds of each class (n, C) of touches, from a classifier that is fitted to all other folds.
+    """Compute log-odds (n, C) of the classes of n touches by cross-validation.
 
-    As `log_odds`, of features (n, k) of classes `right` (n,), 0 … C − 1; a class that the other folds lack has next to
-    none. Raises `ValueError` where they have one class alone.
+    The touches of each fold are classified by the classifier `method`, fitted to all other folds. `values` (n, k):
+    features; `right` (n,): true classes, 0 … C − 1; `folds` (n,): number of the fold of each touch. The log-odds are
+    those of `log_odds`; a class that the other folds lack has −1000. Raises `ValueError` if the other folds contain
+    only one class.
     """
     odds = np.full((len(right), right.max() + 1), -1e3)
 
@@ -99,8 +106,10 @@ def held_out_odds(
 
 
 def random_folds(right: np.ndarray, number: int, seed: int = 0) -> Int[np.ndarray, " n"]:
-    """Assign touches to folds (n,) at random, each class evenly; fewer than `number` folds where there are fewer
-    touches."""
+    """Assign touches to `number` folds at random, with the touches of each class spread evenly.
+
+    Returns the number of the fold of each touch (n,). With fewer touches than `number`, there are fewer folds.
+    """
     rng = np.random.default_rng(seed)
     fold, first = np.empty(len(right), int), 0
     for one in np.unique(right):
@@ -111,6 +120,6 @@ def random_folds(right: np.ndarray, number: int, seed: int = 0) -> Int[np.ndarra
 
 
 def person_folds(people: np.ndarray, most: int | None = None) -> Int[np.ndarray, " n"]:
-    """Assign touches to folds (n,): one for each person, or `most`, each of as many people."""
+    """Assign touches to folds (n,): one fold for each person, or at most `most` folds with equally many people each."""
     number = np.unique(people, return_inverse=True)[1].ravel()
     return number if most is None else number % most

@@ -1,4 +1,4 @@
-"""Learn a gesture classifier from recorded gestures of a skin: image them, segment touches, and train."""
+"""Train a gesture classifier on recordings of a skin: reconstruct images, segment touches, and fit the classifier."""
 
 from __future__ import annotations
 
@@ -16,14 +16,17 @@ from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, find_touc
 from jeit.touch.gestures.gesture_model import METHODS, Reading, check_labels
 from jeit.touch.gestures.touch_images import TouchImages
 
-# The greatest number of recordings from which the sign of touches is determined.
+# Maximum number of recordings used to determine the sign of touches.
 _SIGNED = 60
 
 
 @dataclass(frozen=True)
 class LearntGestures:
-    """A `model`, the `images` it was learnt from, and the numbers of the recordings without a touch,
-    `without_touch`."""
+    """A gesture classifier trained on recordings.
+
+    **Fields**: `model`: the classifier; `images`: the imager of the skin; `without_touch`: numbers of the recordings in
+    which no touch was found.
+    """
 
     model: GestureModel
     images: TouchImages
@@ -38,10 +41,10 @@ def learn_gestures(
     form: str = "auto",
     progress: Callable[[str], None] | None = None,
 ) -> LearntGestures:
-    """Learn the gestures of a described skin from recordings of them, of each the touch that lasts longest.
+    """Learn the gestures of a described skin from recordings; the longest touch of each recording is used.
 
-    `method` and `form` as in `GestureModel.fit`; `progress` is called with a description of the progress. Raises
-    `ValueError` as `TouchImages.prepare` and `GestureModel.fit` do, and where most recordings have no touch.
+    `method` and `form`: see `GestureModel.fit`. `progress` is called with a description of the progress. Raises
+    `ValueError` as `TouchImages.prepare` and `GestureModel.fit` do, and if most recordings contain no touch.
     """
     check_kind("recordings", recordings, GestureSet, "a GestureSet, as of GestureSet.read(path)")
     report = progress or (lambda said: None)
@@ -52,7 +55,7 @@ def learn_gestures(
     level, sign = _level_and_sign(images, still, recordings)
     touches: list[StreamTouch] = []
     kept, without_touch = [], []
-    for number, (seconds, changes) in enumerate(_imaged(images, recordings, range(len(recordings)))):
+    for number, (seconds, changes) in enumerate(_times_and_changes(images, recordings, range(len(recordings)))):
         if number % 50 == 0:
             report(f"images: recording {number} of {len(recordings)}")
         found = find_touches(level, seconds, sign * changes) if len(seconds) else []
@@ -82,9 +85,10 @@ def learn_gestures(
 
 
 def _level_and_sign(images: TouchImages, still: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:
-    """The sign with which touches exceed their level by more, and that level."""
+    """Determine the sign of touches, and their level: with this sign, touches exceed their level by the larger
+    factor."""
     some = np.unique(np.linspace(0, len(recordings) - 1, min(_SIGNED, len(recordings))).astype(int))
-    changes = [one for _, one in _imaged(images, recordings, some.tolist())]
+    changes = [one for _, one in _times_and_changes(images, recordings, some.tolist())]
     found = []
     for sign in (1, -1):
         level = TouchLevel.of_untouched(images.mesh, sign * still)
@@ -93,10 +97,10 @@ def _level_and_sign(images: TouchImages, still: np.ndarray, recordings: GestureS
     return max(found, key=lambda one: one[0])[1:]
 
 
-def _imaged(
+def _times_and_changes(
     images: TouchImages, recordings: GestureSet, which: Sequence[int]
 ) -> Iterator[tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T m"]]]:
-    """Times and changes of these recordings, imaged by one stream."""
+    """Yield the times and the images of change of the recordings `which`, all imaged as one stream."""
     frames = (frame for one in which for frame in recordings.recording(one)[1])
     found = images.stream(frames)
     for one in which:

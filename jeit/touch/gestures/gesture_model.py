@@ -1,4 +1,4 @@
-"""A model of gestures: the frames it reads, its features and its classifier."""
+"""`GestureModel`: a gesture classifier, its features, and a description of the frames that it was trained on."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from jeit.touch.learnt.extras import in_parts
 from jeit.touch.learnt.file import read_plain, write_plain
 from jeit.touch.learnt.methods import log_odds, probabilities, sharpness_of
 
-# A conductivity that differs by this factor is of another skin, or in another unit.
+# Minimum factor between the conductivities of two skins that are considered different, or given in different units.
 _OTHER_SKIN = 5.0
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How a skin was read.
+    """How the frames that a gesture model was trained on were acquired.
 
-    **Fields**: the `level` that a touch exceeds, and the `background`, the untouched skin's conductivity, both S;
-    `sign`, 1 where a touch raises conductivity, -1 where it lowers it; the frame `rate`, frames/s; `num_channels`, and
-    the `protocol`'s name.
+    **Fields**: `level`: change of conductivity that a touch exceeds, S; `background`: conductivity of the untouched
+    skin, S; `sign`: 1 if a touch raises the conductivity, −1 if it lowers it; `rate`: frame rate, frames/s;
+    `num_channels`: number of channels; `protocol`: name of the protocol.
     """
 
     level: float
@@ -50,7 +50,11 @@ class Reading:
     protocol: str
 
     def __post_init__(self):
-        """Raises `ValueError` for levels and rates that are not positive, and what is no sign or number."""
+        """Check the fields.
+
+        Raises `ValueError` if `level`, `background` or `rate` is not positive, `sign` is neither 1 nor −1, or
+        `num_channels` is not a positive integer.
+        """
         for name in ("level", "background", "rate"):
             if not (is_number(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"{name} must be positive; it is {describe(getattr(self, name))}.")
@@ -60,8 +64,11 @@ class Reading:
             raise ValueError(f"num_channels must be a positive number; it is {describe(self.num_channels)}.")
 
     def check_same_skin(self, num_channels: int, protocol: str, background: float) -> None:
-        """Raise `ValueError` for frames of another number of channels, by another protocol, or of a skin of another
-        `background`, S."""
+        """Check that frames are from a skin like the one that gestures were learnt on.
+
+        Raises `ValueError` for another number of channels, another protocol, or a `background`, S, that differs by more
+        than a factor of 5.
+        """
         if num_channels != self.num_channels:
             raise ValueError(
                 f"gestures were learnt from frames of {self.num_channels} channels, and this skin has {num_channels}: "
@@ -81,22 +88,23 @@ class Reading:
 
 
 METHODS = ("auto", *GESTURE_CLASSIFIERS)
-# The greatest number of folds by which the method is chosen; and the share of touches like those learnt that are
-# accepted as such.
+# Maximum number of folds when the method is chosen by cross-validation; fraction of held-out touches that are accepted
+# as similar to the training set.
 _FOLDS, _LIKE = 10, 0.99
-# The number of touches whose distances from the training set are computed at once.
+# Number of touches whose distances from the training set are computed at once.
 _AT_ONCE = 1000
 GESTURE_FILE = "gestures.skops"
-"""Name of a model's file in the folder of `jeit touch gestures`."""
+"""Name of the model's file in the output folder of `jeit touch gestures`."""
 _KIND, _VERSION = "a jeit gesture model", 3
 
 
 @dataclass(frozen=True)
 class Gestures:
-    """Predictions for n touches.
+    """Predicted gestures of n touches.
 
-    `gesture` (n,): the likeliest name; `probability` (n,) of it; `probabilities` (n, C) of all C `names`; `unlike`
-    (n,): whether a touch is unlike any in the training set, where the prediction does not count.
+    **Fields**: `gesture` (n,): most probable gesture; `probability` (n,): its probability; `probabilities` (n, C):
+    probabilities of all C gestures; `names`: names of the C gestures; `unlike` (n,): whether the touch is unlike all
+    touches of the training set, so that its prediction is not valid.
     """
 
     gesture: np.ndarray
@@ -114,12 +122,13 @@ class Gestures:
 class GestureModel:
     """A classifier of touches.
 
-    **Fields**: `names` (C,) of the gestures; the `method` and the `form` of its features ("seven": the paper's,
-    "course": those and more of the course, "sequence": all of it); their `scale`, the `model` of the classifier and the
-    `sharpness` of its probabilities; `known` (N, k), scaled course features of the training set, their `known_scale`,
-    and `farthest`, the distance from the nearest of them beyond which a touch is unlike all. `reading`: how the skin
-    was read, None where it is not known. `standing`: the predictions for held-out touches, and the errors of all that
-    was tried, the best first, None of a model read from a file; `notes` on it.
+    **Fields**: `names` (C,): names of the gestures; `method`: name of the classifier; `form`: name of its features,
+    "seven" (those of the paper), "course" (those and more of the time course) or "sequence" (all of the time course);
+    `scale`: scale of the features; `model`: fitted classifier; `sharpness`: factor that multiplies its log-odds to give
+    probabilities; `known` (N, k): scaled course features of the training set; `known_scale`: their scale; `farthest`:
+    distance from the nearest touch of the training set beyond which a touch is unlike all of them; `reading`: how the
+    frames were acquired, None if unknown; `standing`: predictions for held-out touches, and error rates of all
+    classifiers tried, best first, None if the model was read from a file; `notes`: remarks on the training.
     """
 
     names: tuple[str, ...]
@@ -148,19 +157,21 @@ class GestureModel:
         notes: tuple[str, ...] = (),
         progress: Callable[[str], None] | None = None,
     ) -> "GestureModel":
-        """Learn the `labels` (n,), names of gestures, of touches, made by `people` (n,), names or numbers.
+        """Fit a classifier to touches and their `labels` (n,), the names of gestures.
 
-        `method`: one of `METHODS`; `form`: "seven", "course", "sequence" (the network's) or "auto". "auto" chooses what
-        is most accurate on touches of held-out people, one after the other, or a tenth of them where there are more
-        than ten; without people, or of one person, on touches held out at random, which is no estimate of the accuracy
-        for other people. `reading`, and `notes` on the touches, are kept with it. `progress` is called with what is
-        tried. Raises `ValueError` for labels and people that are not as many, gestures of fewer than two touches, fewer
-        than two gestures, and names of methods and forms that there are not; `ImportError` without the extra `learn`.
+        `people` (n,): names or numbers of the people who made the touches. `method`: one of `METHODS`; `form`: "seven",
+        "course", "sequence" (only for the network) or "auto". "auto" chooses what is most accurate on held-out people:
+        each person in turn, or a tenth of the people if there are more than ten. Without `people`, or with only one
+        person, touches are held out at random, which does not measure the accuracy for other people. `reading` and
+        `notes` are stored in the model. `progress` is called with the name of each combination that is tried. Raises
+        `ValueError` if the numbers of labels, people and touches differ, for empty labels, fewer than two gestures,
+        gestures with fewer than two touches, and unknown names of methods and forms; `ImportError` without the extra
+        `learn`.
         """
         need_extra("learn", "learning gestures")
         check_name("method", method, METHODS)
         check_name("form", form, ("auto", *FORMS))
-        named, people_of = _checked(touches, labels, people)
+        named, people_of = _check_labels_and_people(touches, labels, people)
         names, right = np.unique(named, return_inverse=True)
         remarks = list(notes)
         if people_of is not None and len(np.unique(people_of)) > 1:
@@ -202,9 +213,10 @@ class GestureModel:
         )
 
     def predict(self, touches: list[StreamTouch]) -> Gestures:
-        """Predict gestures of touches; for those that are cut off, less is known than for those in the training set.
+        """Predict the gestures of touches.
 
-        Raises `ValueError` for what is no list of touches.
+        Predictions are less certain for touches that are cut off, of which only a part is known. Raises `ValueError` if
+        `touches` is not a list of touches.
         """
         values = FORMS[self.form](touches).values
         if not len(values):
@@ -220,7 +232,7 @@ class GestureModel:
         return Gestures(said, shares.max(axis=1), shares, self.names, distance > self.farthest)
 
     def write(self, path: str | Path) -> None:
-        """Write the model to one file, without its `standing`. Raises `ValueError` for a folder."""
+        """Write the model, without its `standing`, to one file. Raises `ValueError` if `path` is a folder."""
         own = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "standing"}
         for name in ("scale", "known_scale"):
             own[name] = {one.name: getattr(own[name], one.name) for one in fields(Scale)}
@@ -229,11 +241,10 @@ class GestureModel:
 
     @classmethod
     def read(cls, path: str | Path) -> "GestureModel":
-        """Read a model that `write` wrote, also from the folder of `jeit touch gestures`; nothing in the file is
-        executed.
+        """Read a model from a file written by `write`, or from the output folder of `jeit touch gestures`.
 
-        Raises `FileNotFoundError`, and `ValueError` for files of another kind, and such as hold anything else than
-        numbers and estimators of scikit-learn.
+        Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` if the file is of another kind or
+        contains anything but numbers and estimators of scikit-learn.
         """
         path = Path(path) / GESTURE_FILE if Path(path).is_dir() else Path(path)
         if not path.is_file():
@@ -248,7 +259,7 @@ class GestureModel:
         return read_plain(path, _KIND, _VERSION, "gesture model", make)
 
 
-def _checked(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:
+def _check_labels_and_people(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:
     check_kind("touches", touches, (list, tuple), "a list of touches, such as of find_touches")
     named = np.asarray(labels)
     if named.shape != (len(touches),) or named.dtype.kind not in "UT":
@@ -261,7 +272,10 @@ def _checked(touches, labels, people) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def check_labels(labels: np.ndarray) -> None:
-    """Raise `ValueError` for names (n,) of fewer than two gestures, empty ones, and gestures that are there once."""
+    """Check the names (n,) of gestures.
+
+    Raises `ValueError` if a name is empty, if there are fewer than two gestures, or if a gesture occurs only once.
+    """
     names, count = np.unique(labels, return_counts=True)
     if any(not str(one).strip() for one in names):
         raise ValueError("labels: some are empty; give every touch the name of a gesture.")
@@ -272,13 +286,13 @@ def check_labels(labels: np.ndarray) -> None:
 
 
 def _nearest(known: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Distances from the nearest of the known features (N, k)."""
+    """Distance (n,) of each row of `values` (n, k) from the nearest row of the `known` features (N, k)."""
     from scipy.spatial.distance import cdist
 
     return in_parts(lambda some: cdist(some, known).min(axis=1), values, _AT_ONCE)
 
 
 def _farthest(known: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
-    """Distance from the nearest other touch that all but a hundredth of held-out touches do not exceed."""
+    """99 % quantile of the distance of held-out touches from the nearest touch of the other folds."""
     apart = [_nearest(known[folds != one], known[folds == one]) for one in np.unique(folds)]
     return float(np.quantile(np.concatenate(apart), _LIKE))

@@ -1,4 +1,4 @@
-"""LogitBoost: additive logistic regression by stumps, with the interface of scikit-learn's estimators."""
+"""LogitBoost: additive logistic regression with decision stumps, as an estimator of scikit-learn."""
 
 from __future__ import annotations
 
@@ -15,28 +15,29 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from jeit.arguments import describe
 
-# The bound of responses (Friedman et al. 2000, section 4.2; WEKA's); the least weight; the greatest number of times
-# that a step is halved.
+# Maximum magnitude of responses (Friedman et al. 2000, section 4.2; the value of WEKA); minimum weight; maximum number
+# of times that a step is halved.
 _MOST_RESPONSE, _LEAST_WEIGHT, _MOST_HALVINGS = 3.0, 1e-12, 30
 
 
 class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
-    """Multi-class LogitBoost by regression stumps, with the defaults of WEKA: 10 rounds, full steps.
+    """Multi-class LogitBoost with regression stumps and the defaults of WEKA: 10 rounds, full steps.
 
-    In every round, for each class j of J, with p the probabilities so far and y 1 for what is of the class, else 0, a
-    stump f is fitted to the responses z = (y − p) / (p (1 − p)), clipped at ±3, with weights w = (y − p) / z, which are
-    p (1 − p) where nothing was clipped, and no less than 1e-12. Then F_j grows by (J − 1) / J (f_j − mean f), times
-    `learning_rate`, and p is the softmax of F. Friedman, Hastie and Tibshirani, Annals of Statistics 28 (2000) 337,
-    algorithm 6; weights as in WEKA's LogitBoost.
+    Let p be the current probability of a class, and y = 1 for samples of the class, otherwise 0. In every round, a
+    stump f_j is fitted for each of the J classes to the responses z = (y − p) / (p (1 − p)), clipped at ±3, with the
+    weights w = (y − p) / z, at least 1e-12; without clipping, w = p (1 − p). Then the score F_j grows by (J − 1) / J
+    (f_j − mean f), multiplied by `learning_rate`, and p becomes the softmax of F. Friedman, Hastie and Tibshirani,
+    Annals of Statistics 28 (2000) 337, algorithm 6; weights as in WEKA's LogitBoost.
 
-    A step goes uphill in the likelihood of what is learnt, but a full one may go too far, which clipping all but rules
-    out: it is halved until the likelihood is no less than before, so that this never falls. For two classes this is
-    their own LogitBoost.
+    A small step increases the likelihood of the training set, but a full step may be too long, although clipping makes
+    this rare. A step is therefore halved until the likelihood is at least that before it. For two classes, the method
+    equals the two-class LogitBoost of that paper.
 
-    **Fields** once it is learnt: `classes_` (J,); of the stumps (rounds, J) each one's `feature_`, `threshold_`, where
-    it parts, and `below_` and `above_`, its answers at or below that and above, times the step and (J − 1) / J, from
-    which their mean over the classes is yet to be taken; `step_` (rounds,), of each round; `log_likelihood_`
-    (rounds + 1,), of a sample, on average, before and after each.
+    **Fields** after `fit`: `classes_` (J,): the classes; `feature_` (rounds, J): feature that each stump compares;
+    `threshold_`: threshold of each stump; `below_`, `above_` (rounds, J): values at or below the threshold and above
+    it, multiplied by the step and by (J − 1) / J, before their mean over the classes is subtracted; `step_` (rounds,):
+    step of each round; `log_likelihood_` (rounds + 1,): mean log-likelihood of a sample before the first round and
+    after each round.
     """
 
     def __init__(self, n_estimators: int = 10, *, learning_rate: float = 1.0):
@@ -44,10 +45,10 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         self.learning_rate = learning_rate
 
     def fit(self, X: Any, y: Any) -> "LogitBoostClassifier":
-        """Learn the classes y (n,) of features X (n, k).
+        """Fit the classifier to features X (n, k) and classes y (n,).
 
-        Raises `ValueError` for one class alone, values that are not finite, numbers of samples that do not match, and
-        rounds and rates that are none.
+        Raises `ValueError` for a single class, values that are not finite, different numbers of samples in X and y, and
+        invalid `n_estimators` or `learning_rate`.
         """
         if not (isinstance(self.n_estimators, Integral) and self.n_estimators >= 1):
             raise ValueError(
@@ -55,7 +56,7 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
             )
         if not (isinstance(self.learning_rate, Real) and 0 < self.learning_rate <= 1):
             raise ValueError(f"learning_rate must be above 0, and 1 at most; it is {describe(self.learning_rate)}.")
-        # Single precision, in which scikit-learn's trees part samples.
+        # scikit-learn's trees split samples in single precision.
         X, y = validate_data(self, X, y, dtype=np.float32)
         check_classification_targets(y)
         self.classes_, number = np.unique(y, return_inverse=True)
@@ -66,8 +67,8 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         stumps, steps, likelihood = [], [], [_log_likelihood(score, number)]
         for _ in range(self.n_estimators):
             stump = _stumps(X, right, _softmax(score))
-            gained = _answers(X, *stump)
-            step, found = _uphill(score, gained, number, float(self.learning_rate), likelihood[-1])
+            gained = _stump_values(X, *stump)
+            step, found = _largest_step(score, gained, number, float(self.learning_rate), likelihood[-1])
             score = score + step * gained
             stumps.append(stump)
             steps.append(step)
@@ -85,27 +86,27 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         for feature, threshold, below, above in zip(
             self.feature_, self.threshold_, self.below_, self.above_, strict=True
         ):
-            score = score + _answers(X, feature, threshold, below, above)
+            score = score + _stump_values(X, feature, threshold, below, above)
             yield score
 
     def staged_decision_function(self, X: Any) -> Iterator[np.ndarray]:
-        """`decision_function` after each round in turn."""
+        """Yield `decision_function` after each round."""
         for score in self._staged_scores(X):
             yield score[:, 1] - score[:, 0] if len(self.classes_) == 2 else score
 
     def staged_predict_proba(self, X: Any) -> Iterator[Float[np.ndarray, "n J"]]:
-        """`predict_proba` after each round in turn."""
+        """Yield `predict_proba` after each round."""
         for score in self._staged_scores(X):
             yield _softmax(score)
 
     def staged_predict(self, X: Any) -> Iterator[np.ndarray]:
-        """`predict` after each round in turn."""
+        """Yield `predict` after each round."""
         for score in self._staged_scores(X):
             yield self.classes_[score.argmax(axis=1)]
 
     def decision_function(self, X: Any) -> np.ndarray:
-        """F (n, J) of features (n, k), whose softmax are the probabilities; of two classes F_1 − F_0 (n,), the
-        logarithm of their odds."""
+        """Scores F (n, J), whose softmax gives the probabilities, for features (n, k); for two classes, log-odds F_1 −
+        F_0 (n,)."""
         *_, last = self.staged_decision_function(X)
         return last
 
@@ -115,18 +116,21 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         return last
 
     def predict(self, X: Any) -> np.ndarray:
-        """The likeliest class (n,) of features (n, k)."""
+        """Most probable class (n,) for features (n, k)."""
         *_, last = self.staged_predict(X)
         return last
 
 
 def _stumps(X: np.ndarray, right: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Fit a stump for each class: feature, threshold, and answers below and above it (J,); constant without a split."""
+    """Fit a stump for each class; returns features, thresholds, and values below and above the thresholds, each (J,).
+
+    A stump that finds no split is constant, with an infinite threshold.
+    """
     off = right - probability
     variance = probability * (1 - probability)
     response = np.clip(off / np.maximum(variance, _LEAST_WEIGHT), -_MOST_RESPONSE, _MOST_RESPONSE)
     weight = np.maximum(np.where(response == 0, 0.0, off / np.where(response == 0, 1.0, response)), _LEAST_WEIGHT)
-    response = off / weight  # where the weight is the least one, less: the likelihood's slope stays what it is
+    response = off / weight  # smaller where the weight was raised, to keep the gradient
     number = right.shape[1]
     found = []
     for one in range(number):
@@ -139,17 +143,17 @@ def _stumps(X: np.ndarray, right: np.ndarray, probability: np.ndarray) -> tuple[
     return feature, threshold, below, above
 
 
-def _answers(X: np.ndarray, feature, threshold, below, above) -> Float[np.ndarray, "n J"]:
-    """Values that the stumps of a round add to F."""
+def _stump_values(X: np.ndarray, feature, threshold, below, above) -> Float[np.ndarray, "n J"]:
+    """Values (n, J) that the stumps of a round add to F."""
     said = np.where(X[:, feature] <= threshold, below, above)
     return said - said.mean(axis=1, keepdims=True)
 
 
-def _uphill(score, gained, number, step: float, before: float) -> tuple[float, float]:
-    """The largest step of full, half, quarter … ones that does not lower the log-likelihood below `before`.
+def _largest_step(score, gained, number, step: float, before: float) -> tuple[float, float]:
+    """Find the largest step of `step`, `step` / 2, `step` / 4 … that keeps the log-likelihood at `before` or above.
 
-    Returns the step, and the log-likelihood of the classes `number` (n,) after it; 0 where all that remains to gain is
-    rounding.
+    Returns the step, and the log-likelihood of the classes `number` (n,) after it. The step is 0 if the remaining gain
+    is below rounding errors.
     """
     for _ in range(_MOST_HALVINGS):
         found = _log_likelihood(score + step * gained, number)
@@ -160,7 +164,7 @@ def _uphill(score, gained, number, step: float, before: float) -> tuple[float, f
 
 
 def _log_likelihood(score: np.ndarray, number: np.ndarray) -> float:
-    """Mean log-likelihood of a sample, natural."""
+    """Mean natural log-likelihood of the classes `number` (n,) for the scores (n, J)."""
     shifted = score - score.max(axis=1, keepdims=True)
     return float(np.mean(shifted[np.arange(len(number)), number] - np.log(np.exp(shifted).sum(axis=1))))
 

@@ -1,8 +1,8 @@
-"""Find touches in a stream: the course of change, and where touches begin and end.
+"""Segment a stream of images into touches, and compute the time course of the change.
 
-A touch is where the greatest change P(t) = max_e x_e exceeds a level; where it does not for less than 100 ms, it
-continues. Frames with NaN or infinite values, and such as have the time of the one before, are counted, but not used.
-Where no frame came for so long that a touch might have ended in between, it is cut off there.
+A touch lasts while the maximum change P(t) = max_e x_e over the elements e exceeds a level; interruptions shorter than
+100 ms are bridged. Frames with NaN or infinite values, and frames with the same time as the frame before, are counted
+but not used. If no frame arrives for so long that a touch may have ended in the meantime, the touch is cut off there.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from jaxtyping import Float
 from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.mesh import Mesh, centroids, check_flat, measures
 
-# With fewer frames the deviation of the next one is not known.
+# Minimum number of untouched frames for estimating the standard deviation of their peaks.
 _LEAST_FRAMES = 10
-# A touch exceeds the mean of the peaks of untouched frames by so many deviations.
+# Number of standard deviations by which the level of a touch exceeds the mean peak of untouched frames.
 _ABOVE = 5.0
 
 
 class ChangeCourse(eqx.Module):
-    """Summary of T frames, images x_e of change in the unit of the images, elements e.
+    """Time course of T images of the change x_e of elements e, in the unit of the images.
 
-    **Fields**: `seconds` (T,); `peak` (T,), P = max_e x_e; `least` (T,), min_e x_e; `half_share` (T,), the share of the
-    elements with x_e ≥ P / 2; `mean` (T,) of x_e over the elements above the level that a touch exceeds, 0 where none
-    is; `area` (T,), m², of those; `centroid` (T, 2), metres, theirs, weighted by area and by the excess, NaN where none
-    is.
+    **Fields**: `seconds` (T,): times; `peak` (T,): P = max_e x_e; `least` (T,): min_e x_e; `half_share` (T,): fraction
+    of the elements with x_e ≥ P / 2; `mean` (T,): mean of x_e over the elements above the touch level, 0 if there are
+    none; `area` (T,): area of these elements, m²; `centroid` (T, 2): their centroid, metres, weighted by area and by
+    the excess above the level, NaN if there are none.
     """
 
     seconds: Float[np.ndarray, " T"]
@@ -44,12 +44,12 @@ class ChangeCourse(eqx.Module):
         return len(self.seconds)
 
     def of_frames(self, which: slice | np.ndarray) -> "ChangeCourse":
-        """Select some of the frames."""
+        """Return the time course of some of the frames."""
         return ChangeCourse(*(getattr(self, name)[which] for name in _COLUMNS))
 
     @classmethod
     def joined(cls, courses: "list[ChangeCourse]") -> "ChangeCourse":
-        """Concatenate courses; an empty list gives no frames."""
+        """Concatenate time courses; an empty list gives a time course without frames."""
         shapes = {name: np.empty((0, 2) if name == "centroid" else 0) for name in _COLUMNS}
         parts = {name: [shapes[name], *(getattr(one, name) for one in courses)] for name in _COLUMNS}
         return cls(*(np.concatenate(parts[name]) for name in _COLUMNS))
@@ -59,9 +59,10 @@ _COLUMNS = ("seconds", "peak", "least", "half_share", "mean", "area", "centroid"
 
 
 class TouchLevel(eqx.Module):
-    """The `level` that the greatest change of an image exceeds where there is a touch, in the unit of the images.
+    """Level of the maximum change in an image above which the skin is touched.
 
-    `centres` (m, 2), metres, and `areas` (m,), m², of the mesh's elements.
+    **Fields**: `level`: in the unit of the images; `centres` (m, 2): centroids of the mesh's elements, metres; `areas`
+    (m,): areas of the elements, m².
     """
 
     level: float
@@ -69,7 +70,10 @@ class TouchLevel(eqx.Module):
     areas: Float[np.ndarray, " m"]
 
     def __init__(self, mesh: Mesh, level: float):
-        """Raises `ValueError` for a mesh that is no sheet's, and a level that is not positive."""
+        """Set the level for images on a flat 2-D mesh.
+
+        Raises `ValueError` for any other mesh, and for a level that is not positive.
+        """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
         check_flat(mesh, "gestures")
         if mesh.dimension != 2:
@@ -81,11 +85,11 @@ class TouchLevel(eqx.Module):
 
     @classmethod
     def of_untouched(cls, mesh: Mesh, images: Float[np.ndarray, "F m"]) -> "TouchLevel":
-        """Estimate the level from images (F, m) of an untouched skin, ten at least.
+        """Estimate the level from at least ten images (F, m) of an untouched skin.
 
-        It is five standard deviations above the mean of max_e x_e; frames with NaN are left out. Frames that span as
-        long as readings will last include drift. Raises `ValueError` for fewer frames, images of another mesh, and such
-        as are all the same.
+        The level is five standard deviations above the mean of max_e x_e; frames with NaN are left out. The level
+        allows for drift only if the frames span as long a time as later recordings. Raises `ValueError` for fewer
+        frames, images of another mesh, and images that are all the same.
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the images")
         images = check_images(images, mesh.num_cells)
@@ -99,9 +103,9 @@ class TouchLevel(eqx.Module):
         return cls(mesh, float(peaks.mean() + _ABOVE * peaks.std(ddof=1)))
 
     def course(self, seconds: Float[np.ndarray, " F"], images: Float[np.ndarray, "F m"]) -> ChangeCourse:
-        """Summarise images (F, m) at times `seconds` (F,).
+        """Compute the time course of images (F, m) at times `seconds` (F,).
 
-        Raises `ValueError` for images of another mesh, values that are not finite, and other numbers of times.
+        Raises `ValueError` for images of another mesh, values that are not finite, and a different number of times.
         """
         images = check_images(images, len(self.areas))
         seconds = check_seconds(seconds, len(images))
@@ -125,7 +129,7 @@ class TouchLevel(eqx.Module):
 
 
 def check_images(images: Float[np.ndarray, "F m"], number: int) -> Float[np.ndarray, "F m"]:
-    """Convert images of a mesh of `number` elements to an array. Raises `ValueError` for others."""
+    """Convert images on a mesh of `number` elements to an array (F, m). Raises `ValueError` for another shape."""
     images = real_array("images", images, f"images of change (F, {number}), a row a frame")
     if images.ndim != 2 or images.shape[1] != number:
         raise ValueError(
@@ -135,8 +139,10 @@ def check_images(images: Float[np.ndarray, "F m"], number: int) -> Float[np.ndar
 
 
 def check_seconds(seconds: Float[np.ndarray, " F"], number: int) -> Float[np.ndarray, " F"]:
-    """Convert times of `number` frames to an array. Raises `ValueError` for others, for such as fall, and such as are
-    not finite."""
+    """Convert the times of `number` frames to an array (F,).
+
+    Raises `ValueError` if their number differs, if they decrease, or if they are not finite.
+    """
     seconds = real_array("seconds", seconds, f"times ({number},) of the frames")
     if seconds.shape != (number,):
         raise ValueError(f"seconds have shape {seconds.shape}; give one for each of the {number} frames.")
@@ -145,15 +151,17 @@ def check_seconds(seconds: Float[np.ndarray, " F"], number: int) -> Float[np.nda
     return seconds
 
 
-# Seconds untouched that separate two touches; the least number of frames of a touch; rounding of times.
+# Minimum untouched time between two touches, seconds; minimum number of frames of a touch; tolerance for rounding of
+# times, seconds.
 _GAP, _LEAST, _ROUNDING = 0.1, 2, 1e-9
 
 
 class StreamTouch(eqx.Module):
-    """One touch of a stream: its `course`, from the first to the last frame above the level.
+    """One touch of a stream.
 
-    `lost`: how many frames in it were not usable. `begun_before` and `cut_off`: whether it was there in the first
-    frame, or the last, of an uninterrupted part of the stream, so that its true onset, or its end, is not known.
+    **Fields**: `course`: time course from the first to the last frame above the level; `lost`: number of unusable
+    frames in between; `begun_before`, `cut_off`: whether the touch is present in the first, or the last, frame of an
+    uninterrupted part of the stream, so that its true onset, or end, is unknown.
     """
 
     course: ChangeCourse
@@ -163,35 +171,37 @@ class StreamTouch(eqx.Module):
 
     @property
     def onset(self) -> float:
-        """Time of the first frame, seconds."""
+        """Time of the first frame of the touch, seconds."""
         return float(self.course.seconds[0])
 
     @property
     def offset(self) -> float:
-        """Time of the last frame, seconds."""
+        """Time of the last frame of the touch, seconds."""
         return float(self.course.seconds[-1])
 
     @property
     def longest_gap(self) -> float:
-        """The longest time between two of its frames, seconds; 0 for one frame."""
+        """Maximum time between two consecutive frames of the touch, seconds; 0 for a single frame."""
         return float(np.diff(self.course.seconds).max(initial=0.0))
 
     @property
     def whole(self) -> bool:
-        """Whether both its onset and its end were seen."""
+        """Whether both the onset and the end of the touch were recorded."""
         return not (self.begun_before or self.cut_off)
 
 
 class TouchStream(eqx.Module):
-    """A stream up to now. `stream.follow(second, image)` returns the stream after the next frame; this one is not
-    changed.
+    """State of the segmentation of a stream of images into touches.
 
-    A touch has ended once its last frame above the level is `gap` seconds past; it has `least` frames, shorter ones are
-    not reported. A stream whose frames are `gap` apart, or more, has only touches that are cut off: give a greater one.
+    `stream.follow(second, image)` returns the state after the next frame; this one is not changed. A touch has ended
+    when `gap` seconds have passed since its last frame above the level. Touches of fewer than `least` frames are
+    discarded. If frames are `gap` or more seconds apart, all touches are cut off: choose a larger `gap`.
 
-    **Fields**: `level`; `gap`; `least`; `second` of the last usable frame, -inf before the first; `open`, the frames of
-    the touch that continues, of which so many are `held`, up to its last one above the level; how many frames were
-    `lost` up to that, and since; `begun_before`, of that touch; `ended` touches.
+    **Fields**: `level`: level of a touch; `gap`: minimum untouched time between two touches, seconds; `least`: minimum
+    number of frames of a touch; `second`: time of the last usable frame, -inf before the first; `open`: frames of the
+    current touch; `held`: number of these up to the last one above the level; `lost`: numbers of unusable frames up to
+    that frame and after it; `begun_before`: whether the current touch began before it was first seen; `ended`: touches
+    that have ended.
     """
 
     level: TouchLevel
@@ -205,12 +215,14 @@ class TouchStream(eqx.Module):
     ended: tuple[StreamTouch, ...] = ()
 
     def __check_init__(self):
-        """Raises `ValueError` for what is no level, gap or number of frames."""
+        """Check the fields. Raises `ValueError` for an invalid level, gap or number of frames."""
         _check(self.level, self.gap, self.least)
 
     def follow(self, second: float, image: Float[np.ndarray, " m"]) -> "TouchStream":
-        """Return the stream after a frame (m,) at `second`. Raises `ValueError` for a time before the last one, and
-        images of another mesh."""
+        """Return the state after an image (m,) at time `second`.
+
+        Raises `ValueError` for a time before the last frame, and images of another mesh.
+        """
         if not (is_number(second) and second >= self.second):
             raise ValueError(f"second must not be before the last frame, {self.second:g} s; it is {describe(second)}.")
         frame = check_images(np.asarray(image)[None], len(self.level.areas))
@@ -219,7 +231,7 @@ class TouchStream(eqx.Module):
         course = self.level.course(np.array([float(second)]), frame)
         after, unseen = self, second - self.second >= self.gap - _ROUNDING
         if self.open and second - self.open[self.held - 1].seconds[0] >= self.gap - _ROUNDING:
-            after = replace(self, ended=(*self.ended, *self._going()), open=(), held=0, lost=(0, 0))
+            after = replace(self, ended=(*self.ended, *self._current_touch()), open=(), held=0, lost=(0, 0))
         above = bool(course.peak[0] > self.level.level)
         if above and not after.open:
             after = replace(after, begun_before=bool(unseen))
@@ -231,13 +243,13 @@ class TouchStream(eqx.Module):
 
     @property
     def touches(self) -> list[StreamTouch]:
-        """All touches so far, including the one that continues, in order of onset."""
-        return [*self.ended, *self._going()]
+        """All touches so far, including the current one, in order of onset."""
+        return [*self.ended, *self._current_touch()]
 
-    def _going(self) -> tuple[StreamTouch, ...]:
+    def _current_touch(self) -> tuple[StreamTouch, ...]:
         if self.held < self.least:
             return ()
-        # Where the last frame seen is one of the touch's, it may have continued after that.
+        # If the last frame is above the level, the touch may have continued after it.
         cut_off = self.held == len(self.open)
         course = ChangeCourse.joined(list(self.open[: self.held]))
         return (StreamTouch(course, self.lost[0], self.begun_before, cut_off),)
@@ -251,10 +263,10 @@ def find_touches(
     gap: float = _GAP,
     least: int = _LEAST,
 ) -> list[StreamTouch]:
-    """Find the touches of a recording, images (F, m) at times `seconds` (F,), as a `TouchStream` that follows it does.
+    """Find the touches in images (F, m) at times `seconds` (F,), as a `TouchStream` does frame by frame.
 
-    Raises `ValueError` for times that fall or are not finite, images of another mesh, and frames that mostly are as far
-    apart as the `gap` that separates touches.
+    Raises `ValueError` for times that decrease or are not finite, images of another mesh, and frames whose median
+    interval is not below the `gap`.
     """
     _check(level, gap, least)
     images = check_images(images, len(level.areas))

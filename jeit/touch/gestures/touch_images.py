@@ -1,7 +1,7 @@
-"""`TouchImages`: images of the change of a skin from its untouched state, frame by frame.
+"""`TouchImages`: images of the change of a skin's conductivity from its untouched state, frame by frame.
 
-They are one linear step on a coarse mesh, by default with the prior of Silvera Tawil et al. (2011), NOSER. Frames are
-checked as in every stream: bad ones are refused, a dead electrode's channels left out.
+Each image is one linear reconstruction step on a coarse mesh, by default with the NOSER prior of Silvera Tawil et al.
+(2011). As in every stream, invalid frames are refused, and the channels of a dead electrode are left out.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jeit.inverse.nonlinear.solvers import OneStep
 from jeit.inverse.streaming.stream import FrameImage
 from jeit.mesh import Mesh
 
-# The least number of frames of an untouched skin.
+# Minimum number of frames of an untouched skin.
 _FEWEST = 3
 
 TOUCH_IMAGES = StreamSettings(solver=OneStep(), prior="noser")
@@ -32,7 +32,11 @@ TOUCH_IMAGES = StreamSettings(solver=OneStep(), prior="noser")
 
 @dataclass(frozen=True)
 class TouchImages:
-    """An `imager` of a skin and the `calibration` that it is based on; `reference`, the untouched skin."""
+    """Imager of the touches of a skin.
+
+    **Fields**: `imager`: reconstructs images from frames; `calibration`: calibrated model of the skin that it uses;
+    `reference`: mean frame of the untouched skin.
+    """
 
     imager: Imager
     calibration: Calibration
@@ -47,11 +51,11 @@ class TouchImages:
         *,
         progress: Callable[[str], None] | None = None,
     ) -> "TouchImages":
-        """Prepare imaging of a described skin that reads `untouched` (u, M), volts, while nobody touches it.
+        """Prepare imaging of a described skin from frames `untouched` (u, M), volts, of the untouched skin.
 
         The mean of these frames is the reference. `progress` is called with each step as it begins. Raises `ValueError`
-        for a skin that is not described whole, a solid one, another number of channels, and as
-        `jeit.imaging.prepare_imager`.
+        for an incomplete description, a three-dimensional skin, another number of channels, and as
+        `jeit.imaging.prepare_imager` does.
         """
         check_kind("description", description, Description, "a Description, as of load_description('skin.toml')")
         protocol = description.protocol(description.origin)
@@ -84,18 +88,20 @@ class TouchImages:
 
     @property
     def num_channels(self) -> int:
-        """Number of voltages of a frame, M."""
+        """Number M of voltages of a frame."""
         return self.calibration.model.protocol.num_measurements
 
     def stream(self, frames: Iterable) -> Iterator[tuple[FrameImage, Float[np.ndarray, " m"]]]:
-        """Image each frame (M,), volts: its status, and its change of conductivity (m,), S; NaN where it was
-        refused."""
+        """Image frames (M,), volts.
+
+        Yields the status of each frame, and its change of conductivity (m,), S, which is NaN if the frame was refused.
+        """
         refused = np.full(self.mesh.num_cells, np.nan)
         for one in stream(self.imager, frames):
             yield one, refused if one.conductivity is None else one.conductivity - self.background
 
     def changes(self, frames: Float[np.ndarray, "F M"]) -> Float[np.ndarray, "F m"]:
-        """Changes of conductivity (F, m), S, of frames (F, M), volts; NaN for frames that are refused."""
+        """Compute changes of conductivity (F, m), S, from frames (F, M), volts; NaN for frames that are refused."""
         found = [change for _, change in self.stream(frames)]
         return np.array(found).reshape(len(found), self.mesh.num_cells)
 
@@ -103,9 +109,10 @@ class TouchImages:
 def untouched_frames(
     recording: FrameRecording, seconds: Float[np.ndarray, " F"], span: float
 ) -> Float[np.ndarray, "u M"]:
-    """Frames (u, M) of the untouched skin: the recording's `reference`, or else its first `span` seconds.
+    """Return frames (u, M) of the untouched skin: the recording's `reference`, otherwise its first `span` seconds.
 
-    `seconds` (F,): when its frames came. Raises `ValueError` for fewer than three frames, and such as have no reading.
+    `seconds` (F,): times of the recording's frames. Frames without any reading are left out. Raises `ValueError` if
+    fewer than three frames remain.
     """
     if recording.reference is not None:
         return recording.reference

@@ -1,8 +1,8 @@
 """Classify touches of a live skin as they end.
 
-A touch is named with the first frame below its level, as soon as its end can be known; it has ended finally when it has
-been over for the `gap`. While nobody touches, the reference follows the untouched skin, so that drift makes no touches;
-what lasts longer than the `patience` is reported as held, and is from then on part of the reference.
+A touch is classified at the first frame below its level, as early as it may have ended; it has ended for good after the
+`gap`. While the skin is untouched, the reference follows it, so that drift is not detected as a touch. A touch that
+lasts longer than the `patience` is reported as held, and becomes part of the reference.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from jeit.inverse.streaming.stream import FrameImage
 from jeit.touch.gestures import GestureModel, StreamTouch, TouchLevel, TouchStream
 from jeit.touch.gestures.touch_images import TouchImages
 
-# Seconds that separate two touches, or so many frames if that is longer; untouched seconds after which the skin is at
-# rest again, and the time constant, seconds, with which the reference follows it then.
+# Minimum untouched time between two touches: seconds, and number of frames, of which the longer applies; untouched time
+# after which the reference follows the skin, seconds; time constant with which it follows, seconds.
 _GAP, _FRAMES_APART, _SETTLED, _FOLLOWED = 0.1, 2.5, 0.5, 2.0
-# The greatest share of the initial untouched frames that may exceed the learnt level.
+# Maximum fraction of the initial untouched frames that may exceed the learnt level.
 _MOST_ABOVE = 0.1
-# If a change opposite to a touch is the greatest, above the level by the first factor, for the second number of
-# seconds, the skin was touched when its reference was read.
+# Signs that the skin was touched when its reference was recorded: minimum ratio to the level of the largest change, if
+# it is opposite to a touch; minimum time, seconds, for which it lasts.
 _OPPOSITE, _LIFTED = 3.0, 0.5
 
 
@@ -34,10 +34,11 @@ _OPPOSITE, _LIFTED = 3.0, 0.5
 class NamedTouch:
     """A touch and its predicted gesture.
 
-    **Fields**: `number`, from 1, in order of onset; `touch`; the `gesture`, its `probability`, and `probabilities` (C,)
-    of all; `unlike`, whether it is unlike any in the training set, where the prediction does not count; `named`, the
-    stream's second when it was named, and `latency`, seconds of computing from that frame to the name; `held`, whether
-    it lasted beyond the patience and was cut off for that.
+    **Fields**: `number`: position in order of onset, from 1; `touch`: the touch; `gesture`: most probable gesture;
+    `probability`: its probability; `probabilities` (C,): probabilities of all gestures; `unlike`: whether the touch is
+    unlike all touches of the training set, so that the prediction is not valid; `named`: time in the stream at which it
+    was classified, seconds; `latency`: computing time from that frame to the prediction, seconds; `held`: whether it
+    was cut off because it lasted longer than the patience.
     """
 
     number: int
@@ -53,11 +54,12 @@ class NamedTouch:
 
 @dataclass(frozen=True)
 class WatchedFrame:
-    """The result of a frame at a `second`.
+    """The result for one frame.
 
-    Its `image`, None of what comes after the last frame; the greatest change `peak`, S, NaN where it was refused;
-    whether the skin is `touched`; the touch that was `named` with it, or None, which may yet continue; those that have
-    `ended` finally; `latency`, seconds from the frame to the result; and a `note`, where there is one.
+    **Fields**: `second`: time of the frame; `image`: image of the frame, None in the result after the last frame;
+    `peak`: maximum change, S, NaN if the frame was refused; `touched`: whether the skin is touched; `named`: touch that
+    was classified at this frame, which may still continue, or None; `ended`: touches that have ended for good;
+    `latency`: time from the frame to the result, seconds; `note`: remark on the frame, or an empty string.
     """
 
     second: float
@@ -72,11 +74,11 @@ class WatchedFrame:
 
 @dataclass(frozen=True)
 class TouchWatch:
-    """Settings of a watched skin.
+    """Settings for classifying the touches of a live skin.
 
-    `images` of the skin, the `level` that a touch exceeds, the `model` that classifies it; `gap`, seconds untouched
-    that separate two touches; `patience`, seconds after which a touch becomes part of the reference; `notes` on what
-    was found.
+    **Fields**: `images`: imager of the skin; `level`: change that a touch exceeds; `model`: gesture classifier; `gap`:
+    minimum untouched time between two touches, seconds; `patience`: time after which a touch becomes part of the
+    reference, seconds; `notes`: remarks on the untouched skin and the frame rate.
     """
 
     images: TouchImages
@@ -96,11 +98,12 @@ class TouchWatch:
         rate: float,
         patience: float = 30.0,
     ) -> "TouchWatch":
-        """Create a watch for frames at `rate`, frames/s, of a skin that initially read `untouched` (u, M), volts.
+        """Create a watch for a skin whose frames come at `rate`, frames/s.
 
-        The level is the one that the model learnt with, or the untouched frames' own where these are noisier. Raises
-        `ValueError` for a model of another skin, or of none, frames in which the skin is touched, and rates and
-        patience that are not positive.
+        `untouched` (u, M): first frames of the skin, untouched, volts. The level of a touch is that of the model, or is
+        estimated from the untouched frames if these are noisier. Raises `ValueError` for a model that was learnt on
+        another skin or does not describe its skin, for untouched frames from which no level can be estimated, and for
+        rates and patience that are not positive.
         """
         check_kind("images", images, TouchImages, "TouchImages, as of TouchImages.prepare(description, untouched)")
         check_kind("model", model, GestureModel, "a GestureModel, as of GestureModel.read(path)")
@@ -129,18 +132,18 @@ class TouchWatch:
         return cls(images, level, model, max(_GAP, _FRAMES_APART / rate), patience, tuple(notes))
 
     def follow(self, frames: Iterable[tuple[float, Any]]) -> Iterator[WatchedFrame]:
-        """Process frames as they come, each its second and its voltages (M,).
+        """Process frames as they come: pairs of a time in seconds and voltages (M,).
 
-        Frames that are refused, or come with the time of the one before, count as lost. A touch that is there at the
-        end is reported, cut off, with one more `WatchedFrame`, without an image. Raises `ValueError` for times that
-        fall.
+        Frames that are refused, and frames with the same time as the frame before, count as lost. A touch that is
+        present at the end is reported as cut off by one more `WatchedFrame`, without an image. Raises `ValueError` for
+        times that decrease.
         """
         check_kind("frames", frames, Iterable, "pairs of a second and a frame (M,), one after another")
         return _Session(self).follow(frames)
 
 
 class _Session:
-    """The state of a watch from one frame to the next."""
+    """State of a `TouchWatch` between two frames."""
 
     def __init__(self, watch: TouchWatch):
         self.watch = watch
@@ -148,7 +151,8 @@ class _Session:
         self.touches = TouchStream(watch.level, gap=watch.gap)
         self.rest = np.asarray(watch.images.imager.expected, float)
         self.drift = np.zeros_like(self.rest)
-        # The last frame without drift, None where it has no numbers; when it came, and its second.
+        # The last frame with the drift subtracted, None if it is invalid; then the clock time at which it came, its
+        # time in the stream, and the time of the last result.
         self.frame: np.ndarray | None = None
         self.came, self.second, self.last_seen = 0.0, -np.inf, -np.inf
         self.last_touched, self.number = -np.inf, 0
@@ -156,16 +160,16 @@ class _Session:
         self.opposite_since: float | None = None
 
     def follow(self, frames: Iterable) -> Iterator[WatchedFrame]:
-        """As `TouchWatch.follow`."""
-        for image, change in self.watch.images.stream(self._coming(frames)):
-            yield self._watched(image, self.sign * change)
+        """See `TouchWatch.follow`."""
+        for image, change in self.watch.images.stream(self._frames_without_drift(frames)):
+            yield self._frame_result(image, self.sign * change)
         if self.touches.touches:
             self.came = time.perf_counter()
-            ended = tuple(self._ended(one) for one in self.touches.touches)
+            ended = tuple(self._ended_touch(one) for one in self.touches.touches)
             yield WatchedFrame(self.second, None, np.nan, False, None, ended, time.perf_counter() - self.came)
 
-    def _coming(self, frames: Iterable) -> Iterator:
-        """Subtract the drift of the untouched skin from frames before they are imaged."""
+    def _frames_without_drift(self, frames: Iterable) -> Iterator:
+        """Yield frames with the drift of the untouched skin subtracted."""
         for second, frame in frames:
             self.came = time.perf_counter()
             if not (is_number(second) and second >= self.second):
@@ -173,17 +177,18 @@ class _Session:
             self.second = float(second)
             try:
                 values = np.asarray(frame)
-            except ValueError:  # ragged: refused by the stream
+            except ValueError:  # a ragged array, which the stream refuses
                 values = np.empty(0)
             plain = values.shape == self.rest.shape and values.dtype.kind in "iuf"
             self.frame = values - self.drift if plain else None
             yield frame if self.frame is None else self.frame
 
-    def _watched(self, image: FrameImage, change: np.ndarray) -> WatchedFrame:
-        """Process a frame whose change of conductivity is `change` (m,), positive where touched."""
+    def _frame_result(self, image: FrameImage, change: np.ndarray) -> WatchedFrame:
+        """Return the result for a frame with change of conductivity `change` (m,), which is positive where the skin is
+        touched."""
         second = self.second
         self.touches = self.touches.follow(second, change)
-        ended = tuple(self._ended(one) for one in self.touches.ended)
+        ended = tuple(self._ended_touch(one) for one in self.touches.ended)
         self.touches = replace(self.touches, ended=())
         going, named = bool(self.touches.open), None
         touched = going and self.touches.held == len(self.touches.open)
@@ -191,42 +196,42 @@ class _Session:
             self.last_touched, self.named = second, None  # the named touch continues
         elif self.named is None and self.touches.touches:
             (over,) = self.touches.touches
-            named = self.named = self._name(over)
+            named = self.named = self._classify(over)
         note = ""
-        if self._lifted(image, change):
+        if self._is_lifted(image, change):
             note = f"at {second:.2f} s the skin is more at rest than when its rest was read: was it touched? Read anew."
-            ended = (*ended, *self._rest_here(image))
+            ended = (*ended, *self._reset_reference(image))
         elif going and second - self.touches.open[0].seconds[0] >= self.watch.patience:
-            ended = (*ended, *(replace(one, held=True) for one in self._rest_here(image)))
+            ended = (*ended, *(replace(one, held=True) for one in self._reset_reference(image)))
         elif second - self.last_touched >= _SETTLED and np.isfinite(self.last_seen):
-            self._follow_rest(image, 1 - np.exp(-(second - self.last_seen) / _FOLLOWED))
+            self._follow_drift(image, 1 - np.exp(-(second - self.last_seen) / _FOLLOWED))
         self.last_seen = second
         peak = float(change.max())
         return WatchedFrame(second, image, peak, touched, named, ended, time.perf_counter() - self.came, note)
 
-    def _lifted(self, image: FrameImage, change: np.ndarray) -> bool:
-        """Whether a touch that was there when the reference was read has been lifted for good."""
+    def _is_lifted(self, image: FrameImage, change: np.ndarray) -> bool:
+        """Whether a touch that was present when the reference was recorded has been lifted for good."""
         if not image.imaged or -change.min() <= max(change.max(), _OPPOSITE * self.watch.level.level):
             self.opposite_since = None
         elif self.opposite_since is None:
             self.opposite_since = self.second
         return self.opposite_since is not None and self.second - self.opposite_since >= _LIFTED
 
-    def _rest_here(self, image: FrameImage) -> tuple[NamedTouch, ...]:
-        """Take the skin as it is now as the reference; returns the touch that this ends."""
-        ended = tuple(self._ended(one) for one in self.touches.touches)
+    def _reset_reference(self, image: FrameImage) -> tuple[NamedTouch, ...]:
+        """Make the last frame the reference of the untouched skin; returns the touch that this ends, if any."""
+        ended = tuple(self._ended_touch(one) for one in self.touches.touches)
         self.touches = replace(self.touches, open=(), held=0, lost=(0, 0))
         self.opposite_since = None
-        self._follow_rest(image, 1.0)
+        self._follow_drift(image, 1.0)
         return ended
 
-    def _follow_rest(self, image: FrameImage, share: float) -> None:
-        """Add a `share` of the last frame's deviation to the drift."""
+    def _follow_drift(self, image: FrameImage, share: float) -> None:
+        """Add a fraction `share` of the last frame's deviation from the reference to the drift."""
         if self.frame is not None and image.imaged:
             there = image.usable & np.isfinite(self.frame)
             self.drift = self.drift + np.where(there, share * (self.frame - self.rest), 0.0)
 
-    def _name(self, touch: StreamTouch) -> NamedTouch:
+    def _classify(self, touch: StreamTouch) -> NamedTouch:
         said = self.watch.model.predict([touch])
         return NamedTouch(
             number=self.number + 1,
@@ -239,10 +244,11 @@ class _Session:
             latency=time.perf_counter() - self.came,
         )
 
-    def _ended(self, touch: StreamTouch) -> NamedTouch:
-        """A touch that has ended, as it was named when it was over; touches that are cut off are named now."""
+    def _ended_touch(self, touch: StreamTouch) -> NamedTouch:
+        """Return an ended touch with the prediction made when it was over, or with a new one if there is none for all
+        of it."""
         named, self.named = self.named, None
         if named is None or len(named.touch.course) != len(touch.course):
-            named = self._name(touch)
+            named = self._classify(touch)
         self.number += 1
         return replace(named, touch=touch)

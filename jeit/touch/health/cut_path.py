@@ -1,23 +1,20 @@
-"""The path of a cut: change of conductivity near a line, on a mesh that is finer there.
+"""Locate a cut: fit its path to the change of voltages by least squares on the forward model.
 
-Refine a flat mesh locally, to resolve thin structures: triangles are halved across their longest edge.
+Across a cut, a sheet conducts as if it were longer there by some length, which is very long if it is cut through; along
+the cut, it conducts as before. This loss is spread over a band about as wide as two edges of the mesh, which is refined
+where images show a loss. The unknowns are the ends of the path, its bend, and the added length; the voltages are
+computed exactly in every step. A round spot, as a press makes, is fitted too: the better fit determines what caused the
+change.
 
-Rivara's closure: a triangle with any halved edge has its longest edge halved too, so that no triangle gets thinner than
-half of what it was, and there are no hanging nodes.
+To refine a flat mesh locally, triangles are halved across their longest edge. Rivara's closure: a triangle with any
+halved edge has its longest edge halved too, so that no triangle becomes thinner than half of what it was, and there are
+no hanging nodes.
 
-Voltages of a model whose conductivity changes in one region only: dense low-rank updates of one solution.
-
-With the grounded matrix A of stiffness and contact mass, the loads B (`jeit.forward.transfer`) and a change D of the
-stiffness between a few nodes t, the Woodbury identity gives Bᵀ(A + D)⁻¹B = BᵀX − X_tᵀ (1 + D G)⁻¹ D X_t, with X = A⁻¹B
-and G = A⁻¹ between the nodes t. G is computed once for all nodes of the region; each change then needs the solution of
-a system with as many unknowns as it has nodes.
-
-Estimate the path of a cut from the change of voltages that it made, by least squares on the forward model.
-
-Across the path a sheet conducts as if it were longer there by some length, very long where it is cut through; along the
-path it conducts as before. This is spread over a band about as wide as two edges of a mesh, which is refined where
-images show a loss. The unknowns are the ends of the path, its bend, and that length; the voltages are computed exactly
-in every step. A round spot, which is what a press makes, is fitted too: the better fit determines what the change is.
+If the conductivity changes in one region only, voltages are computed by dense low-rank updates of one solution. With
+the grounded matrix A of stiffness and contact mass, the loads B (`jeit.forward.transfer`) and a change D of the
+stiffness between a few nodes t, the Woodbury identity gives Bᵀ(A + D)⁻¹B = BᵀX − X_tᵀ (1 + D G)⁻¹ D X_t, where X =
+A⁻¹B, and G is A⁻¹ between the nodes t. G is computed once for all nodes of the region; each change then requires the
+solution of a system with as many unknowns as the change has nodes.
 """
 
 from __future__ import annotations
@@ -39,9 +36,9 @@ from jeit.mesh import Mesh, centroids, check_flat, measures
 from jeit.mesh.sizes import size_checked
 from jeit_solvers.engines import on_host
 
-# The greatest number of times that a cell is halved.
+# Maximum number of times that a cell is halved.
 _ROUNDS = 12
-# Electrodes that can be used unchanged with another mesh of the same skin with more nodes.
+# Electrodes that remain valid if the mesh of the skin gets more nodes.
 _FREE = (BoundaryElectrodes, SheetDiscs, PointElectrodes, NodeElectrodes)
 
 
@@ -50,8 +47,9 @@ def finer_model(
 ) -> tuple[ForwardModel, Int[np.ndarray, " m"], float]:
     """Refine a model's mesh to edges of `edge` metres within `radius` metres of a `centre` (2,).
 
-    Returns the model; for each of its cells (m,), the number of the original cell that it is part of; and the length of
-    its edges there, metres. A layer, and a skin whose electrodes are facets of its mesh, stay as they are.
+    Returns the model; the number of the original cell that contains each of its cells (m,); and the length of the edges
+    in the refined region, metres. Three-dimensional meshes, and meshes whose facets form the electrodes, are not
+    refined.
     """
     mesh = model.mesh
     check_flat(mesh, "cuts")
@@ -70,7 +68,7 @@ def finer_model(
 def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tuple[Mesh, Int[np.ndarray, " m"]]:
     """Refine a flat mesh so that cells within `radius` metres of a `centre` (2,) are no larger than `area`, m².
 
-    Returns the mesh; and for each cell (m,), the number of the original cell that it is part of.
+    Returns the mesh, and the number of the original cell that contains each of its cells (m,).
     """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     parent = np.arange(len(cells))
@@ -80,17 +78,17 @@ def finer_mesh(mesh: Mesh, centre: np.ndarray, radius: float, area: float) -> tu
         large = near & (np.asarray(measures(made)) > area)
         if not large.any():
             break
-        points, cells, parent = _halved(points, cells, parent, large)
+        points, cells, parent = _halve(points, cells, parent, large)
     return Mesh.create(points, cells), parent
 
 
-def _halved(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, large: Bool[np.ndarray, " m"]):
-    """Halve the `large` cells, and those needed to leave no hanging nodes; returns points, cells and parents."""
+def _halve(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, large: Bool[np.ndarray, " m"]):
+    """Halve the `large` cells, and others as needed to avoid hanging nodes; returns points, cells and parents."""
     pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]], axis=-1)
     edges, number = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
     number = number.reshape(-1, 3)
     lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
-    # Of two edges of equal length, both neighbours must choose the same.
+    # If two edges of a cell are equally long, both neighbours must choose the same one.
     lengths = lengths * (1 + 1e-9 * np.arange(len(lengths)) / len(lengths))
     longest = number[np.arange(len(cells)), lengths[number].argmax(axis=1)]
     split = np.zeros(len(edges), bool)
@@ -103,7 +101,7 @@ def _halved(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, large: Bo
     middle = np.full(len(edges), -1)
     middle[split] = len(points) + np.arange(split.sum())
     points = np.concatenate([points, points[edges[split]].mean(axis=1)])
-    # The longest edge first in each cell, then the halves by their own edge.
+    # Turn each cell so that its longest edge comes first, then halve it.
     place = lengths[number].argmax(axis=1)
     rows = np.arange(len(cells))[:, None]
     turned, own = cells[rows, (place[:, None] + np.arange(3)) % 3], number[rows, (place[:, None] + np.arange(3)) % 3]
@@ -112,7 +110,8 @@ def _halved(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, large: Bo
     new, whose = middle[own[~kept]], parent[~kept]
     made, of = [turned[kept]], [parent[kept]]
     for corner, other, across in ((b, c, new[:, 1]), (c, a, new[:, 2])):
-        # A half is (corner, other, middle of the longest); its edge from corner to other may be halved again.
+        # A half is the triangle (corner, other, middle of the longest edge); its edge from corner to other may be
+        # halved too.
         halved = across >= 0
         top = new[:, 0]
         made += [
@@ -124,17 +123,17 @@ def _halved(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, large: Bo
     return points, np.concatenate(made), np.concatenate(of)
 
 
-# The greatest number of nodes of a region.
+# Maximum number of nodes of a region.
 _MOST_NODES = 2500
-# The factor by which the radius of a region with too many nodes is reduced.
+# Factor by which the radius of a region with too many nodes is reduced.
 _LESS = 0.85
 
 
 class LocalChange:
-    """Voltages of a `model` whose conductivity changes within about `radius` metres of a `centre` (2,) only.
+    """Voltages of a `model` whose conductivity changes only within about `radius` metres of a `centre` (2,).
 
-    `conductivity` (m,), S/m (2-D: S), before the change; `cells` (c,): the cells of the region, whose conductivity may
-    change, as of `voltages`.
+    `conductivity` (m,): before the change, S/m (2-D: S). The attribute `cells` (c,) holds the numbers of the cells in
+    the region, whose conductivity may change.
     """
 
     def __init__(
@@ -161,14 +160,15 @@ class LocalChange:
         self.inverse = _inverse_between(matrix, nodes)
 
     def impedance(self, change: Float[np.ndarray, "c ..."]) -> Float[np.ndarray, "L L"]:
-        """Transfer impedance (L, L), ohms, after conductivity has changed by (c,) or tensors (c, d, d)."""
-        return self._impedance(self._solved(change)[1])
+        """Transfer impedance (L, L), ohms, after a change of conductivity: scalars (c,) or tensors (c, d, d)."""
+        return self._impedance(self._solve(change)[1])
 
     def slopes(
         self, change: Float[np.ndarray, "c ..."], ways: list[Float[np.ndarray, "c ..."]]
     ) -> tuple[Float[np.ndarray, "L L"], list[Float[np.ndarray, "L L"]]]:
-        """Transfer impedance after a `change`, and its derivatives (L, L) in directions of conductivity."""
-        cells, product, solution = self._solved(change)
+        """Transfer impedance (L, L), ohms, after a `change` of conductivity, and its derivatives (L, L) in the
+        directions `ways`."""
+        cells, product, solution = self._solve(change)
         fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
         table = np.zeros((self.solution.shape[0], fields.shape[1]))
         nodes = np.unique(self.corners[cells])
@@ -182,8 +182,9 @@ class LocalChange:
             found.append(-np.asarray(centred(energy)))  # pyright: ignore[reportArgumentType]
         return self._impedance(product), found
 
-    def _solved(self, change: np.ndarray):
-        """Solve for a change: the changed cells, Bᵀ(A + D)⁻¹B, and (A + D)⁻¹B at these cells' nodes, in order."""
+    def _solve(self, change: np.ndarray):
+        """Solve for a change; returns the changed cells, Bᵀ(A + D)⁻¹B, and (A + D)⁻¹B at the nodes of these cells, in
+        order."""
         size = np.abs(change).reshape(len(change), -1).max(axis=1)
         cells = np.flatnonzero(size > 0)
         if not len(cells):
@@ -206,7 +207,7 @@ class LocalChange:
 
 
 def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, "t t"]:
-    """Inverse of a sparse symmetric matrix between some nodes: of the Schur complement that eliminates the others."""
+    """Inverse of a sparse symmetric matrix between some nodes: inverse of the Schur complement without the others."""
     others = np.setdiff1d(np.arange(matrix.shape[0]), nodes)
     left = matrix[nodes][:, nodes].toarray()
     if len(others):
@@ -218,39 +219,42 @@ def _inverse_between(matrix, nodes: Int[np.ndarray, " t"]) -> Float[np.ndarray, 
     return scipy.linalg.inv(0.5 * (left + left.T))
 
 
-# Numbers of directions, and lengths as shares of the skin's side, tried first; how many of these starts are followed,
-# and the greatest number of steps of each.
+# Starting points of the fit: number of directions; lengths divided by the skin's side; number of starting points that
+# are optimised; maximum number of steps of each optimisation.
 _DIRECTIONS, _LENGTHS, _FOLLOWED, _STEPS = 8, (0.08, 0.2), 2, 25
-# Added length across a cut, as shares of the skin's side: the greatest, of a cut that goes through; the start of the
-# fit of a lesser cut; and the least.
+# Added length across a cut, divided by the skin's side: maximum, for a cut that goes through; initial value of the fit
+# of a partial cut; minimum.
 _THROUGH, _PART, _LEAST = 3.0, 0.02, 1e-4
-# As shares of the skin's side: the radius of the refined region, and the length of the mesh edges in it.
+# Divided by the skin's side: radius of the refined region; length of the mesh edges in it.
 _RADIUS, _EDGE = 0.22, 0.0125
-# Half the width of the band, in edges of the fine mesh; the factor by which it is narrower beyond a path's ends.
+# Half the width of the band, in edges of the refined mesh; factor by which it is narrower beyond a path's ends.
 _BAND, _ENDS = 1.5, 2.0
-# Of a spot: the radius as a share of the skin's side, and the greatest; how many radii it extends; the initial depths,
-# and the greatest.
+# Spot: initial and maximum radius, divided by the skin's side; extent, in radii; initial and maximum depth, where depth
+# is minus the logarithm of the fraction of conductivity left at the centre.
 _SPOT, _MOST_SPOT, _REACH, _SPOT_DEPTHS, _MOST_DEPTH = 0.05, 0.1, 3.0, (0.5, -0.5), 6.0
-# Initial offset of a bend from the middle of a line, as a share of the line's length.
+# Initial offset of a bend from the middle of a straight path, divided by the length of the path.
 _ASIDE = 0.2
-# A bend, or a cut that does not go through, is accepted if it reduces the misfit below this share.
+# Maximum ratio of misfits for accepting a bent path in place of a straight one, and a partial cut in place of one that
+# goes through.
 _BEND, _NOT_THROUGH = 0.7, 0.4
-# A cut that goes through with a misfit below the first is certain. Otherwise the alternative is excluded if its misfit
-# is greater by the second factor. The greatest uncertainty of an end, in edges.
+# Misfit below which a cut that goes through is certain; ratio of misfits from which the alternative is excluded;
+# maximum uncertainty of an end, in edges.
 _CLEAR, _DISTINCT, _WIDEST = 0.01, 4.0, 10.0
-# Relative model error, of a change and of the root mean square of all; and that of a common factor.
+# Model error, relative to a change and to the root mean square of all changes; standard deviation of a factor common to
+# all changes.
 _MODEL, _FACTOR = 0.05, 0.1
-# Step of a numerical derivative, as a share of the skin's side.
+# Step of numerical derivatives, divided by the skin's side.
 _STEP = 1e-5
 
 
 @dataclass(frozen=True)
 class FittedLoss:
-    """A loss of conductivity along a `path` (k, 2), metres, or in a round spot at `path` (1, 2).
+    """Fitted loss of conductivity along a path or in a round spot.
 
-    `misfit`: the share of the change's energy that it does not explain; `conductivity` (m,), S/m (2-D: S), with the
-    loss; `through`: whether the cut goes through the whole depth, which is assumed unless the data need a lesser cut;
-    `deviation`: the standard deviation of its length, metres.
+    **Fields**: `path` (k, 2): points of the path, metres, or the centre (1, 2) of a spot; `misfit`: fraction of the
+    change's energy that the loss does not explain; `conductivity` (m,): conductivity with the loss, S/m (2-D: S);
+    `through`: whether the cut goes through the whole depth, which is assumed unless the data require a partial cut;
+    `deviation`: standard deviation of the path's length, metres.
     """
 
     path: Float[np.ndarray, "k 2"]
@@ -261,21 +265,20 @@ class FittedLoss:
 
 
 @dataclass(frozen=True)
-class _Found:
+class _FittedUnknowns:
     unknowns: np.ndarray
     misfit: float
 
 
-def _length(found: _Found) -> float:
-    """Length of the fitted path, metres."""
+def _length(found: _FittedUnknowns) -> float:
+    """Length of a fitted path, metres."""
     return float(np.linalg.norm(np.diff(found.unknowns[:-2].reshape(-1, 2), axis=0), axis=1).sum())
 
 
 class LossFit:
-    """Least-squares fit of a cut or a spot to a `change` (K,) of voltages of a model's `channels` (K,), volts.
+    """Least-squares fit of a cut or a spot to a `change` (K,), volts, in the `channels` (K,) of a model.
 
-    The change is from `conductivity` (m,), S/m (2-D: S), in a skin whose mesh is refined around a `centre` (2,),
-    metres.
+    The change is relative to the `conductivity` (m,), S/m (2-D: S); the mesh is refined around a `centre` (2,), metres.
     """
 
     def __init__(
@@ -287,7 +290,8 @@ class LossFit:
         noise: Float[np.ndarray, " K"],
         centre: Float[np.ndarray, " 2"],
     ):
-        """Prepare the fit; `conductivity` before the change, S/m (2-D: S); `noise` (K,) of the change, volts."""
+        """Prepare the fit. `conductivity`: before the change, S/m (2-D: S); `noise` (K,): noise of the change,
+        volts."""
         own = np.asarray(centroids(model.mesh))[:, :2]
         self.low, self.high = own.min(axis=0), own.max(axis=0)
         self.side = float((self.high - self.low).max())
@@ -306,13 +310,13 @@ class LossFit:
         size = np.sqrt(np.mean(change**2))
         self.weight = 1 / np.hypot(noise, _MODEL * np.hypot(change, size))
         self.change = change
-        # A uniform change of the skin's conductivity is projected out.
+        # Direction of a uniform change of the skin's conductivity, which is projected out of changes.
         whole = self.weight * self.rest
         self.drift = whole / np.linalg.norm(whole)
-        self.energy = float(np.sum(self._weighted(change) ** 2))
+        self.energy = float(np.sum(self._weight_residual(change) ** 2))
 
     def line(self, starts: list[np.ndarray]) -> FittedLoss:
-        """Fit a straight cut near one of some places (x, y), or a bent one if it fits far better."""
+        """Fit a straight cut near one of the places (x, y) in `starts`, or a bent cut if it fits much better."""
         angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         ways = np.column_stack([np.cos(angles), np.sin(angles)])
         tried = []
@@ -324,26 +328,26 @@ class LossFit:
                 for way in ways
             ]
             tried.append(sorted(first, key=self._misfit)[:_FOLLOWED])
-        through = min((self._fitted(one, fixed=True) for one in tried[0]), key=lambda one: one.misfit)
-        partly = min((self._fitted(one) for one in tried[1]), key=lambda one: one.misfit)
-        through, partly = self._bent(through, fixed=True), self._bent(partly)
+        through = min((self._fit(one, fixed=True) for one in tried[0]), key=lambda one: one.misfit)
+        partly = min((self._fit(one) for one in tried[1]), key=lambda one: one.misfit)
+        through, partly = self._fit_bend(through, fixed=True), self._fit_bend(partly)
         is_through = not partly.misfit < _NOT_THROUGH * through.misfit
         best, other = (through, partly) if is_through else (partly, through)
         path = best.unknowns[:-2].reshape(-1, 2)
-        # A shallow long line and a deep short one may fit about equally well.
+        # A long partial cut and a short cut that goes through may fit about equally well.
         clear = is_through and best.misfit < _CLEAR
         alike = not clear and other.misfit < _DISTINCT * best.misfit
         unsure = abs(_length(best) - _length(other)) if alike else 0.0
         deviation = float(np.hypot(self._deviation(best), unsure))
-        return FittedLoss(path, best.misfit, self._own(best.unknowns), is_through, deviation)
+        return FittedLoss(path, best.misfit, self._conductivity_on_mesh(best.unknowns), is_through, deviation)
 
     def spot(self, start: np.ndarray) -> FittedLoss:
-        """Fit a round spot of lost or gained conductivity."""
+        """Fit a round spot of lost or gained conductivity near a place (x, y)."""
         begun = [np.array([*start, np.log(_SPOT), depth, 0.0]) for depth in _SPOT_DEPTHS]
-        best = min((self._fitted(one) for one in begun), key=lambda one: one.misfit)
-        return FittedLoss(best.unknowns[None, :2], best.misfit, self._own(best.unknowns))
+        best = min((self._fit(one) for one in begun), key=lambda one: one.misfit)
+        return FittedLoss(best.unknowns[None, :2], best.misfit, self._conductivity_on_mesh(best.unknowns))
 
-    def _bent(self, straight: _Found, *, fixed: bool = False) -> _Found:
+    def _fit_bend(self, straight: _FittedUnknowns, *, fixed: bool = False) -> _FittedUnknowns:
         ends = straight.unknowns[:-2].reshape(-1, 2)
         middle, (x, y) = ends.mean(axis=0), ends[-1] - ends[0]
         aside = _ASIDE * np.array([-y, x])
@@ -351,11 +355,11 @@ class LossFit:
             np.array([*ends[0], *place, *ends[-1], *straight.unknowns[-2:]])
             for place in (middle + aside, middle - aside)
         ]
-        bent = min((self._fitted(one, fixed=fixed) for one in tried), key=lambda one: one.misfit)
+        bent = min((self._fit(one, fixed=fixed) for one in tried), key=lambda one: one.misfit)
         return bent if bent.misfit < _BEND * straight.misfit else straight
 
-    def _fitted(self, start: np.ndarray, *, fixed: bool = False) -> _Found:
-        """Fit the unknowns from a `start`; if `fixed`, the added length across the cut stays as it is."""
+    def _fit(self, start: np.ndarray, *, fixed: bool = False) -> _FittedUnknowns:
+        """Fit the unknowns from a `start`; if `fixed`, the added length across the cut does not change."""
         from scipy.optimize import least_squares
 
         low, high, scale = self._bounds(len(start))
@@ -378,10 +382,10 @@ class LossFit:
             ftol=1e-3,
             xtol=1e-3,
         )
-        return _Found(whole(found.x), 2 * found.cost / self.energy)
+        return _FittedUnknowns(whole(found.x), 2 * found.cost / self.energy)
 
     def _bounds(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lower and upper bounds of the unknowns, and their scale."""
+        """Lower and upper bounds of the unknowns, and their scales."""
         if number == 5:  # a spot
             low, high = (
                 [*self.low, np.log(self.band / self.side), -_MOST_DEPTH],
@@ -395,8 +399,8 @@ class LossFit:
             scale = [*np.full(2 * places, 0.05 * self.side), 1.0]
         return np.array([*low, -0.5]), np.array([*high, 0.5]), np.array([*scale, _FACTOR])
 
-    def _deviation(self, found: _Found) -> float:
-        """Standard deviation of a path's length, metres: from that of its ends, and half an edge of the mesh."""
+    def _deviation(self, found: _FittedUnknowns) -> float:
+        """Standard deviation of a path's length, metres: that of its ends, combined with half an edge of the mesh."""
         least = found.misfit * self.energy
         each = least / max(len(self.change) - len(found.unknowns), 1)
         path = found.unknowns[:-2].reshape(-1, 2)
@@ -412,7 +416,7 @@ class LossFit:
             square += self.edge**2 * min(each / max(max(rises), 1e-12 * self.energy), _WIDEST**2)
         return float(np.sqrt(square))
 
-    def _weighted(self, volts: np.ndarray) -> np.ndarray:
+    def _weight_residual(self, volts: np.ndarray) -> np.ndarray:
         scaled = (self.weight * volts.T).T
         return scaled - np.multiply.outer(self.drift, self.drift @ scaled)
 
@@ -420,18 +424,18 @@ class LossFit:
         return float(np.sum(self._residual(unknowns) ** 2))
 
     def _volts(self, impedance: np.ndarray) -> np.ndarray:
-        """Voltages of the channels (K,) from a transfer impedance (L, L)."""
+        """Voltages (K,) of the channels, computed from a transfer impedance (L, L)."""
         return np.einsum("kl,kl->k", self.measured @ impedance, self.driven)
 
-    def _predicted(self, unknowns: np.ndarray) -> np.ndarray:
+    def _predicted_change(self, unknowns: np.ndarray) -> np.ndarray:
         return self._volts(self.region.impedance(self._change(unknowns))) - self.rest
 
     def _residual(self, unknowns: np.ndarray) -> np.ndarray:
-        left = (1 + unknowns[-1]) * self._predicted(unknowns) - self.change
-        return np.append(self._weighted(left), unknowns[-1] / _FACTOR)
+        left = (1 + unknowns[-1]) * self._predicted_change(unknowns) - self.change
+        return np.append(self._weight_residual(left), unknowns[-1] / _FACTOR)
 
     def _slope(self, unknowns: np.ndarray) -> np.ndarray:
-        """Derivatives (K + 1, q) of the residual."""
+        """Derivatives (K + 1, q) of the residual with respect to the unknowns."""
         change = self._change(unknowns)
         steps = np.full(len(unknowns) - 1, _STEP)
         steps[: 2 if len(unknowns) == 5 else -1] *= self.side
@@ -445,10 +449,10 @@ class LossFit:
         found[:, :-1] *= 1 + unknowns[-1]
         last = np.zeros(len(unknowns))
         last[-1] = 1 / _FACTOR
-        return np.concatenate([self._weighted(found), last[None]])
+        return np.concatenate([self._weight_residual(found), last[None]])
 
     def _change(self, unknowns: np.ndarray) -> np.ndarray:
-        """Change of the region's conductivity: of a spot (c,), along a path tensors (c, d, d)."""
+        """Change of the region's conductivity: scalars (c,) for a spot, tensors (c, d, d) for a path."""
         if len(unknowns) == 5:
             return self.conductivity * np.expm1(self._spot_log(unknowns))
         left, across = self._across(unknowns)
@@ -457,12 +461,12 @@ class LossFit:
         return change
 
     def _spot_log(self, unknowns: np.ndarray) -> np.ndarray:
-        """Logarithm (c,) of the share of conductivity that is left in a spot."""
+        """Logarithm (c,) of the fraction of conductivity that is left in a spot."""
         square = np.sum((self.centres - unknowns[:2]) ** 2, axis=1) / (np.exp(unknowns[2]) * self.side) ** 2
         return -unknowns[3] * np.where(square < _REACH**2, np.exp(-square / 2), 0.0)
 
     def _across(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Share of conductivity (m,) left across the nearest part of a path, and the direction (m, 2) across it."""
+        """Fraction of conductivity (m,) left across the nearest part of a path, and the direction (m, 2) across it."""
         path = unknowns[:-2].reshape(-1, 2)
         start, along = path[:-1], np.diff(path, axis=0)
         lengths = np.maximum(np.linalg.norm(along, axis=1), 1e-9)
@@ -470,7 +474,7 @@ class LossFit:
         normal = np.column_stack([-along[:, 1], along[:, 0]])
         off = self.centres[:, None] - start  # (m, s, 2)
         place = np.sum(off * along, axis=-1)
-        # The band ends at the ends of the path.
+        # The path is shortened by the width of the band beyond it, so that the band ends at the ends of the path.
         pulled = np.minimum(self.band / _ENDS, 0.45 * lengths)
         first, last = np.zeros(len(lengths)), lengths.copy()
         first[0] += pulled[0]
@@ -479,12 +483,12 @@ class LossFit:
         square = np.sum(off * normal, axis=-1) ** 2 + beyond**2
         nearest = square.argmin(axis=1)
         square = square[np.arange(len(square)), nearest] / self.band**2
-        # A bump across the path, with integral 1.
+        # Profile of the band across the path, with integral 1.
         shape = np.where(square < 1, (1 - square) ** 2, 0.0) * 15 / (16 * self.band)
         return 1 / (1 + np.exp(unknowns[-2]) * self.side * shape), normal[nearest]
 
-    def _own(self, unknowns: np.ndarray) -> np.ndarray:
-        """Conductivity on the given mesh, one number for each cell."""
-        # Conductivity is lost across the path, not along it.
+    def _conductivity_on_mesh(self, unknowns: np.ndarray) -> np.ndarray:
+        """Conductivity on the mesh of the model before refinement, one value for each cell."""
+        # Conductivity is lost across a path, not along it: the geometric mean of both directions is used.
         lost = self._spot_log(unknowns) if len(unknowns) == 5 else 0.5 * np.log(self._across(unknowns)[0])
         return self.whole * np.exp(np.bincount(self.parent, lost, len(self.whole)) / self.parts)

@@ -1,10 +1,9 @@
-"""Events of a skin: what has changed, and what lasts.
+"""Events in the state of a skin, and detection of lasting steps in its frames.
 
-Detect a lasting step in frames with touches, noise and drift, by comparing the medians of two windows.
-
-A touch is shorter than half a window, so that it hardly affects the median of the window; drift within a window is as
-large as between two; what is left is a step. The change between windows of healthy frames, channel by channel, is the
-scale of steps.
+A lasting step is detected in frames with touches, noise and drift by comparing the medians of two windows. A touch is
+shorter than half a window, so that it hardly affects the window's median. Drift within a window is as large as drift
+between two windows, whereas a step occurs at one time. Steps are measured relative to the change between windows of
+healthy frames, channel by channel.
 """
 
 from __future__ import annotations
@@ -19,48 +18,50 @@ from scipy.special import ndtr
 
 
 class EventKind(StrEnum):
-    """The kind of an event. Each is equal to its word."""
+    """Kind of an event. Each member equals its string value."""
 
     CUT = "cut"
     """Conductivity is permanently lost along a path."""
     DEAD = "dead electrode"
-    """An electrode's channels have changed by far more than its contact ever did."""
+    """The channels of an electrode have changed by far more than its contact explains."""
     TORN = "torn wire"
-    """An electrode's channels read next to nothing, or one constant; a dead electrode may look the same."""
+    """The channels of an electrode read almost nothing, or all the same constant; a dead electrode may look the
+    same."""
     LOOSE = "loose electrode"
-    """An electrode's contact is worse, and fluctuates."""
+    """The contact of an electrode has become worse, and fluctuates."""
     NOISY = "noisy channel"
-    """A single channel has several times its noise, or jumps."""
+    """A single channel has several times its usual noise, or jumps."""
     STUCK = "stuck channel"
     """A single channel no longer changes, while others do."""
     CHANGED = "changed"
-    """The skin has changed; frames alone do not determine how, or no model explains it."""
+    """The skin has changed, but frames alone do not determine how, or no model explains the change."""
     REPAIRED = "repaired"
     """A change has disappeared, or the user has reported a repair."""
 
 
 class EventStatus(StrEnum):
-    """How certain an event is. Each is equal to its word."""
+    """How certain an event is. Each member equals its string value."""
 
     HELD = "held, or a void"
-    """It looks like a touch that is held: only time or the user can distinguish the two."""
+    """The change looks like a touch that is held: only time or the user can distinguish the two."""
     LASTING = "lasting"
-    """It has lasted longer than every touch, or is unlike any."""
+    """The change has lasted longer than any touch, or is unlike any touch."""
     CONFIRMED = "confirmed"
     DENIED = "denied"
     MENDED = "mended"
-    """It has disappeared: mended, or a press that was held longer than any was assumed to be."""
+    """The change has disappeared: it was mended, or was a press held for an unusually long time."""
 
 
 class HealthEvent(eqx.Module):
     """An event in the state of a skin.
 
-    **Fields**: `number`, in the order of detection; `kind`; `status`; `time`, when it began, and `noticed`, when it was
-    detected, both seconds (frames, where there are no times); `frame`, the number of the frame at which it began;
-    `channels` (M,) that changed; `change` (M,), by how much, volts; `strength`: the ratio to the greatest change among
-    healthy frames; `electrode`, its number from 0, or None; `path` (k, 2) of a cut, metres, or None, its `length`,
-    metres, and the standard `deviation` of the length, estimated from the voltages; `through`, whether all of the
-    skin's depth is cut, or None; `reason`, a sentence.
+    **Fields**: `number`: position in order of detection; `kind`; `status`; `time`: when it began; `noticed`: when it
+    was detected, both in seconds (in frames if there are no times); `frame`: number of the frame at which it began;
+    `channels` (M,): whether each channel changed; `change` (M,): change of each channel, volts; `strength`: size of the
+    change divided by the limit learnt from healthy frames; `electrode`: number of the electrode, from 0, or None;
+    `path` (k, 2): path of a cut, metres, or None; `deviation`: standard deviation of the path's `length`, metres,
+    estimated from the voltages; `through`: whether the whole depth of the skin is cut, or None; `reason`: explanation,
+    a sentence.
     """
 
     number: int
@@ -80,24 +81,26 @@ class HealthEvent(eqx.Module):
 
     @property
     def length(self) -> float:
-        """Length of the path, metres; 0 where there is none."""
+        """Length of the path, metres; 0 without a path."""
         return 0.0 if self.path is None else float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
 
     @property
     def open(self) -> bool:
-        """Whether the event still applies: neither denied nor mended, and no repair."""
+        """Whether the event still applies: it is neither denied nor mended, and is not a repair."""
         gone = self.status in (EventStatus.DENIED, EventStatus.MENDED)
         return not gone and self.kind != EventKind.REPAIRED
 
 
-# The least share of a step between the quarters of a window right before and after it; a slope has a quarter.
+# Minimum fraction of a step that occurs between the quarters of a window directly before and after it; for a constant
+# slope, the fraction is a quarter.
 _SHARP = 0.55
-# The share of a step that all thirds of the window after it exceed, and that the window before it does not.
+# Fraction of a step that the medians of all thirds of the frames after it must exceed; fraction that no third of the
+# frames before it may exceed.
 _STAYED, _NOT_YET = 0.5, 0.5
-# A frame below this share of the step is as before it; the share of frames that may be so, by touches of the opposite
-# sign.
+# Fraction of the step below which a frame counts as before the step; maximum fraction of frames on the wrong side of
+# the step, because of touches of the opposite sign.
 _BACK, _SOME = 0.3, 0.1
-# Exponent of the mean, so high that a change of a single channel among many is detected.
+# Exponent of the power mean over channels, large enough to detect a change of a single channel among many.
 _POWER = 4
 
 
@@ -105,8 +108,8 @@ _POWER = 4
 class Step:
     """A step between two windows.
 
-    **Fields**: `change` (M,) from window to window; `size`, in the scale of healthy windows; `first`: the index of its
-    first time step in both windows.
+    **Fields**: `change` (M,): change of each channel, volts; `size`: size of the change relative to healthy windows;
+    `first`: index, within both windows, of the first frame after the step.
     """
 
     change: Float[np.ndarray, " M"]
@@ -115,13 +118,13 @@ class Step:
 
 
 def window_change(frames: Float[np.ndarray, "2w M"]) -> Float[np.ndarray, " M"]:
-    """Change from the median of the first half of frames to that of the second, 0 where a half has no reading."""
+    """Change from the median of the first half of frames to that of the second; NaN if a half has no reading."""
     half = len(frames) // 2
     return median(frames[half:]) - median(frames[:half])
 
 
 def median(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
-    """Median of every channel over its readings; NaN where there are none."""
+    """Median of every channel over its readings; NaN for channels without readings."""
     if not np.isnan(frames).any():
         return np.median(frames, axis=0)
     some = ~np.isnan(frames).all(axis=0)
@@ -131,7 +134,7 @@ def median(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
 
 
 def size_of(scaled: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
-    """Size of changes in the scale of healthy ones; channels without a reading are left out."""
+    """Size of changes (..., M) divided by their healthy scale: a power mean over the channels that have readings."""
     powers = np.minimum(np.abs(scaled), 1e9) ** _POWER
     there = np.isfinite(powers)
     mean = np.sum(np.where(there, powers, 0.0), axis=-1) / np.maximum(there.sum(axis=-1), 1)
@@ -139,9 +142,10 @@ def size_of(scaled: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
 
 
 def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M"], limit: float) -> Step | None:
-    """Find the step between two windows of frames (2w, M).
+    """Find a lasting step between two windows of frames (2w, M).
 
-    Returns None unless it is above the `limit`, is sharp, and lasts for all of the second window.
+    `scale` (M,): healthy change of each channel. Returns None unless the step is larger than the `limit`, is sharp, and
+    lasts for all of the second window.
     """
     change = window_change(frames)
     size = float(size_of(change / scale))
@@ -151,9 +155,9 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     half = len(frames) // 2
     before = np.where(np.isfinite(change), median(frames[:half]), 0.0)
     readings = np.where(np.isfinite(frames), frames, before)
-    # 0 before the step, 1 after it.
+    # Component of the frames along the step: 0 before the step, 1 after it.
     along = (readings - before) @ direction / max(np.nan_to_num(change) @ direction, 1e-300)
-    first = _split(np.clip(along, -1.0, 2.0), half)
+    first = _best_split(np.clip(along, -1.0, 2.0), half)
     quarter = max(2, half // 4)
     if first < half // 2 or first + quarter > len(along):
         return None
@@ -162,12 +166,12 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     earlier = [np.median(part) for part in np.array_split(along[:first], 3)]
     if sharp < _SHARP or min(thirds) < _STAYED or max(earlier) > _NOT_YET or not is_distinct(along, first):
         return None
-    # The step need not be where the windows meet.
+    # The step may not be where the windows meet.
     return Step(median(frames[first:]) - median(frames[:first]), size, first)
 
 
 def is_distinct(along: Float[np.ndarray, " n"], first: int) -> bool:
-    """Whether frames are 0 before the `first` and 1 from it on, but for noise and a few.
+    """Whether frames are 0 before index `first` and 1 from it on, apart from noise and a few exceptions.
 
     Between two touches, in contrast, frames return to 0.
     """
@@ -177,8 +181,8 @@ def is_distinct(along: Float[np.ndarray, " n"], first: int) -> bool:
     return bool(np.mean(along[first:] < _BACK) <= most and early <= most)
 
 
-def _split(along: np.ndarray, half: int) -> int:
-    """Find the index at which splitting into two constants fits best."""
+def _best_split(along: np.ndarray, half: int) -> int:
+    """Find the index at which splitting the frames into two constant parts fits best."""
     number = len(along)
     total, sums = along.sum(), np.cumsum(along)[:-1]
     count = np.arange(1, number)

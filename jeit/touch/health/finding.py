@@ -1,4 +1,4 @@
-"""Find what has changed in a skin: faults of electrodes, cuts, or a touch that is held."""
+"""Classify a lasting change of a skin: failing electrodes, a cut, or a touch that is held."""
 
 from __future__ import annotations
 
@@ -12,30 +12,31 @@ from jeit.touch.health.event import EventKind
 from jeit.touch.health.healthy import Healthy
 from jeit.touch.health.imaged_skin import ImagedSkin
 
-# The greatest share of a change's energy, relative to the reference, that the electrodes leave unexplained; the least
-# share of an electrode's channels that have changed, and by what share of their reading; the greatest share of
+# Failing electrodes: maximum fraction of a change's energy that they may leave unexplained; minimum fraction of an
+# electrode's channels that have changed; minimum change of such a channel, divided by its reading; maximum fraction of
 # electrodes that may fail at once.
 _LEFT, _OWN, _RELATIVE, _AT_ONCE = 0.1, 0.75, 0.12, 0.25
-# A torn wire reads less than this share of its reference; a loose contact has at least so many times the noise.
+# Maximum ratio of a reading to its reference for a torn wire; minimum ratio of the noise to its healthy value for a
+# loose contact.
 _NOTHING, _WANDERS = 0.2, 5.0
-# Standard deviation of a normal variable over the median magnitude of the difference of two.
+# Ratio of the standard deviation of a normal variable to the median magnitude of the difference of two.
 _DEVIATION = 1.0484
-# Relative changes are clipped at this multiple of the reading.
+# Maximum of a change divided by the reading; larger ones are clipped.
 _MOST = 10.0
 
 
 def faulty_electrodes(
     change: Float[np.ndarray, " M"], reference: Float[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
 ) -> list[int]:
-    """Find the electrodes that account for a change from the reference, volts, by themselves.
+    """Find the electrodes whose failure alone explains a change from the reference, volts.
 
-    Returns their numbers; none if a change of the skin is needed too. `touching` (L, M): the channels that each
-    electrode takes part in.
+    Returns the numbers of these electrodes, or an empty list if the skin must have changed too. `touching` (L, M):
+    whether each channel uses each electrode.
     """
     size = np.sqrt(np.mean(reference[np.isfinite(reference)] ** 2))
     relative = np.abs(np.nan_to_num(change)) / np.maximum(np.abs(reference), 0.1 * size)
     relative = np.minimum(relative, _MOST)
-    # A channel with a weak reading does not count as a larger change.
+    # The change of a channel with a weak reading is compared with the mean reading, not with its own.
     energy = np.minimum(np.abs(np.nan_to_num(change)) / size, relative) ** 2
     total, left, found = energy.sum(), np.ones(len(energy), bool), []
     while total > 0 and energy[left].sum() > _LEFT * total and len(found) < max(1, _AT_ONCE * len(touching)):
@@ -62,7 +63,7 @@ def kind_of_fault(
     constant = len(middle) > 1 and np.ptp(middle) <= 0.02 * np.abs(middle).max() and np.ptp(reference[own]) > 0.1 * size
     if constant or np.median(np.abs(middle)) < _NOTHING * np.median(np.abs(reference[own])):
         return EventKind.TORN
-    # Differences from frame to frame, so that touches do not count.
+    # Touches hardly affect differences from frame to frame.
     steps = np.diff(now, axis=0)
     some = np.isfinite(steps).any(axis=0)
     wander = np.zeros(len(middle))
@@ -74,7 +75,8 @@ def kind_of_fault(
     return EventKind.DEAD
 
 
-# The greatest share of a change in an electrode's channels that a cut beside it leaves; a contact leaves more.
+# Maximum fraction of the energy of a change in an electrode's channels that a cut beside the electrode leaves
+# unexplained; for a failing contact, the fraction is larger.
 _CUT_BESIDE = 0.1
 
 
@@ -82,8 +84,8 @@ _CUT_BESIDE = 0.1
 class Change:
     """A lasting change.
 
-    `vector` (M,), volts; its `size` in the scale of healthy changes; `time` and `frame` at which it began; `noticed`,
-    the time at which it was detected.
+    **Fields**: `vector` (M,): change of each channel, volts; `size`: size relative to healthy changes; `time`, `frame`:
+    time and frame at which it began; `noticed`: time at which it was detected.
     """
 
     vector: Float[np.ndarray, " M"]
@@ -95,10 +97,11 @@ class Change:
 
 @dataclass(frozen=True)
 class Finding:
-    """The classification of a lasting change.
+    """Classification of a lasting change.
 
-    **Fields**: `kind`; `reason`; whether it is `sure`, or a press may do the same; `electrode`; `loss`, of a cut; `own`
-    (M,), the channels that it affects, all if None.
+    **Fields**: `kind`: kind of event; `reason`: explanation; `sure`: False if a press may cause the same change;
+    `electrode`: number of the failing electrode, or None; `loss`: fitted cut, or None; `own` (M,): channels that are
+    affected, None for all.
     """
 
     kind: EventKind
@@ -117,7 +120,7 @@ def findings(
     touching: Bool[np.ndarray, "L M"] | None,
     skin: ImagedSkin | None,
 ) -> list[Finding]:
-    """Classify a `change` (M,) from `reference` (M,), with the `frames` (n, M) that came after it."""
+    """Classify a `change` (M,) from the `reference` (M,), with the `frames` (n, M) after it."""
     used = healthy.used & np.isfinite(change)
     electrodes = [] if touching is None else faulty_electrodes(change, reference, touching & healthy.used)
     faults = []
@@ -126,8 +129,8 @@ def findings(
         kind = kind_of_fault(frames, reference, healthy.noise, own)
         reason = f"Nearly all of the change is in the {int(own.sum())} channels of electrode {one}."
         faults.append(Finding(kind, reason, True, electrode=one, own=own))
-    # Nearly all of a cut right beside an electrode is in its channels too; but it does not fluctuate, and does not
-    # increase the current at the electrode.
+    # A cut right beside an electrode also changes almost only that electrode's channels. But it does not fluctuate, and
+    # does not increase the current at the electrode.
     if faults and (skin is None or any(one.kind != EventKind.DEAD for one in faults)):
         return faults
     loss = None if skin is None else skin.loss(change, used, healthy.scale)
@@ -148,5 +151,5 @@ def findings(
 
 
 def _opposite(skin: ImagedSkin | None) -> bool:
-    """Whether a loss of conductivity has the sign opposite to that of a touch."""
+    """Whether a loss of conductivity is opposite to the change that a touch makes."""
     return skin is not None and skin.sign > 0

@@ -1,4 +1,4 @@
-"""Learn the healthy state of a skin from a recording of it: on frames alone, or with a calibrated model."""
+"""Learn the healthy state of a skin from a recording of it, with or without a calibrated model."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from jeit.data.description import Description
 from jeit.touch.gestures.touch_images import TouchImages
 from jeit.touch.health import SkinHealth
 
-# The least share of a frame's channels that have a reading; the number of healthy frames below which little is known of
-# drift; and the ratio between readings of two recordings that suggests another unit.
+# Minimum fraction of a frame's channels that have a reading; number of healthy frames below which drift is poorly
+# known; ratio between the readings of two recordings that suggests different units.
 _READ, _FEW, _ANOTHER = 0.5, 250, 20.0
 
 
@@ -29,10 +29,11 @@ def learn_health(
 ) -> SkinHealth:
     """Learn the healthy state of a skin to be monitored, from a recording of frames while it is healthy.
 
-    Frames are at the recording's times, or at `rate` frames/s; without either, frames are counted. A `description` with
-    a protocol lets failing electrodes be identified; with geometry and electrodes too, a model is calibrated on the
-    median of the frames, so that cuts are located on it: `sign` as in `SkinHealth.fit`, -1 for skins that conduct worse
-    where touched. `patience`, seconds. Raises `ValueError` as `SkinHealth.fit` and `TouchImages.prepare` do.
+    Frames have the recording's times, or come at `rate`, frames/s; otherwise, times are numbers of frames. If the
+    `description` has a protocol, failing electrodes are identified. If it also has geometry and electrodes, a model is
+    calibrated on the untouched frames, with which cuts are located. `sign`: as in `SkinHealth.fit`, -1 for skins that
+    conduct worse where touched; `patience`: time, in seconds, that no touch is held for. Raises `ValueError` as
+    `SkinHealth.fit` and `TouchImages.prepare` do.
     """
     check_kind("healthy", healthy, FrameRecording, "a FrameRecording, as of read_frame_recording(path)")
     frames, seconds = healthy.frames, seconds_of(healthy, rate)
@@ -51,16 +52,16 @@ def learn_health(
 
 
 def seconds_of(recording: FrameRecording, rate: float | None) -> Float[np.ndarray, " F"] | None:
-    """Times of frames: those of the recording, or at `rate` frames/s; None where neither is known."""
+    """Times of frames, seconds: those of the recording, or computed from `rate`, frames/s; None if neither is known."""
     if recording.seconds is None:
         return None if rate is None else np.arange(len(recording.frames)) / rate
     return recording.seconds
 
 
 def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndarray, "F M"]) -> list[str]:
-    """List the reasons to doubt the events that a `health`, learnt from `healthy`, detects in frames (F, M).
+    """List reasons to doubt the events that `health`, learnt from `healthy`, detects in frames (F, M).
 
-    Returns a sentence for each. Raises `ValueError` for frames of which none has enough readings.
+    Returns a sentence for each reason. Raises `ValueError` if no frame has a reading in half of the healthy channels.
     """
     known = health.healthy
     there = np.isfinite(frames)

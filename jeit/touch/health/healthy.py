@@ -1,10 +1,10 @@
-"""The healthy skin: directions of its touches, usual changes, and channels that are unsteady.
+"""The healthy state of a skin: directions of its touches, usual changes, and steadiness of its channels.
 
-Detect single channels that are noisy, jump, or are stuck, from their changes from step to step.
-
-Two measures of every channel in a window: the mean of the smaller half of its steps' magnitudes, which touches hardly
-affect, and the mean of all, which responds to jumps. Each is compared with that of healthy windows, in two consecutive
-windows, and with the other channels now: where many do it at once, it is a touch, not they.
+Single channels that are noisy, jump, or are stuck are detected from their changes from step to step. Two measures are
+computed for every channel in a window: the mean of the smaller half of the magnitudes of these changes, which touches
+hardly affect, and the mean of all of them, which responds to jumps. Both are compared with those of healthy windows, in
+two consecutive windows, and with those of the other channels. If many channels exceed their limits at once, the cause
+is a touch, not the channels.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from jaxtyping import Bool, Float
 
 from jeit.touch.health.event import lasting_step, median, size_of, window_change
 
-# The share of a window's steps, the smallest, that measure noise; the least share that has a reading.
+# Fraction of a window's changes, the smallest ones, that measure noise; minimum fraction of changes with a reading.
 _SMALL, _READ = 0.5, 0.5
-# The least limit, as a multiple of the usual; the multiple of the greatest among healthy windows; and how much this
-# grows where windows are few.
+# Minimum limit, as a multiple of the usual value; limit as a multiple of the maximum among healthy windows; increase of
+# the latter multiple, to be divided by the number of windows.
 _LEAST, _BEYOND_UNSTEADY, _FEW_UNSTEADY = 3.0, 2.0, 12.0
-# The least share of steps in which a healthy channel changes, for a channel without changes to count as stuck.
+# Minimum fraction of steps in which a healthy channel changes; otherwise, it never counts as stuck.
 _MOVES = 0.6
-# The greatest share of channels that may be unsteady at once.
+# Maximum fraction of channels that may be unsteady at once.
 _AT_ONCE = 0.1
 
 
 @dataclass(frozen=True)
 class Steadiness:
-    """The usual step-to-step variation of channels, and its limits.
+    """Usual variation of channels from step to step, and its limits.
 
-    **Fields**: `usual` (2, M), of the two measures, volts; `limits` (2,), as multiples of the usual; `still` (M,),
-    whether a channel that does not change at all is stuck.
+    **Fields**: `usual` (2, M): usual values of the two measures, volts; `limits` (2,): limits of the measures, as
+    multiples of the usual values; `still` (M,): whether a channel that does not change at all is stuck.
     """
 
     usual: Float[np.ndarray, "2 M"]
@@ -41,7 +41,10 @@ class Steadiness:
 
     @classmethod
     def learn(cls, steps: Float[np.ndarray, "n M"], window: int, noise: Float[np.ndarray, " M"]) -> "Steadiness":
-        """Learn from healthy steps and the length of a window; `noise` (M,), volts, infinite where nothing is read."""
+        """Learn from healthy steps (n, M) and the length of a window.
+
+        `noise` (M,): noise of the channels, volts; infinite for channels without readings.
+        """
         starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
         found = np.array([_measures(steps[start : start + window]) for start in starts])  # (n, 2, M)
         half, ratios = len(found) // 2, [np.zeros((1, *found.shape[1:]))]
@@ -50,28 +53,31 @@ class Steadiness:
                 ratios.append(_above_others(np.nan_to_num(other / _usual(learnt, noise))))
         most = np.concatenate(ratios).max(axis=(0, 2))
         limits = np.maximum(_LEAST, (_BEYOND_UNSTEADY + _FEW_UNSTEADY / max(len(found), 1)) * most)
-        # A coarse converter may read the same throughout a window.
+        # With a coarse analogue-to-digital converter, a channel may read the same value throughout a window.
         moves = np.diff(steps, axis=0)
         still = np.isfinite(noise) & (np.sum(np.abs(moves) > 0, axis=0) > _MOVES * np.isfinite(moves).sum(axis=0))
         return cls(_usual(found, noise), limits, still)
 
     def noisy(self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
-        """Which channels (M,) are noisy, or jump, in both of two windows, far more than any other."""
+        """Whether each channel (M,) is noisy, or jumps, in both of two windows, far more than nearly all others."""
         half, found = len(steps) // 2, []
         for part in (steps[:half], steps[half:]):
             over = np.where(trusted, np.nan_to_num(_measures(part) / self.usual), 0.0)
             found.append((_above_others(over) > self.limits[:, None]).any(axis=0))
-        return self._few(found, trusted)
+        return self._unless_many(found, trusted)
 
     def stuck(self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
-        """Which channels (M,) do not change at all in both of two windows, while others do."""
+        """Whether each channel (M,) does not change at all in both of two windows, while others do."""
         half = len(steps) // 2
-        return self._few([(_measures(part)[1] == 0) & self.still for part in (steps[:half], steps[half:])], trusted)
+        return self._unless_many(
+            [(_measures(part)[1] == 0) & self.still for part in (steps[:half], steps[half:])], trusted
+        )
 
     @staticmethod
-    def _few(each: list[np.ndarray], trusted: np.ndarray) -> Bool[np.ndarray, " M"]:
+    def _unless_many(each: list[np.ndarray], trusted: np.ndarray) -> Bool[np.ndarray, " M"]:
         found = each[0] & each[1] & trusted
-        # A channel that has just begun is detected in the next window; but if too many do so at once, none is.
+        # A channel that was steady in the first window is detected later; if too many channels are unsteady at once,
+        # none is.
         at_once = max(1, _AT_ONCE * trusted.sum())
         return (
             found if 0 < found.sum() <= at_once and (each[1] & trusted).sum() <= 2 * at_once else np.zeros_like(found)
@@ -79,7 +85,7 @@ class Steadiness:
 
 
 def _above_others(over: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "... M"]:
-    """Ratios to the usual, divided by the highest ratio of the other channels, except a few, where that is above 1."""
+    """Divide ratios to the usual values by the highest ratio among all channels but a few, if it is above 1."""
     few = max(1, int(_AT_ONCE * over.shape[-1]))
     if few >= over.shape[-1]:
         return over
@@ -87,7 +93,7 @@ def _above_others(over: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "... M"
 
 
 def _measures(steps: Float[np.ndarray, "w M"]) -> Float[np.ndarray, "2 M"]:
-    """The two measures of a window; NaN where there are too few readings."""
+    """Compute the two measures of a window; NaN for channels with too few readings."""
     sizes = np.sort(np.abs(np.diff(steps, axis=0)), axis=0)  # NaN last
     there = np.isfinite(sizes).sum(axis=0)
     sizes, sums = np.nan_to_num(sizes), np.cumsum(np.nan_to_num(sizes), axis=0)
@@ -98,55 +104,59 @@ def _measures(steps: Float[np.ndarray, "w M"]) -> Float[np.ndarray, "2 M"]:
 
 
 def _usual(found: Float[np.ndarray, "n 2 M"], noise: Float[np.ndarray, " M"]) -> Float[np.ndarray, "2 M"]:
-    """Mean of the measures over healthy windows, and at least a tenth of the noise, which a coarse converter hides."""
+    """Mean of the measures over healthy windows, but at least a tenth of the noise, since a coarse converter hides
+    noise."""
     usual = np.nan_to_num(found).mean(axis=0)
     return np.where(np.isfinite(noise), np.maximum(usual, 0.1 * np.where(np.isfinite(noise), noise, 1.0)), np.inf)
 
 
-# The greatest number of steps of a window (with more frames, several are averaged to a step), and the least; and the
-# number of windows that a healthy recording has at least.
+# Maximum number of steps of a window (with more frames, several are averaged to a step); minimum number; minimum number
+# of windows of a healthy recording.
 _MOST, _FEWEST, _WINDOWS = 48, 5, 8
-# Least and greatest length of windows, in frames, of a healthy recording without a quiet interval.
+# Minimum and maximum length of windows, in frames, for a healthy recording without a quiet interval.
 _LEAST_ALWAYS, _MOST_ALWAYS = 12, 64
-# Length of a window, as a multiple of the longest touch, where no time is given; and its least share of the frames.
+# If no time is given: length of a window as a multiple of the longest touch; its minimum as a fraction of the
+# recording.
 _LONGEST, _LEAST_SHARE = 3.0, 1 / 40
-# Limit of a change, as a multiple of the greatest among healthy windows; its least value, in deviations of healthy
-# ones; and how much the multiple grows where windows are few.
+# Limit of a change: multiple of the maximum among healthy windows; minimum, in standard deviations of healthy changes;
+# increase of the multiple, to be divided by the number of windows.
 _BEYOND, _LEAST_SIZE, _FEW = 2.0, 4.0, 20.0
-# If windows are shorter by this factor than touches require, touches appear to last: limits are raised by the second
-# factor.
+# Factor by which windows may be shorter than touches require; if they are even shorter, touches appear to last, and
+# limits are multiplied by the second factor.
 _SHORT, _DOUBT = 1.5, 2.0
-# The share of a step that has to be left for it to count as lasting.
+# Minimum fraction of a step that is left a window later if the step lasts.
 _STILL = 0.4
-# The multiple for a change of level, from the healthy recording to another.
+# Limit of a change of level from the healthy recording to another one, as a multiple of the maximum among its windows.
 _BEYOND_LEVEL = 3.0
-# A touch exceeds the variation of quiet frames by this factor; the share of frames that are taken as quiet.
+# Minimum ratio of the change in a touched frame to that in quiet frames; quantile of the changes of all frames that is
+# used as the change in quiet frames.
 _STANDS_OUT, _QUIET = 3.0, 0.3
-# The greatest number of directions of touches, and the share of their energy that the directions explain.
+# Maximum number of directions of touches; fraction of the touches' energy that the directions explain.
 _DIRECTIONS, _EXPLAINED = 40, 0.98
-# Quantile of healthy touches that defines what is unlike them; the least energy of the touches counted, as a share of
-# that of a strong one.
+# Quantile, among healthy touches, of the energy outside of these directions, above which a change is unlike touches;
+# minimum energy of these touches, relative to that of a strong touch.
 _UNLIKE, _STRONG = 0.99, 0.2
 _LEAST_FRAMES = 20
-# The share of steps from frame to frame, the smallest, that touches do not affect; the mean magnitude of the same share
-# of a normal variable.
+# Fraction of the changes from frame to frame, the smallest ones, that touches do not affect; mean magnitude of the same
+# fraction of a standard normal variable.
 _QUIETER, _OF_NORMAL = 0.8, 0.5586
-# Standard deviation of a normal variable over its mean magnitude.
+# Ratio of the standard deviation of a normal variable to its mean magnitude.
 _MEAN = float(np.sqrt(np.pi / 2))
 
 
 @dataclass(frozen=True)
 class Healthy:
-    """The healthy state of a skin with M channels, and its variation.
+    """Healthy state of a skin with M channels, and its variation.
 
-    **Fields**: `reference` (M,), untouched, volts; `used` (M,): channels that have readings; `noise` (M,), volts, from
-    frame to frame; `span` (2, M): least and greatest change in the recording; `stride`: frames averaged to a step;
-    `window`: steps of a window; `scale` (M,), volts: the change between consecutive windows; `limit`: of `size_of` for
-    a step that stays, and `sudden`: for one that may be a touch; `level` (M,), volts: the change between any two
-    windows, and its `level_limit`; `touches` (M, k): directions of touches, orthonormal in units of noise; `unlike`:
-    the share of a change outside of these directions that no touch exceeds; `steadiness` of single channels; `period`,
-    seconds a frame, or 1; `brief`: whether the recording was too short for its touches, so that limits are twice as
-    high.
+    **Fields**: `reference` (M,): voltages of the untouched skin, volts; `used` (M,): whether channels have readings;
+    `noise` (M,): noise from frame to frame, volts; `span` (2, M): minimum and maximum change in the recording, volts;
+    `stride`: number of frames averaged to a step; `window`: number of steps of a window; `scale` (M,): change between
+    consecutive windows, volts; `limit`: limit of `size_of` for a step that lasts; `sudden`: its limit for a step that
+    may be a touch; `level` (M,): change between any two windows, volts; `level_limit`: limit of `size_of` for a change
+    of level; `touches` (M, k): directions of touches, orthonormal in units of noise; `unlike`: fraction of a change's
+    energy outside of these directions that touches do not exceed; `steadiness`: steadiness of single channels;
+    `period`: seconds between frames, or 1; `brief`: whether the recording was too short for its touches, so that limits
+    are twice as high.
     """
 
     reference: Float[np.ndarray, " M"]
@@ -170,8 +180,9 @@ class Healthy:
     def learn(cls, frames: Float[np.ndarray, "F M"], period: float = 1.0, longest: float | None = None) -> "Healthy":
         """Learn from healthy frames (F, M), with or without touches, `period` seconds apart.
 
-        `longest`: the length of windows in seconds, which every touch is shorter than; estimated from the touches in
-        the frames unless given. Raises `ValueError` for fewer than 20 frames, and where no channel reads anything.
+        `longest`: length of a window, seconds, which must exceed that of every touch; by default estimated from the
+        touches in the frames. Raises `ValueError` for fewer than 20 frames, and if all channels lack readings or are
+        constant.
         """
         if len(frames) < _LEAST_FRAMES:
             raise ValueError(
@@ -223,12 +234,12 @@ class Healthy:
         )
 
     def outside(self, change: Float[np.ndarray, " M"]) -> float:
-        """Share of a change's energy, in units of noise, that is outside of the directions of touches."""
-        return float(_outside((np.nan_to_num(change) / self.noise)[None], self.touches)[0])
+        """Fraction of a change's energy, in units of noise, that is outside of the directions of touches."""
+        return float(_fraction_outside((np.nan_to_num(change) / self.noise)[None], self.touches)[0])
 
 
 def averaged(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.ndarray, "n M"]:
-    """Means of every `stride` frames, over the channels that have readings."""
+    """Average every `stride` frames, for each channel over its readings."""
     if stride == 1:
         return frames
     groups = frames[: len(frames) // stride * stride].reshape(-1, stride, frames.shape[1])
@@ -238,7 +249,7 @@ def averaged(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.ndarray,
 
 
 def _noise(frames: np.ndarray) -> np.ndarray:
-    """Noise of every channel from frame to frame: the standard deviation estimated from the smaller steps."""
+    """Noise of every channel from frame to frame: its standard deviation, estimated from the smaller changes."""
     steps = np.diff(frames, axis=0)
     some = np.isfinite(steps).any(axis=0)
     quiet, most, whole = np.zeros((3, frames.shape[1]))
@@ -246,7 +257,7 @@ def _noise(frames: np.ndarray) -> np.ndarray:
     there = np.isfinite(sizes).sum(axis=0)
     quiet[some] = 1.4826 * np.nanmedian(sizes, axis=0) / np.sqrt(2)
     whole[some] = np.nanstd(steps[:, some], axis=0) / np.sqrt(2)
-    # Coarse steps of a converter have a median of zero, or of one of them; the mean is more informative.
+    # With a coarse converter, the median change is zero or one step of the converter; the mean is more informative.
     small = np.maximum((_QUIETER * there).astype(int), 1)
     most[some] = (
         np.cumsum(np.nan_to_num(sizes), axis=0)[small - 1, np.arange(len(small))] / small / _OF_NORMAL / np.sqrt(2)
@@ -256,7 +267,7 @@ def _noise(frames: np.ndarray) -> np.ndarray:
 
 
 def _window(frames: np.ndarray, noise: np.ndarray, period: float, longest: float | None) -> tuple[int, float]:
-    """Number of frames of a window, and the number that it would have if the recording were long enough."""
+    """Number of frames of a window, and the number that a sufficiently long recording would allow."""
     most = max(_FEWEST, len(frames) // _WINDOWS)
     if longest is not None:
         return int(np.clip(np.ceil(longest / period), _FEWEST, most)), longest / period
@@ -273,27 +284,27 @@ def _window(frames: np.ndarray, noise: np.ndarray, period: float, longest: float
 
 
 def _floor(noise: np.ndarray, frames: int) -> np.ndarray:
-    """Least difference between the medians of two windows of `frames` frames that contain only noise."""
+    """Minimum difference between the medians of two windows of `frames` frames that contain only noise."""
     return noise * np.sqrt(np.pi / max(frames, 2))
 
 
 def _triples(steps: np.ndarray, window: int) -> np.ndarray:
-    """Triples of consecutive windows (n, 3w, M) throughout a recording."""
+    """Triples (n, 3w, M) of consecutive windows throughout a recording."""
     starts = range(0, max(1, len(steps) - 3 * window + 1), max(1, window // 4))
     return np.array([steps[start : start + 3 * window] for start in starts])
 
 
 def _levels(steps: np.ndarray, window: int) -> np.ndarray:
-    """Changes (n, M) of windows from the median of all."""
+    """Differences (n, M) of the medians of windows from the median of all steps."""
     starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
     return np.array([median(steps[start : start + window]) for start in starts]) - median(steps)
 
 
 def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Estimate the scale (M,) of changes between windows, and the limits of steps in that scale.
+    """Estimate the scale (M,) of changes between windows, and the limits of steps relative to that scale.
 
-    The first limit is for steps that are still there a window later; the second for any step, such as a touch. The
-    steps of each half of the recording are scaled by the other half, which is independent of them.
+    The first limit is for steps that are still present a window later; the second is for all steps, including touches.
+    The steps of each half of the recording are scaled by the other half, which is independent of them.
     """
     pairs = triples[:, : 2 * window]
     changes = np.nan_to_num(np.array([window_change(one) for one in pairs]))
@@ -308,7 +319,7 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
             sizes.append(step.size)
             direction = np.nan_to_num(step.change / scale**2)
             now = median(triple[2 * window :])
-            if size_of((now - rest) / scale) < _STILL * step.size:  # back from a touch
+            if size_of((now - rest) / scale) < _STILL * step.size:  # the end of a touch
                 continue
             later = np.nan_to_num(now - median(pair[:window]))
             if later @ direction > _STILL * (np.nan_to_num(step.change) @ direction):
@@ -320,7 +331,8 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
 
 
 def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, float]:
-    """Estimate the scale and the limit of changes of windows from the median of all, each half scaled by the other."""
+    """Estimate the scale (M,) and the limit of the windows' differences from the median; each half is scaled by the
+    other."""
     changes = np.nan_to_num(changes)
     half = len(changes) // 2
     sizes = [
@@ -334,13 +346,14 @@ def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, fl
 def _scale(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
     """Standard deviation of changes (n, M), estimated from their mean magnitude as for a normal variable."""
     own = _MEAN * np.mean(np.abs(changes), axis=0) if len(changes) else np.zeros(changes.shape[1])
-    # A channel that hardly changed, while others did, may have done so by chance.
+    # A channel that hardly changed while others did may have done so by chance.
     typical = np.median(own[np.isfinite(floor)] / floor[np.isfinite(floor)])
     return np.maximum(own, np.maximum(1.0, 0.5 * typical) * floor)
 
 
 def _touches(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.ndarray, float]:
-    """Directions (M, k) of healthy changes, in units of noise, and the usual share of energy outside of them."""
+    """Directions (M, k) of healthy changes, in units of noise, and 99 % quantile of the fraction of energy outside of
+    them."""
     there = np.where(np.isfinite(frames), frames, median(frames))
     centres = np.concatenate(
         [np.tile(median(part), (len(part), 1)) for part in np.array_split(there, max(1, len(there) // (2 * window)))]
@@ -353,7 +366,7 @@ def _touches(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.nda
     half, shares = len(strong) // 2, []
     for learnt, other in ((strong[:half], strong[half:]), (strong[half:], strong[:half])):
         if len(learnt) and len(other):
-            shares.append(_outside(other, _directions(learnt)))
+            shares.append(_fraction_outside(other, _directions(learnt)))
     unlike = float(np.quantile(np.concatenate(shares), _UNLIKE)) if shares else 1.0
     return _directions(strong), unlike
 
@@ -366,8 +379,8 @@ def _directions(frames: np.ndarray) -> np.ndarray:
     return rows[: min(number, max(1, frames.shape[1] // 2))].T
 
 
-def _outside(scaled: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Share of the energy of changes (n, M) that is outside of the directions."""
+def _fraction_outside(scaled: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Fraction of the energy of changes (n, M) that is outside of the directions."""
     energy = np.sum(scaled**2, axis=1)
     left = energy - np.sum((scaled @ directions) ** 2, axis=1)
     return np.clip(left / np.maximum(energy, 1e-300), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""`ImagedSkin`: a calibrated model of a skin, which images with the remaining channels and fits cuts."""
+"""`ImagedSkin`: a calibrated model of a skin that computes images from the remaining channels and fits cuts."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from jeit.mesh import centroids, measures
 from jeit.touch.health.cut_path import FittedLoss, LossFit
 from jeit_solvers.engines import as_array
 
-# Gains of channels are estimated from the reference where the model agrees with it within this factor.
+# Maximum factor between the gain of a channel and that of all channels; if it is larger, the latter is used.
 _AGREES = 3.0
-# A ratio beyond this factor is due to units or polarity, not to model error.
+# Maximum factor between readings and the model that model errors explain; a larger one is due to units or polarity.
 _OFF = 10.0
-# A starting point of the fit is the middle of the region above this share of an image's peak.
+# Fraction of an image's peak above which cells count for the starting point of the fit, their centroid.
 _ABOVE = 0.5
-# A line is a cut if its misfit is no more than the first, and no more than the second times that of a spot.
+# Thresholds for accepting a line as a cut: maximum misfit, and maximum ratio of its misfit to that of a spot.
 _EXPLAINS, _BETTER = 0.4, 0.6
-# Least distance of a second starting point from the first, as a share of the skin's side.
+# Minimum distance of a second starting point from the first, divided by the skin's side.
 _APART = 0.05
 
 
@@ -32,8 +32,9 @@ _APART = 0.05
 class ImagedSkin:
     """A calibrated model of a skin.
 
-    **Fields**: `model`; `conductivity` (m,), S/m (2-D: S), as it is now, with all cuts, and when it was `healthy`;
-    `gain` (M,), the ratio of readings to the model's volts; `noise` (M,), volts; `sign` of a touch.
+    **Fields**: `model`: forward model; `conductivity` (m,): current conductivity with all cuts, S/m (2-D: S); `healthy`
+    (m,): conductivity of the healthy skin, S/m (2-D: S); `gain` (M,): ratio of readings to the model's voltages;
+    `noise` (M,): noise of readings, volts; `sign`: 1 if touched skin conducts better, -1 if it conducts worse.
     """
 
     model: ForwardModel
@@ -47,8 +48,10 @@ class ImagedSkin:
     def create(
         cls, model: ForwardModel, conductivity: ArrayLike, reference: np.ndarray, noise: np.ndarray, sign: int
     ) -> "ImagedSkin":
-        """Calibrate a model on a `reference`. Raises `ValueError` for a conductivity that is none, a reference of
-        another skin, and a sign that is none."""
+        """Calibrate a model on the `reference` (M,), volts, of a healthy skin.
+
+        Raises `ValueError` for an invalid conductivity, a reference of another skin, and a sign other than 1 and -1.
+        """
         if sign not in (1, -1):
             raise ValueError(f"sign must be 1, where touched skin conducts better, or -1, where worse; it is {sign!r}.")
         values = np.asarray(check_conductivity(model.mesh, conductivity))
@@ -72,14 +75,15 @@ class ImagedSkin:
         return cls(model, values, values, gain, noise, int(sign))
 
     def linear(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
-        """One-step reconstruction from the model's volts of the `usable` channels (M,), about the skin as it is now."""
+        """One-step reconstruction from the model's voltages of the `usable` channels (M,), about the current
+        conductivity."""
         noise = np.where(np.isfinite(self.noise), self.noise / np.abs(self.gain), 1.0)
         return one_step(self.model, self.conductivity, noise=as_array(noise), mask=as_array(usable))
 
     def images(self, changes: Float[np.ndarray, "F M"], usable: Bool[np.ndarray, " M"]) -> Float[np.ndarray, "F m"]:
-        """Reconstruct changes of conductivity (F, m), S/m (2-D: S), from changes (F, M), volts.
+        """Reconstruct changes of conductivity (F, m), S/m (2-D: S), from changes of voltage (F, M), volts.
 
-        Changes are NaN where there is no reading; a frame without any gives NaN.
+        Channels without a reading are NaN; a frame without any reading gives NaN.
         """
         there = np.isfinite(changes) & usable
         volts = np.where(there, changes / self.gain, 0.0)
@@ -94,9 +98,9 @@ class ImagedSkin:
     def loss(
         self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"], noise: Float[np.ndarray, " M"]
     ) -> FittedLoss | None:
-        """Fit a cut to a change (M,), volts; None if no cut explains it, or a press explains it as well.
+        """Fit a cut to a change (M,), volts; returns None if no cut explains it, or a press explains it as well.
 
-        `noise` (M,) of the change, volts.
+        `usable` (M,): channels to use; `noise` (M,): noise of the change, volts.
         """
         there = usable & np.isfinite(change)
         volts = np.where(there, change / self.gain, 0.0)

@@ -28,35 +28,35 @@ from jeit.touch.health.finding import Change, Finding, findings
 from jeit.touch.health.healthy import Healthy, averaged
 from jeit.touch.health.imaged_skin import ImagedSkin
 
-# Seconds that no touch is held for; the number of windows, where frames have no times.
+# Time that no touch is held for: seconds; number of windows if frames have no times.
 PATIENCE, _PATIENCE_WINDOWS = 30.0, 3
-# The patience, as a multiple of the length of a window.
+# Ratio of the patience to the length of a window.
 _WINDOW = 3.0
-# The weight with which the reference follows the window, a quarter of a window later.
+# Weight of the latest window when the reference is updated, every quarter of a window.
 _FOLLOWS = 0.1
-# A change has disappeared when this share of it has; a frame is refused if more than this share of channels has no
-# reading.
+# Fraction of a change that must have disappeared for it to count as gone; minimum fraction of channels with a reading,
+# otherwise a frame is refused.
 _GONE, _REFUSED = 0.6, 0.5
-# A channel beyond this multiple of the span of healthy changes does not measure the skin; the greatest share of
-# channels that may do so at once.
+# Multiple of the span of healthy changes beyond which a channel does not measure the skin; maximum fraction of channels
+# that may be beyond it at once.
 _SPANS, _FEW = 3.0, 0.34
 
 _OF_CHANNELS = (EventKind.NOISY, EventKind.STUCK)
 
 
 class WatchStatus(StrEnum):
-    """How a frame was processed. Each is equal to its word."""
+    """How a frame was processed. Each member equals its string value."""
 
     WATCHED = "watched"
     PARTIAL = "partial"
-    """Processed; some of its channels are not trusted."""
+    """Processed, but some of its channels are not trusted."""
     REFUSED = "refused"
-    """Not processed: too few readings, or its time is not after the last."""
+    """Not processed: it has too few readings, or its time is not after that of the last frame."""
 
 
 @dataclass(frozen=True)
 class _Pending:
-    """A change that looks like a touch, until it has lasted."""
+    """A change that looks like a touch, which is pending until it disappears or has lasted."""
 
     change: Change
     finding: Finding
@@ -64,19 +64,21 @@ class _Pending:
 
 @dataclass(frozen=True)
 class SkinHealth:
-    """A monitored skin. `health.follow(time, frame)` returns its state after the next frame; this one is not changed.
+    """State of a monitored skin.
 
-    Every quarter of a window, the medians of two windows are compared: a step between them, larger than any among the
-    healthy frames, sharp and lasting, is a change of the skin. A change unlike any healthy touch is reported at once; a
-    change that touches make too may be a press that is held, and is reported when it has lasted for `patience` seconds.
+    `health.follow(time, frame)` returns the state after the next frame; this one is not changed. Every quarter of a
+    window, the medians of two windows are compared. A step between them is a change of the skin if it is larger than
+    any step in the healthy frames, sharp, and lasting. A change unlike any healthy touch is reported at once. A change
+    that touches can make too may be a press that is held, and is reported when it has lasted for `patience` seconds.
     The reference follows drift.
 
-    **Fields**: `healthy`, the learnt healthy state; `reference` (M,), the skin as it is now, untouched, volts;
-    `trusted` (M,), channels that may be used; `events` so far; `patience`, seconds; `skin`, its model, or None;
-    `touching` (L, M), the channels of every electrode, or None; `time` of the last frame; `frames`, how many were
-    given; `status` of the last frame, its `usable` channels (M,), and the `reason` in a sentence.
+    **Fields**: `healthy`: healthy state; `reference` (M,): voltages of the skin as it is now, untouched, volts;
+    `trusted` (M,): whether channels may be used; `patience`: time that no touch is held for, seconds; `skin`: model of
+    the skin, or None; `touching` (L, M): whether each channel uses each electrode, or None; `events`: events so far;
+    `time`: time of the last frame; `frames`: number of frames given; `status`: status of the last frame; `usable` (M,):
+    whether its channels are usable; `reason`: reason for the status, a sentence.
 
-    Make it with `SkinHealth.fit`.
+    Create it with `SkinHealth.fit`.
     """
 
     healthy: Healthy
@@ -109,14 +111,14 @@ class SkinHealth:
         conductivity: ArrayLike | None = None,
         sign: int = 1,
     ) -> "SkinHealth":
-        """Learn from a recording of the healthy skin, (F, M) volts or differences of volts, preferably with touches in
-        it.
+        """Learn the healthy state from a recording (F, M), volts or differences of volts, preferably with touches.
 
-        `times` (F,), seconds; without them, frames are counted. `patience`: seconds (frames) that no touch is held for;
-        30 s, or three windows, unless given. `protocol`: what the channels are, so that electrodes are identified.
-        `model` of the skin, its `conductivity` S/m (2-D: S), and the `sign` of a touch, -1 where touched skin conducts
-        worse: cuts are then located on it. Raises `ValueError` for frames that are no recording of this skin, fewer
-        than 20, times that do not rise, and a patience that is none.
+        `times` (F,): seconds; without them, frames are counted. `patience`: time that no touch is held for, seconds
+        (frames), by default 30 s, or three windows. `protocol`: protocol of the channels, with which failing electrodes
+        are identified. `model`, `conductivity`, `sign`: forward model of the skin, its conductivity, S/m (2-D: S), and
+        1 if touched skin conducts better, -1 if it conducts worse; with these, cuts are located. Raises `ValueError`
+        for frames that are no recording of this skin, fewer than 20 frames, times that do not rise, and a patience that
+        is not positive.
         """
         frames = _frames("healthy", healthy)
         period = 1.0
@@ -152,8 +154,8 @@ class SkinHealth:
     def follow(self, time: float, frame: ArrayLike) -> "SkinHealth":
         """Return the state after a frame (M,) at `time`, seconds. NaN marks a channel without a reading.
 
-        A frame that is not later than the last, or of which fewer than half of the channels have a reading, is refused,
-        as `status` and `reason` state. Raises `ValueError` for what is no time, and for another number of channels.
+        A frame is refused if it is not later than the last one, or if fewer than half of its channels have a reading;
+        then `status` and `reason` say so. Raises `ValueError` for an invalid time, and for another number of channels.
         """
         if not is_number(time):
             raise ValueError(f"time must be seconds; it is {describe(time)}.")
@@ -168,38 +170,37 @@ class SkinHealth:
         elif there.sum() < _REFUSED * self.healthy.used.sum():
             reason = f"Only {int(there.sum())} of {int(self.healthy.used.sum())} channels have a reading."
         else:
-            return self._watched(float(time), values, there)
+            return self._process(float(time), values, there)
         none = np.zeros_like(there)
         return replace(self, frames=self.frames + 1, status=WatchStatus.REFUSED, reason=reason, usable=none)
 
     def confirm(self, event: HealthEvent) -> "SkinHealth":
-        """Return the state after the user has confirmed an event, also one that is only `held`.
+        """Return the state after the user has confirmed an event, which may be the one in `held`.
 
         Raises `ValueError` for an event of another skin.
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
-            return replace(self, _pending=None)._with(
+            return replace(self, _pending=None)._add_events(
                 self._pending.change, [self._pending.finding], EventStatus.CONFIRMED
             )
         return self._with_status(event, EventStatus.CONFIRMED)
 
     def deny(self, event: HealthEvent) -> "SkinHealth":
-        """Return the state after the user has denied an event: it is no damage, but a press that is held.
+        """Return the state after the user has denied an event, which was a press that is held, not damage.
 
-        The reference is again what it was before. Raises `ValueError` for an event of another skin.
+        The reference is reset to what it was before the event. Raises `ValueError` for an event of another skin.
         """
         if self._pending is not None and self.held is not None and event.number == self.held.number:
             return replace(self, _pending=None)
         denied = self._with_status(event, EventStatus.DENIED)
         back = np.where(np.isfinite(event.change), self.reference - event.change, self.reference)
-        return replace(denied, reference=back, trusted=denied._trusted_channels(), skin=denied._skin_left())
+        return replace(denied, reference=back, trusted=denied._trusted_channels(), skin=denied._current_skin())
 
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
-        """Return the state after the user has repaired the skin, with frames (n, M) of it, untouched, as the new
-        reference.
+        """Return the state after the user has repaired the skin; all open events become mended.
 
-        All open events become mended. Raises `ValueError` for frames that are no reference: of other channels, or
-        without a reading in half of them.
+        The median of the frames (n, M), volts, of the repaired, untouched skin is the new reference. Raises
+        `ValueError` for frames with another number of channels, or without a reading in half of them.
         """
         read = _frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
         if read.shape[1] != self.reference.size:
@@ -208,7 +209,7 @@ class SkinHealth:
         there = np.isfinite(fresh) & self.healthy.used
         if there.sum() < _REFUSED * self.healthy.used.sum():
             raise ValueError("frames: fewer than half of the channels have a reading; that is no reference.")
-        mended = tuple(_changed(one, EventStatus.MENDED) if one.open else one for one in self.events)
+        mended = tuple(_with_new_status(one, EventStatus.MENDED) if one.open else one for one in self.events)
         change = np.where(there, fresh - self.reference, 0.0)
         strength = float(size_of(change / self.healthy.scale)) / self.healthy.limit
         event = HealthEvent(
@@ -237,8 +238,8 @@ class SkinHealth:
     def images(self, frames: ArrayLike) -> Float[np.ndarray, "F m"]:
         """Reconstruct changes of conductivity (F, m), S/m (2-D: S), from the skin as it is now, with all cuts.
 
-        Only the remaining channels are used; a frame without a reading gives NaN. Raises `ValueError` without a model,
-        and for other channels.
+        Only trusted channels are used; a frame without a reading gives NaN. Raises `ValueError` without a model, and
+        for another number of channels.
         """
         if self.skin is None:
             raise ValueError("images need a model: give it to SkinHealth.fit, with its conductivity.")
@@ -249,8 +250,8 @@ class SkinHealth:
 
     @property
     def held(self) -> HealthEvent | None:
-        """The event that looks like a touch that is held, or a void, until time or the user decides; None if there is
-        none."""
+        """Pending event that may be a touch that is held, or damage, until time or the user decides; None without
+        one."""
         if self._pending is None:
             return None
         return self._event(self._pending.change, self._pending.finding, EventStatus.HELD, len(self.events))
@@ -260,12 +261,12 @@ class SkinHealth:
         """The events that still apply."""
         return [one for one in self.events if one.open]
 
-    def _watched(self, time: float, values: np.ndarray, there: np.ndarray) -> "SkinHealth":
+    def _process(self, time: float, values: np.ndarray, there: np.ndarray) -> "SkinHealth":
         healthy = self.healthy
         low, high = healthy.span + self.reference
         far = _SPANS * (high - low) + healthy.limit * np.where(healthy.used, healthy.noise, 0.0)
         strange = there & ((values < low - far) | (values > high + far))
-        # Where many channels are beyond, the skin has changed, not they.
+        # If many channels are beyond their span, the skin has changed; the channels are not faulty.
         strange &= strange.sum() <= _FEW * healthy.used.sum()
         usable = there & self.trusted & ~strange
         lost = int((healthy.used & ~usable).sum())
@@ -282,35 +283,35 @@ class SkinHealth:
         first = self.frames + 1 - healthy.stride
         window = (*self._window, (time, first, step))[-2 * healthy.window :]
         after = replace(after, _part=(), _window=window, _steps=self._steps + 1)
-        return after._examined() if after._steps % max(1, healthy.window // 4) == 0 else after
+        return after._compare_windows() if after._steps % max(1, healthy.window // 4) == 0 else after
 
-    def _examined(self) -> "SkinHealth":
-        """Return the state after comparing the windows."""
+    def _compare_windows(self) -> "SkinHealth":
+        """Return the state after comparing the two windows."""
         healthy, number = self.healthy, len(self._window)
         if number < healthy.window:
             return self
         frames = np.array([one for _, _, one in self._window])
         latest = median(frames[-healthy.window :])
         if not self._settled:
-            return self._begun(latest)
-        after = self._waited(latest)
+            return self._start(latest)
+        after = self._update_pending(latest)
         if number == 2 * healthy.window:
-            # Channels that are not trusted belong to known events.
+            # Changes in channels that are not trusted belong to known events.
             step = lasting_step(frames, np.where(after.trusted, healthy.scale, np.inf), healthy.limit)
             if step is not None:
-                return after._stepped(step, frames)
-            after = after._steadied(frames)
+                return after._process_step(step, frames)
+            after = after._check_channels(frames)
         off = np.where(self.trusted & np.isfinite(latest), latest - self.reference, 0.0)
         if after._pending is None and size_of(off / healthy.scale) < healthy.limit:
             followed = self.reference + _FOLLOWS * (latest - self.reference)
             after = replace(after, reference=np.where(np.isfinite(latest), followed, self.reference))
         return after
 
-    def _begun(self, latest: np.ndarray) -> "SkinHealth":
+    def _start(self, latest: np.ndarray) -> "SkinHealth":
         """Return the state after the first window, which is compared with the healthy frames."""
         healthy = self.healthy
         change = np.where(np.isfinite(latest), latest - healthy.reference, 0.0)
-        # Uniform drift of conductivity scales every channel alike.
+        # A uniform drift of conductivity, which scales all channels alike, is removed if it is small.
         whole = np.where(healthy.used, healthy.reference / healthy.level, 0.0)
         scaled = np.where(healthy.used, change / healthy.level, 0.0)
         if whole @ whole > 0 and abs(scaled @ whole) < 0.1 * (whole @ whole):
@@ -325,10 +326,10 @@ class SkinHealth:
         change = Change(change, size / healthy.level_limit * healthy.limit, time, frame, self.time)
         frames = np.array([one for _, _, one in self._window])
         found = findings(change.vector, frames, healthy.reference, healthy, self.touching, self.skin)
-        return replace(begun, reference=healthy.reference)._with(change, found, EventStatus.LASTING)
+        return replace(begun, reference=healthy.reference)._add_events(change, found, EventStatus.LASTING)
 
-    def _waited(self, latest: np.ndarray) -> "SkinHealth":
-        """Return the state after checking whether a held change has disappeared, or has lasted."""
+    def _update_pending(self, latest: np.ndarray) -> "SkinHealth":
+        """Return the state after checking whether the pending change has disappeared or has lasted."""
         pending = self._pending
         if pending is None:
             return self
@@ -341,31 +342,31 @@ class SkinHealth:
             return self
         lasted = replace(pending.change, vector=np.where(self.trusted, left, 0.0), noticed=self.time)
         reason = f"{pending.finding.reason} It has lasted for {self.time - pending.change.time:.3g} s or frames."
-        return replace(self, _pending=None)._with(
+        return replace(self, _pending=None)._add_events(
             lasted, [replace(pending.finding, reason=reason)], EventStatus.LASTING
         )
 
-    def _stepped(self, step: Step, frames: np.ndarray) -> "SkinHealth":
+    def _process_step(self, step: Step, frames: np.ndarray) -> "SkinHealth":
         """Return the state after a lasting step."""
         time, frame, _ = self._window[step.first]
         change = Change(step.change, step.size, time, frame, self.time)
         fresh = replace(self, _window=self._window[step.first :])
         off = np.where(np.isfinite(step.change), median(frames[step.first :]) - self.reference, 0.0)
         scale = np.where(self.trusted, self.healthy.scale, np.inf)
-        if size_of(off / scale) <= self.healthy.limit:  # as it was before a touch
+        if size_of(off / scale) <= self.healthy.limit:  # the skin is as it was before a touch
             return fresh
-        undone = fresh._undone(change)
+        undone = fresh._undo(change)
         if undone is not None:
             return undone
         after = frames[step.first :]
         found = findings(step.change, after, self.reference, self.healthy, self.touching, self.skin)
         if found[0].electrode is not None or (found[0].sure and change.size > self.healthy.sudden):
-            return fresh._with(change, found, EventStatus.LASTING)
-        if self._pending is not None:  # only one change is pending at a time: that which began first
+            return fresh._add_events(change, found, EventStatus.LASTING)
+        if self._pending is not None:  # only one change is pending at a time: the first
             return fresh
         return replace(fresh, _pending=_Pending(change, found[0]))
 
-    def _steadied(self, frames: np.ndarray) -> "SkinHealth":
+    def _check_channels(self, frames: np.ndarray) -> "SkinHealth":
         """Return the state after checking for single channels that are noisy or stuck."""
         after, steadiness, asked = self, self.healthy.steadiness, self.trusted.copy()
         for one in self.events:
@@ -386,8 +387,8 @@ class SkinHealth:
                 after = replace(after, events=(*after.events, event))
         return after if after is self else replace(after, trusted=after._trusted_channels())
 
-    def _undone(self, change: Change) -> "SkinHealth | None":
-        """Return the state after a step that reverses an earlier change."""
+    def _undo(self, change: Change) -> "SkinHealth | None":
+        """Return the state after a step that reverses an earlier change; None if it reverses none."""
         for one in self.open_events:
             there = np.isfinite(one.change) & np.isfinite(change.vector) & self.trusted
             before = (one.change[there] / self.healthy.scale[there]).clip(-1e9, 1e9)
@@ -395,7 +396,7 @@ class SkinHealth:
             share = -(now @ before) / max(before @ before, 1e-300)
             if share > _GONE and np.linalg.norm(now + before) < 0.6 * np.linalg.norm(before):
                 events = tuple(
-                    _changed(other, EventStatus.MENDED) if other.number == one.number else other
+                    _with_new_status(other, EventStatus.MENDED) if other.number == one.number else other
                     for other in self.events
                 )
                 reason = f"Event {one.number} is gone: it was mended, or a press that has been lifted."
@@ -403,13 +404,13 @@ class SkinHealth:
                 event = self._event(change, finding, EventStatus.LASTING, len(events))
                 after = replace(self, events=(*events, event))
                 fresh = np.where(np.isfinite(change.vector), self.reference + change.vector, self.reference)
-                return replace(after, reference=fresh, trusted=after._trusted_channels(), skin=after._skin_left())
+                return replace(after, reference=fresh, trusted=after._trusted_channels(), skin=after._current_skin())
         return None
 
-    def _with(self, change: Change, found: list[Finding], status: EventStatus) -> "SkinHealth":
-        """Return the state with events added; the reference contains their change from now on."""
+    def _add_events(self, change: Change, found: list[Finding], status: EventStatus) -> "SkinHealth":
+        """Return the state with events added; from now on, the reference contains their change."""
         events = [self._event(change, one, status, len(self.events) + number) for number, one in enumerate(found)]
-        # Failing electrodes carry no information about the skin, which may be touched.
+        # If electrodes fail, the reference changes only in their channels: the skin may be touched at the time.
         own = np.logical_or.reduce([np.ones_like(self.trusted) if one.own is None else one.own for one in found])
         fresh = np.where(own & np.isfinite(change.vector), self.reference + change.vector, self.reference)
         skin = self.skin
@@ -440,20 +441,20 @@ class SkinHealth:
         )
 
     def _with_status(self, event: HealthEvent, status: EventStatus) -> "SkinHealth":
-        """Return the state with another status of an event. Raises `ValueError` for one that is not of this skin."""
+        """Return the state with another status of an event. Raises `ValueError` for an event of another skin."""
         check_kind("event", event, HealthEvent, "one of health.events, or health.held")
         if not event.number < len(self.events):
             raise ValueError(f"event {event.number} is none of this skin's, which has {len(self.events)}.")
-        events = [_changed(one, status) if one.number == event.number else one for one in self.events]
+        events = [_with_new_status(one, status) if one.number == event.number else one for one in self.events]
         return replace(self, events=tuple(events))
 
-    def _skin_left(self) -> ImagedSkin | None:
-        """The model of the healthy skin, once no cut is left."""
+    def _current_skin(self) -> ImagedSkin | None:
+        """Return the model, without cuts if no open event is a cut."""
         cut = any(one.path is not None for one in self.open_events)
         return self.skin if self.skin is None or cut else self.skin.healed()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
-        """Channels (M,) that no open event of an electrode, or of a channel, excludes."""
+        """Whether each channel (M,) is trusted: it has readings, and no open event excludes it or its electrodes."""
         trusted = self.healthy.used.copy()
         for one in self.open_events:
             if one.electrode is not None and self.touching is not None:
@@ -464,9 +465,10 @@ class SkinHealth:
 
 
 def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None) -> SkinHealth:
-    """Process a recording (F, M), the same as following it frame by frame; `times` (F,), seconds, or frames counted on.
+    """Process a recording (F, M), volts, frame by frame, and return the state after it.
 
-    Returns the state after it. Raises `ValueError` as `SkinHealth.follow` does, and for another number of times.
+    `times` (F,): seconds; by default, frames are counted. Raises `ValueError` as `SkinHealth.follow` does, and for a
+    different number of times.
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(healthy)")
     read = real_array("frames", frames, "(F, M) volts")
@@ -482,7 +484,7 @@ def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None)
     return health
 
 
-def _changed(event: HealthEvent, status: EventStatus) -> HealthEvent:
+def _with_new_status(event: HealthEvent, status: EventStatus) -> HealthEvent:
     return eqx.tree_at(lambda one: one.status, event, status)
 
 

@@ -1,6 +1,6 @@
-"""Kohonen's self-organising map, learnt from a skin's frames without a model, and places of touches from it.
+"""Kohonen's self-organising map: learnt from a skin's frames without a physical model, it estimates places of touches.
 
-`jeit.touch.learnt` uses it as a method, "som", of `jeit touch fit`.
+`jeit.touch.learnt` offers it as the method "som" of `jeit touch fit`.
 """
 
 from __future__ import annotations

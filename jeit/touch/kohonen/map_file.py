@@ -1,4 +1,4 @@
-"""Read and write maps as files that hold only arrays."""
+"""Read and write self-organising maps as files that contain only arrays."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ _OF_PLACES = "places", "widening", "missed", "fitted"
 
 
 def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
-    """Write a map, or one with places, to an NPZ file: `weights` and `scale`, and its places. Raises
-    `ValueError` for what is no map, and for a folder."""
+    """Write a map to an NPZ file: its `weights` and `scale`, and the places of a `PlacedMap`.
+
+    Raises `ValueError` if `learnt` is no map, or `path` is a folder.
+    """
     check_kind("learnt", learnt, (SelfOrganisingMap, PlacedMap), "a map, as of SelfOrganisingMap.fit, or a PlacedMap")
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / 'map.npz'}.")
@@ -29,7 +31,8 @@ def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
 
 
 def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
-    """Read the map of a file that `write_map` made. Raises `FileNotFoundError`, and `ValueError` for another file."""
+    """Read a map from a file that `write_map` wrote. Raises `FileNotFoundError`, and `ValueError` for any other
+    file."""
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give an NPZ file.")
     if not Path(path).is_file():

@@ -1,4 +1,4 @@
-"""A map whose neurons have places or other values, drawn on a skin."""
+"""A self-organising map whose neurons have places on a skin, or other values; a map's drawing as a graph."""
 
 from __future__ import annotations
 
@@ -17,25 +17,27 @@ from jeit.arguments import check_key, check_kind, real_array
 from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
-# The number of neurons that a place is estimated from: those nearest to the frame, or 5 by 5 on the grid about the
-# nearest; and the regularisation of their shares, relative to the mean square of their differences.
+# Number of neurons from which a place is estimated, and regularisation of their shares, relative to the mean square of
+# the differences of their frames: for the neurons nearest to the frame, then for 5 by 5 neurons on the grid around the
+# nearest.
 _NEAREST, _HELD = 9, 0.05
 _ON_GRID, _HELD_ON_GRID = 25, 0.005
-# The number of presses that count as much for a neuron's place as the mean of all that it won.
+# Weight of the mean place of a neuron's presses in the fit of its place, relative to that of one press.
 _DOUBT = 0.3
 _FEWEST = 10
-# The number of frames that are located at once.
+# Number of frames that are located at once.
 _AT_ONCE = 512
 
 
 @dataclass(frozen=True)
 class PlacedMap:
-    """A `learnt` map whose neurons have `places` (R, C, d), metres; make it with `PlacedMap.learn`.
+    """A self-organising map whose neurons have places, created by `PlacedMap.learn`.
 
-    A place is the mean of the presses that a neuron won, NaN for those that won none. `widening`: the root mean square
-    error of held-out presses, over the estimated spread. `missed`: the root mean square of what the neurons nearest to
-    a press leave of a channel, in the unit of frames. `fitted` (R, C, d), metres: places that fit presses best, where
-    neighbours on the grid locate a frame; None: it is located by the neurons nearest to it, and their places.
+    `learnt`: the map. `places` (R, C, d), metres: mean place of the presses that each neuron won, NaN if it won none.
+    `widening`: root mean square error of held-out presses, divided by the estimated spread. `missed`: root mean square
+    residual of a channel if presses are approximated by the neurons nearest to them, in the unit of frames. `fitted`
+    (R, C, d), metres: places that fit the presses best, if neighbours on the grid locate a frame; None if the neurons
+    nearest to the frame locate it, by `places`.
     """
 
     learnt: SelfOrganisingMap
@@ -46,13 +48,12 @@ class PlacedMap:
 
     @classmethod
     def learn(cls, learnt: SelfOrganisingMap, frames: ArrayLike, positions: ArrayLike) -> "PlacedMap":
-        """Learn places of the neurons of a `learnt` map from presses: frames (N, M) and their `positions` (N, d),
-        metres.
+        """Learn places of a map's neurons from presses: frames (N, M) and their `positions` (N, d), metres.
 
-        The frames are those that the map was learnt from, or others. With few presses the neurons nearest to a frame
-        locate it better; with many, neighbours on the grid, with places fitted by least squares. The choice is what has
-        less error on held-out presses. Raises `ValueError` for what is no map, fewer than ten presses, and positions
-        that are not finite, one for each frame, or all the same.
+        The frames may be those that the map was learnt from, or others. With few presses, a frame is located best by
+        the neurons nearest to it; with many, by neighbours on the grid, whose places are fitted by least squares. The
+        choice is the one with less error on held-out presses. Raises `ValueError` if `learnt` is no map, for fewer than
+        ten presses, and for positions that are not finite, not one for each frame, or all the same.
         """
         check_kind("learnt", learnt, SelfOrganisingMap, "a map, as of SelfOrganisingMap.fit")
         frames = learnt.checked(frames)
@@ -71,7 +72,7 @@ class PlacedMap:
             off = spread = missed = 0.0
             for out in (odd, ~odd):
                 part = cls._of(learnt, frames[~out], positions[~out], winners[~out], fit)
-                placed = part._located(frames[out])
+                placed = part._estimate(frames[out])
                 off += float(np.sum((placed.places - positions[out]) ** 2))
                 spread += float(np.sum(placed.spread**2))
                 missed += float(np.sum(placed.left**2))
@@ -82,7 +83,10 @@ class PlacedMap:
 
     @classmethod
     def _of(cls, learnt, frames, positions, winners, fit: bool) -> "PlacedMap":
-        """The map with places from these presses, with these winners (N,); without an estimate of deviations yet."""
+        """Create a map with places from presses and their winners (N,).
+
+        Its standard deviations are not yet calibrated.
+        """
         number = learnt.shape[0] * learnt.shape[1]
         count = np.bincount(winners, minlength=number)[:, None]
         sums = np.stack([np.bincount(winners, one, minlength=number) for one in positions.T], axis=1)
@@ -101,35 +105,39 @@ class PlacedMap:
 
     @property
     def placed(self) -> Bool[np.ndarray, "R C"]:
-        """Neurons that have a place."""
+        """Whether each neuron has a place (R, C)."""
         return np.isfinite(self.places[..., 0])
 
     def locate(self, frames: ArrayLike) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-        """Estimate the places (n, d) of frames (n, M), or one (M,), and their standard deviations (n, d), metres.
+        """Estimate the places (n, d) of frames (n, M), or one frame (M,), and their standard deviations (n, d), metres.
 
-        The neurons nearest to a frame, or those about the nearest on the grid (`fitted`), are combined with shares of
-        sum 1 so that their frames are nearest to it; the place is the combination of their places with the same shares
-        (a map that is linear between neurons; the shares are those of Roweis and Saul 2000), at most as far from the
-        middle of these, or on the grid from the nearest, as any of them. Raises `ValueError` for frames of another
-        number of channels, and NaN.
+        Neurons are combined with shares of sum 1 such that the combination of their frames is nearest to the given
+        frame. These are the neurons nearest to it, or, if there are `fitted` places, those around the nearest neuron on
+        the grid. The place is the combination of their places with the same shares (a map that is linear between
+        neurons; the shares are those of Roweis and Saul 2000). It is at most as far from the mean of their places, or
+        on the grid from the place of the nearest neuron, as the farthest of these places. Raises `ValueError` for
+        frames with another number of channels, and NaN.
         """
-        placed = self._located(self.learnt.checked(frames))
+        placed = self._estimate(self.learnt.checked(frames))
         return placed.places, self.widening * placed.spread
 
-    def _located(self, frames: Float[np.ndarray, "n M"]) -> "_Located":
+    def _estimate(self, frames: Float[np.ndarray, "n M"]) -> "_Estimate":
         near, shares, left = self._shares(frames)
-        there = self._known.places[near]
+        there = self._placed_neurons.places[near]
         own = there.mean(axis=1) if self.fitted is None else there[:, 0]
         offset = np.einsum("nq,nqd->nd", shares, there) - own
         most = np.linalg.norm(there - own[:, None], axis=2).max(axis=1)
         length = np.linalg.norm(offset, axis=1)
         said = own + offset * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
-        return _Located(said, np.sqrt(np.mean((there - said[:, None]) ** 2, axis=1)), left)
+        return _Estimate(said, np.sqrt(np.mean((there - said[:, None]) ** 2, axis=1)), left)
 
     def _shares(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Numbers (n, q), among the neurons with places, of those that locate frames, their shares (n, q), and what
-        they leave (n, M)."""
-        known = self._known
+        """Find the neurons that locate frames.
+
+        Returns their indices (n, q) among the neurons with places, their shares (n, q), and the residuals of the frames
+        (n, M).
+        """
+        known = self._placed_neurons
         if self.fitted is None:
             near, held = known.neurons.nearest(frames, min(_NEAREST, len(known.places)))[0], _HELD
         else:
@@ -137,48 +145,54 @@ class PlacedMap:
         shares, left = np.empty(near.shape), np.empty(frames.shape)
         for first in range(0, len(frames), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
-            shares[some], left[some] = _combined(known.neurons.weights[0][near[some]], frames[some], held)
+            shares[some], left[some] = _combination_shares(known.neurons.weights[0][near[some]], frames[some], held)
         return near, shares, left
 
     def predict(self, features: ArrayLike) -> Float[np.ndarray, "n d"]:
-        """Places (n, d) alone, as of `locate`, in the interface of scikit-learn's estimators."""
+        """Predict only the places (n, d) of `locate`, in the interface of scikit-learn's estimators."""
         return self.locate(features)[0]
 
     @cached_property
-    def _known(self) -> "_Known":
+    def _placed_neurons(self) -> "_PlacedNeurons":
         neurons = SelfOrganisingMap(self.learnt.weights[self.placed][None], self.learnt.scale)
         places, grid = (self.places if self.fitted is None else self.fitted)[self.placed], np.argwhere(self.placed)
-        # Sorted by the longer way along the grid: the first is the neuron itself.
+        # Sorted by the larger of the distances in rows and columns: the first is the neuron itself.
         around = KDTree(grid).query(grid, min(_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
-        return _Known(neurons, places, around)
+        return _PlacedNeurons(neurons, places, around)
 
 
-class _Known(NamedTuple):
-    """The neurons that have a place, in one row; the places that estimates use; the numbers of those about each on the
-    grid."""
+class _PlacedNeurons(NamedTuple):
+    """The neurons that have a place, as a map of one row.
+
+    `places` (k, d): the places that estimates use; `around` (k, q): indices of the neurons around each on the grid.
+    """
 
     neurons: SelfOrganisingMap
     places: Float[np.ndarray, "k d"]
     around: Int[np.ndarray, "k q"]
 
 
-class _Located(NamedTuple):
-    """Estimated places (n, d), the spread of the neurons' places about them (n, d), and the residual of frames (n,
-    M)."""
+class _Estimate(NamedTuple):
+    """Estimated places (n, d), metres.
+
+    `spread` (n, d): standard deviations of the neurons' places around them; `left` (n, M): residuals of the frames.
+    """
 
     places: Float[np.ndarray, "n d"]
     spread: Float[np.ndarray, "n d"]
     left: Float[np.ndarray, "n M"]
 
 
-def _combined(own: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], held: float):
-    """Shares (n, q), of sum 1, with which the neurons' frames are nearest to the given ones, and the residual (n,
-    M)."""
+def _combination_shares(own: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], held: float):
+    """Compute shares (n, q) of sum 1 whose combinations of the neurons' frames are nearest to the given frames.
+
+    Also returns the residuals (n, M).
+    """
     count = own.shape[1]
     middle = own.mean(axis=1, keepdims=True)
     apart = own - middle
     gram = apart @ np.swapaxes(apart, 1, 2)
-    diagonal = np.einsum("nqq->nq", gram)  # a view
+    diagonal = np.einsum("nqq->nq", gram)  # a view of `gram`
     diagonal += held * diagonal.mean(axis=1, keepdims=True) + 1e-300
     change = frames - middle[:, 0]
     found = np.linalg.solve(gram, apart @ change[..., None])
@@ -186,16 +200,16 @@ def _combined(own: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"],
     return found[..., 0] + (1 - found.sum(axis=1)) / count, left
 
 
-# Steps of the springs, and the distance of neighbours, relative to the usual one, below which springs grow no stronger.
+# Number of iterations; minimum distance of neighbours' frames, relative to the median, for the strength of a spring.
 _STEPS, _LEAST = 60, 1e-2
 
 
 def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2"]:
-    """Places (R, C, 2) of a map's neurons on paper, from -1 to 1, by Fruchterman and Reingold's springs (1991).
+    """Draw a map as a graph: places (R, C, 2) of its neurons, from -1 to 1, by springs (Fruchterman and Reingold 1991).
 
-    Each neuron is tied to its four neighbours on the grid, the stronger the nearer its frame is to theirs; all repel
-    each other. They start from their places on the grid, moved a little at random by `key`: which way round the drawing
-    comes out says nothing. Raises `ValueError` for what is no map, and no key.
+    Each neuron is tied to its four neighbours on the grid, more strongly if their frames are more similar; all neurons
+    repel each other. The initial places are those on the grid, shifted slightly at random by `key`; the orientation of
+    the drawing has no meaning. Raises `ValueError` if `learnt` is no map, and for an invalid key.
     """
     networkx = optional("networkx", "a map drawn as a graph")
     import jax
@@ -219,7 +233,7 @@ def drawn_map(learnt: SelfOrganisingMap, key: Array) -> Float[np.ndarray, "R C 2
 
 
 def neighbours(shape: tuple[int, int]) -> tuple[Int[np.ndarray, " e"], Int[np.ndarray, " e"]]:
-    """Numbers of the neurons, row by row, at both ends of every edge of a grid of this shape."""
+    """Return the indices of the neurons at both ends of every edge of a grid of this shape, counted row by row."""
     number = np.arange(shape[0] * shape[1]).reshape(shape)
     first = np.concatenate([number[:-1].ravel(), number[:, :-1].ravel()])
     return first, np.concatenate([number[1:].ravel(), number[:, 1:].ravel()])

@@ -1,4 +1,4 @@
-"""The quality of a self-organising map: quantisation and topographic errors, and how they settle."""
+"""Quality of a self-organising map: quantisation and topographic errors, and how fast its weights converge."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap, checked_frames, learn_weights
 from jeit.touch.kohonen.training import Schedule
 
-# The number of frames of which all pairs are compared, and of neighbours of each.
+# Maximum number of frames of which all pairs are compared; number of neighbours of each frame.
 _COMPARED, _NEIGHBOURS = 2000, 12
 
 
@@ -22,9 +22,10 @@ _COMPARED, _NEIGHBOURS = 2000, 12
 class MapQuality:
     """Measures of how well a map preserves the order of frames.
 
-    `quantisation_error`, mean distance of frames from their winners, in their unit; `topographic_error`, share of the
-    frames whose two nearest neurons are no neighbours on the grid, of eight each (Kiviluoto 1996); `trustworthiness`, 1
-    if all that is near on the map was near among the frames (Venna and Kaski 2001).
+    `quantisation_error`: mean distance of frames from their winners, in the unit of frames; `topographic_error`: share
+    of the frames whose two nearest neurons are not neighbours on the grid, where each neuron has eight neighbours
+    (Kiviluoto 1996); `trustworthiness`: 1 if all neighbours on the map are neighbours among the frames
+    (Venna and Kaski 2001).
     """
 
     quantisation_error: float
@@ -33,10 +34,10 @@ class MapQuality:
 
 
 def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
-    """Compute the quality of a `learnt` map for frames (n, M), those it was learnt from or others.
+    """Compute the quality of a map for frames (n, M), which may be those it was learnt from or others.
 
-    Trustworthiness is computed for 2,000 of them at most, evenly chosen, with 12 neighbours of each. Raises
-    `ValueError` for what is no map, fewer than 25 frames, another number of channels, and NaN.
+    Trustworthiness is computed for at most 2,000 evenly spaced frames, with 12 neighbours of each. Raises `ValueError`
+    if `learnt` is no map, and for fewer than 25 frames, another number of channels, and NaN.
     """
     trustworthiness = optional("sklearn.manifold", "the trustworthiness of a map").trustworthiness
 
@@ -61,11 +62,11 @@ def learning_curves(
     steps: int = 10_000,
     shape: tuple[int, int] = (32, 32),
 ) -> Float[np.ndarray, "r T"]:
-    """Mean of all weights after each of `steps`, with each of the `rates` ε: (rates, steps), in the unit of frames (N,
-    M).
+    """Compute the mean of all weights after each of T `steps`, for each of the `rates` ε: (r, T), in the unit of
+    frames.
 
-    Weights are small at first; the rates are constant, as is the radius, half the map's longer side. Raises
-    `ValueError` as `SelfOrganisingMap.fit` does.
+    `frames`: (N, M). Initial weights are small. The rates are constant, and so is the radius, half the map's longer
+    side. Raises `ValueError` as `SelfOrganisingMap.fit` does.
     """
     radius = max(shape) / 2
     schedules = [Schedule(steps, 0, (float(rate), float(rate)), (radius, radius)) for rate in rates]
@@ -73,9 +74,10 @@ def learning_curves(
 
 
 def time_constant(curve: ArrayLike) -> float:
-    """Steps after which a curve (T,) has come 1 − 1/e of the way from zero to its end, the mean of its last tenth.
+    """Number of steps after which a curve (T,) has risen from zero to 1 − 1/e of its final value.
 
-    Raises `ValueError` for what is no curve of ten steps or more.
+    The final value is the mean of the last tenth. Raises `ValueError` for a curve that is not (T,), not finite, or
+    shorter than ten steps.
     """
     values = real_array("curve", curve, "the means (T,) of a map's weights")
     if values.ndim != 1 or len(values) < 10 or not np.isfinite(values).all():

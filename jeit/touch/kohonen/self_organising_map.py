@@ -1,4 +1,4 @@
-"""`SelfOrganisingMap`: neurons on a grid, each with a frame of its own, so that neighbours have similar frames."""
+"""`SelfOrganisingMap`: neurons on a grid, each with its own frame, such that neighbours have similar frames."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_key, check_kind, counted, describe, is_number, real_array
 from jeit.touch.kohonen.training import Schedule, train
 
-# Fewer frames define no order.
+# Minimum number of frames: fewer define no order.
 _FEWEST = 3
-# Weights at the start, over the frames' root mean square.
+# Standard deviation of the initial weights, relative to the frames' root mean square.
 _SMALL = 1e-3
-# A radius, grid steps, within which only the winner moves: for its neighbours exp(−1/2ρ²) underflows.
+# Radius, in grid steps, at which only the winner moves: for its neighbours, exp(−1/2ρ²) underflows.
 _ALONE = 0.01
-# The number of frames whose distances to all neurons are computed at once.
+# Number of frames whose distances to all neurons are computed at once.
 _AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
 class SelfOrganisingMap:
-    """Kohonen's map of frames of M channels; make it with `SelfOrganisingMap.fit`.
+    """Kohonen's map of frames with M channels, created by `SelfOrganisingMap.fit`.
 
-    **Fields**: `weights` (R, C, M), the frame of every neuron on a grid of R by C, in the unit of frames; `scale`, the
-    distance of a frame from a neuron at which its activity is a half, the same unit.
+    **Fields**: `weights` (R, C, M): the frame of every neuron on a grid of R rows and C columns, in the unit of frames;
+    `scale`: distance between a frame and a neuron at which the neuron's activity is 1/2, in the same unit.
     """
 
     weights: Float[np.ndarray, "R C M"]
     scale: float
 
     def __post_init__(self):
-        """Raises `ValueError` for weights that are no finite (R, C, M), and a scale that is not positive."""
+        """Raises `ValueError` for weights that are not finite or not (R, C, M), and for a scale that is not
+        positive."""
         weights = real_array("weights", self.weights, "an array (R, C, M), a frame for every neuron")
         if weights.ndim != 3 or not weights.size or not np.isfinite(weights).all():
             raise ValueError(f"weights must be finite, (R, C, M), a frame for every neuron; they are {weights.shape}.")
@@ -54,12 +55,13 @@ class SelfOrganisingMap:
         schedule: Schedule | None = None,
         scale: float | None = None,
     ) -> "SelfOrganisingMap":
-        """Learn a map of frames (N, M): volts, or changes, all of one unit.
+        """Train a map on frames (N, M): voltages or changes of voltage, all in one unit.
 
-        `key` (`jax.random.key`) orders the frames: all once, then all again in another order, until the `schedule` has
-        had as many as it shows. `shape`: rows and columns. `scale`: unless given the median distance of the frames from
-        their winners. Weights are small at the start, and random. Raises `ValueError` for frames that are not numbers,
-        NaN, fewer than three or all the same, and what is no key, shape, schedule or scale.
+        `key` (`jax.random.key`): determines the initial weights, which are small and random, and the order of the
+        frames: all are shown once, then again in another order, until the `schedule` ends. `shape`: rows and columns.
+        `scale`: by default the median distance of the frames from their winners. Raises `ValueError` for frames that
+        are not numbers, contain NaN, are fewer than three or all the same, and for an invalid key, shape, schedule or
+        scale.
         """
         schedule = Schedule() if schedule is None else schedule
         return fit_maps(frames, [key], shape=shape, schedules=[schedule], scale=scale)[0]
@@ -70,38 +72,46 @@ class SelfOrganisingMap:
         return self.weights.shape[0], self.weights.shape[1]
 
     def distances(self, frames: ArrayLike) -> Float[np.ndarray, "n R C"]:
-        """Euclidean distances of frames (n, M), or one (M,), from every neuron, in their unit. Raises `ValueError` for
-        frames of another number of channels, and NaN."""
-        return np.sqrt(self._squared(self.checked(frames))).reshape(-1, *self.shape)
+        """Compute the Euclidean distances (n, R, C) of frames (n, M), or one frame (M,), from every neuron.
+
+        Distances are in the unit of frames. Raises `ValueError` for frames with another number of channels, and NaN.
+        """
+        return np.sqrt(self._squared_distances(self.checked(frames))).reshape(-1, *self.shape)
 
     def activity(self, frames: ArrayLike) -> Float[np.ndarray, "n R C"]:
-        """Activity of neurons for frames (n, M), or one (M,): 1 / (1 + distance / scale), 1 for a neuron's own frame.
+        """Compute the activity (n, R, C) of every neuron for frames (n, M), or one frame (M,).
 
-        Raises as `distances` does.
+        The activity is 1 / (1 + distance / scale), which is 1 if the frame is the neuron's own. Raises as `distances`
+        does.
         """
         return 1 / (1 + self.distances(frames) / self.scale)
 
     def winners(self, frames: ArrayLike) -> Int[np.ndarray, "n 2"]:
-        """Row and column (n, 2) of the neuron nearest to each of frames (n, M), or one (M,). Raises as `distances`
-        does."""
-        nearest = self._squared(self.checked(frames)).argmin(axis=1)
+        """Find the row and the column (n, 2) of the neuron nearest to each of the frames (n, M), or to one frame (M,).
+
+        Raises as `distances` does.
+        """
+        nearest = self._squared_distances(self.checked(frames)).argmin(axis=1)
         return np.stack(np.unravel_index(nearest, self.shape), axis=1)
 
     def nearest(self, frames: Float[np.ndarray, "n M"], count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (n, count), row by row of the grid, of the neurons nearest to checked frames, the nearest first, and
-        their distances (n, count)."""
-        squared = self._squared(frames)
+        """Find the `count` neurons nearest to each of the frames (n, M), which must be checked, the nearest first.
+
+        Returns their indices (n, count), counted row by row of the grid, and their distances (n, count).
+        """
+        squared = self._squared_distances(frames)
         some = np.argpartition(squared, count - 1, axis=1)[:, :count]
         near = np.take_along_axis(squared, some, axis=1)
         order = np.argsort(near, axis=1)
         return np.take_along_axis(some, order, axis=1), np.sqrt(np.take_along_axis(near, order, axis=1))
 
     def checked(self, frames: ArrayLike) -> Float[np.ndarray, "n M"]:
-        """Convert frames (n, M) to numbers. Raises `ValueError` for other shapes, and NaN."""
+        """Convert frames to an array (n, M). Raises `ValueError` for other shapes, and NaN."""
         return checked_frames(frames, self.weights.shape[2])
 
-    def _squared(self, frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n k"]:
-        """Squared distances: |w − m|² − 2 (w − m)·(x − m) + |x − m|², m being the weights' mean."""
+    def _squared_distances(self, frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n k"]:
+        """Compute squared distances (n, k) as |w − m|² − 2 (w − m)·(x − m) + |x − m|², with m the mean of the
+        weights."""
         middle, weights, squares = self._about_middle
         found = np.empty((len(frames), len(weights)))
         for first in range(0, len(frames), _AT_ONCE):
@@ -128,13 +138,14 @@ def fit_maps(
     schedules: Sequence[Schedule] = (Schedule(),),
     scale: float | None = None,
 ) -> list[SelfOrganisingMap]:
-    """Learn several maps of the same frames at once: for each key with each schedule, those of the first key first.
+    """Train several maps on the same frames at once, one for each pair of a key and a schedule.
 
-    All schedules show as many frames. The other arguments, and what is raised, are as in `SelfOrganisingMap.fit`.
+    The maps of the first key come first. All schedules must show the same number of frames. The other arguments, and
+    what is raised, are as in `SelfOrganisingMap.fit`.
     """
     frames = checked_frames(frames)
     learnt, _ = learn_weights(frames, keys, shape, schedules)
-    return [_scaled(one, frames, scale) for one in learnt]
+    return [_with_scale(one, frames, scale) for one in learnt]
 
 
 def learn_weights(
@@ -143,7 +154,7 @@ def learn_weights(
     shape: tuple[int, int],
     schedules: Sequence[Schedule],
 ) -> tuple[Float[np.ndarray, "k R C M"], Float[np.ndarray, "k T"]]:
-    """Learn the weights of the maps that `fit_maps` makes, and the mean of their weights after each frame.
+    """Train the weights of the maps of `fit_maps`; also returns the mean of their weights after each frame.
 
     Raises `ValueError` as `fit_maps` does.
     """
@@ -158,19 +169,21 @@ def learn_weights(
         raise ValueError("keys and schedules: give one at least of each, and schedules that show as many frames.")
     shape = _check_shape(shape)
     pairs = [(key, schedule) for key in keys for schedule in schedules]
-    starts = np.stack([_started(frames, key, shape) for key, _ in pairs])
+    starts = np.stack([_initial_weights(frames, key, shape) for key, _ in pairs])
     orders = np.stack([_order(key, len(frames), schedule.steps) for key, schedule in pairs])
     rates = np.stack([schedule.rates() for _, schedule in pairs])
     longest = max(schedule.ordering for schedule in schedules)
-    radii = np.stack([_filled(schedule.radii(shape), longest) for _, schedule in pairs])
-    many = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(pairs) > 1 else _alone
+    radii = np.stack([_extend_radii(schedule.radii(shape), longest) for _, schedule in pairs])
+    many = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(pairs) > 1 else _train_one
     weights, curves = many(jnp.asarray(starts), jnp.asarray(frames), orders, rates, radii)
     return np.asarray(weights), np.asarray(curves)
 
 
 def checked_frames(given, channels: int | None = None) -> Float[np.ndarray, "n M"]:
-    """Convert frames (n, M), or one (M,), to numbers. Raises `ValueError` for other shapes and numbers of channels, and
-    NaN."""
+    """Convert frames (n, M), or one frame (M,), to an array (n, M).
+
+    Raises `ValueError` for other shapes, for another number of channels than `channels`, and for NaN.
+    """
     frames = real_array("frames", given, "numbers (n, channels)")
     frames = frames[None] if frames.ndim == 1 else frames
     if frames.ndim != 2 or not frames.shape[1]:
@@ -186,31 +199,34 @@ def checked_frames(given, channels: int | None = None) -> Float[np.ndarray, "n M
     return frames
 
 
-def _filled(radii: Float[np.ndarray, " O"], longest: int) -> Float[np.ndarray, " L"]:
-    """Radii of as many frames as the longest ordering phase of some schedules has: the tuning phase's are next to 0."""
+def _extend_radii(radii: Float[np.ndarray, " O"], longest: int) -> Float[np.ndarray, " L"]:
+    """Extend radii to the length of the longest ordering phase of several schedules.
+
+    The added radii, which belong to the tuning phase, are almost 0.
+    """
     return np.concatenate([radii, np.full(longest - len(radii), _ALONE)])
 
 
-def _alone(starts, frames, orders, rates, radii):
+def _train_one(starts, frames, orders, rates, radii):
     return tuple(one[None] for one in train(starts[0], frames, orders[0], rates[0], radii[0]))
 
 
-def _scaled(weights: np.ndarray, frames: np.ndarray, scale: float | None) -> SelfOrganisingMap:
+def _with_scale(weights: np.ndarray, frames: np.ndarray, scale: float | None) -> SelfOrganisingMap:
     learnt = SelfOrganisingMap(weights, 1.0 if scale is None else scale)
     if scale is not None:
         return learnt
-    usual = float(np.median(np.sqrt(learnt._squared(frames).min(axis=1))))
+    usual = float(np.median(np.sqrt(learnt._squared_distances(frames).min(axis=1))))
     return SelfOrganisingMap(weights, usual or float(np.std(frames)))
 
 
-def _started(frames: np.ndarray, key: Array, shape: tuple[int, int]) -> Float[np.ndarray, "R C M"]:
-    """Initial weights: small, and random."""
+def _initial_weights(frames: np.ndarray, key: Array, shape: tuple[int, int]) -> Float[np.ndarray, "R C M"]:
+    """Draw the initial weights, which are small and random."""
     size = _SMALL * float(np.sqrt(np.mean(frames**2)))
     return size * np.asarray(jax.random.normal(key, (*shape, frames.shape[1])))
 
 
 def _order(key: Array, number: int, steps: int) -> Int[np.ndarray, " T"]:
-    """Order of `number` frames, reordered after all were shown, for `steps` steps."""
+    """Draw the order of `number` frames for `steps` steps: a new permutation each time that all have been shown."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     rounds = [random.permutation(number) for _ in range(-(-steps // number))]
     return np.concatenate(rounds)[:steps]

@@ -11,20 +11,20 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.touch.kohonen.placed_map import PlacedMap
 
-# The least strength of a touch, relative to the strongest; the least distance between touches, relative to the extent
-# of the map's places.
+# Minimum strength of a touch, relative to the strongest; minimum distance between touches, relative to the extent of
+# the map's places.
 _LEAST, _APART = 0.08, 0.1
-# The decrease of the residual sum of squares, in variances, that one more touch requires; the greatest number of
+# Minimum decrease of the residual sum of squares for each further touch, in residual variances; maximum number of
 # touches.
 _EVIDENCE, _MOST = 25.0, 6
 
 
 @dataclass(frozen=True)
 class MapTouch:
-    """One of several touches.
+    """One of several simultaneous touches.
 
-    Its `place` (d,) and the root mean square distance `spread` of its neurons from there, metres; its `strength`, 1 for
-    a touch like those that were learnt.
+    `place` (d,), metres; `spread`: root mean square distance of its neurons from the place, metres; `strength`: 1 for a
+    touch like those in the training set.
     """
 
     place: Float[np.ndarray, " d"]
@@ -33,12 +33,12 @@ class MapTouch:
 
 
 def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "R C"]:
-    """Shares (R, C) of each neuron's touch in a frame (M,), zero or more, by non-negative least squares.
+    """Explain a frame (M,) as a sum of touches: the share of each neuron's touch (R, C), by non-negative least squares.
 
-    The neurons' changes from the `reference` (M,), the untouched skin's frame, times their shares, sum to the frame's
-    as nearly as possible; 0 for neurons without a place. Changes of small touches add up, and touches have one sign:
-    few of the non-negative shares are needed (Lawson and Hanson 1974). Raises `ValueError` for what is no map with
-    places, more than one frame, other numbers of channels, and NaN.
+    The changes of the neurons from the `reference` (M,), the frame of the untouched skin, times their shares,
+    approximate the change of the frame; neurons without a place have share 0. Changes of small touches add up, and
+    touches have one sign, so few of the non-negative shares are needed (Lawson and Hanson 1974). Raises `ValueError` if
+    `placed` is no map with places, and for more than one frame, another number of channels, and NaN.
     """
     sum_of = _Sum.of(placed, frame, reference)
     shares = np.zeros(placed.learnt.shape)
@@ -56,11 +56,12 @@ def touches_reported(
 ) -> list[MapTouch]:
     """Detect the touches in a frame (M,) of a skin whose untouched frame is `reference` (M,).
 
-    Returns six touches at most, the strongest first. Neurons with a share in the frame (`neuron_shares`) whose places
-    are less than `apart` metres from each other, one after another, may be of one touch; unless given a tenth of the
-    extent of all places. Touches are added one after another, as long as the unexplained change decreases by five
-    standard deviations of the map's own residual. Touches of less than `least` of the strongest, or of a touch that was
-    learnt, are left out. Raises `ValueError` as `neuron_shares` does, and for a share or distance that cannot be.
+    Returns at most six touches, the strongest first. Neurons with a share in the frame (`neuron_shares`) are grouped
+    into possible touches: groups are separated by more than `apart` metres, by default a tenth of the extent of all
+    places. Touches are added one after another, as long as the unexplained change decreases by five standard deviations
+    of the map's own residual. Touches are omitted if they are weaker than the fraction `least` of the strongest touch,
+    or of a touch in the training set. Raises `ValueError` as `neuron_shares` does, and for an invalid `least` or
+    `apart`.
     """
     if not (is_number(least) and 0 <= least < 1):
         raise ValueError(f"least must be a share, from 0 to below 1; it is {describe(least)}.")
@@ -74,7 +75,7 @@ def touches_reported(
     if not own:
         return []
     variance = max(left / max(len(sum_of.change) - own, 1), sum_of.variance)
-    chosen = _needed(sum_of, sum_of.groups(shares, apart), variance)
+    chosen = _select_groups(sum_of, sum_of.groups(shares, apart), variance)
     if not chosen:
         return []
     shares, _ = sum_of.shares(np.any(chosen, axis=0))
@@ -85,9 +86,10 @@ def touches_reported(
 
 @dataclass(frozen=True)
 class _Sum:
-    """Model of a frame's `change` (M,) as a sum of those of neurons, `changes` (k, M), at `places` (k, d).
+    """Model of the `change` (M,) of a frame as a sum of the `changes` (k, M) of neurons at `places` (k, d).
 
-    Changes are in a unit in which they are about 1, as is `variance`, the residual variance of a channel.
+    Changes are divided by the root mean square of the neurons' changes; `variance`: residual variance of a channel, in
+    the square of this unit.
     """
 
     change: Float[np.ndarray, " M"]
@@ -98,14 +100,14 @@ class _Sum:
     @classmethod
     def of(cls, placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_Sum":
         check_kind("placed", placed, PlacedMap, "a map with places, as of PlacedMap.learn")
-        read, rest = (_one(placed, name, given) for name, given in (("frame", frame), ("reference", reference)))
+        read, rest = (_check_frame(placed, name, given) for name, given in (("frame", frame), ("reference", reference)))
         changes = placed.learnt.weights[placed.placed] - rest
         size = float(np.sqrt(np.mean(changes**2))) or 1.0
         own = placed.places[placed.placed]
         return cls((read - rest) / size, changes / size, own, (placed.missed / size) ** 2)
 
     def shares(self, some: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
-        """Shares (k,) of some of the neurons, and the residual sum of squares."""
+        """Fit the shares (k,) of the neurons `some`; also returns the residual sum of squares."""
         from scipy.optimize import nnls
 
         found = np.zeros(len(some))
@@ -113,7 +115,10 @@ class _Sum:
         return found, float(distance) ** 2
 
     def groups(self, shares: Float[np.ndarray, " k"], apart: float) -> list[Bool[np.ndarray, " k"]]:
-        """Neurons (k,) near those of each cluster of shares, for the clusters that change the frame most."""
+        """Group the neurons with shares into clusters of nearby places.
+
+        Returns the neurons (k,) near each of the clusters that change the frame most.
+        """
         from scipy.cluster.hierarchy import fcluster, linkage
 
         own = np.flatnonzero(shares)
@@ -128,8 +133,8 @@ class _Sum:
         ]
 
 
-def _needed(sum_of: _Sum, groups: list[np.ndarray], variance: float) -> list[Bool[np.ndarray, " k"]]:
-    """Groups of neurons that are needed to explain the frame, the most informative first."""
+def _select_groups(sum_of: _Sum, groups: list[np.ndarray], variance: float) -> list[Bool[np.ndarray, " k"]]:
+    """Select the groups of neurons that are needed to explain the frame, the most informative first."""
     chosen: list[np.ndarray] = []
     left = float(sum_of.change @ sum_of.change)
     rest = list(groups)
@@ -149,7 +154,7 @@ def _touch(places: Float[np.ndarray, "k d"], shares: Float[np.ndarray, " k"]) ->
     return MapTouch(middle, float(spread), float(shares.sum()))
 
 
-def _one(placed: PlacedMap, name: str, given) -> Float[np.ndarray, " M"]:
+def _check_frame(placed: PlacedMap, name: str, given) -> Float[np.ndarray, " M"]:
     values = real_array(name, given, "one frame (M,)")
     if values.shape != placed.learnt.weights.shape[2:] or not np.isfinite(values).all():
         raise ValueError(

@@ -1,18 +1,19 @@
 """Kohonen's learning rule in two phases, compiled: a map learns the order of its inputs, then their detail.
 
-For each frame x the winner c is the neuron whose weights are nearest; every neuron n moves by
+For each frame x, the winner c is the neuron whose weights are nearest, and every neuron n moves by
 
     w_n ← w_n + ε h_cn (x − w_n),    h_cn = exp(−|r_c − r_n|² / 2ρ²)
 
-with r_n its place on the grid (Kohonen, Self-Organizing Maps, 2001, chapter 3). In the ordering phase ρ shrinks; in the
-tuning phase, where ρ is next to nothing, the winner alone moves. ε falls throughout.
+where r_n is its place on the grid (Kohonen, Self-Organizing Maps, 2001, chapter 3). In the ordering phase, the radius ρ
+decreases; in the tuning phase, ρ is almost zero, so only the winner moves. The rate ε decreases throughout.
 
-All is done about the frames' mean, whose differences are small. A weight that moves to x by the share s = ε h comes
+The mean of the frames is subtracted first, since frames differ little from it. When weights w move by the share s = ε h
+of the way to x, the squared distance of the new weights w′ from any frame y is
 
     |w′ − y|² = (1 − s) |w − y|² + s |x − y|² − s (1 − s) |w − x|²
 
-far from y, whichever that is (Stewart's theorem). So weights are multiplied with some frames at once, and moved once
-after them: in between, distances alone change, in the tuning phase those of the winner alone.
+(Stewart's theorem). So the weights are multiplied with several frames at once, and moved once after these frames; in
+between, only the distances are updated, and in the tuning phase only those of the winner.
 """
 
 from __future__ import annotations
@@ -25,18 +26,18 @@ from jaxtyping import Array, Float, Int
 
 from jeit.arguments import describe, is_number, real_array
 
-# The number of frames after which weights are moved, in either phase.
+# Number of frames after which the weights are moved, in the ordering and in the tuning phase.
 _ORDERED, _TUNED = 16, 64
-# Of neurons that exist: an index that may lie outside costs a copy of all.
+# Indices are always those of existing neurons: without this promise, JAX copies all distances.
 _THERE = "promise_in_bounds"
 
 
 class Schedule(eqx.Module):
-    """How a map learns.
+    """Schedule of a map's training.
 
-    **Fields**: `ordering` and `tuning`, frames shown in each phase; `rate`, ε at the first frame and at the last, which
-    falls exponentially between; `radius`, ρ at the first frame of the ordering phase and at its last, grid steps, the
-    same; None: half the map's longer side to 1.
+    **Fields**: `ordering` and `tuning`: number of frames shown in each phase; `rate`: the rate ε at the first and the
+    last frame, with exponential decay between them; `radius`: ρ at the first and the last frame of the ordering phase,
+    in grid steps, also with exponential decay; if None, from half the map's longer side to 1.
     """
 
     ordering: int = 20_000
@@ -45,7 +46,7 @@ class Schedule(eqx.Module):
     radius: tuple[float, float] | None = None
 
     def __check_init__(self):
-        """Raises `ValueError` for numbers of frames, rates and radii that cannot be."""
+        """Raises `ValueError` for invalid numbers of frames, rates and radii."""
         for name in ("ordering", "tuning"):
             value = getattr(self, name)
             if not (is_number(value) and int(value) == value and value >= 0):
@@ -58,15 +59,15 @@ class Schedule(eqx.Module):
 
     @property
     def steps(self) -> int:
-        """Frames shown in all."""
+        """Total number of frames shown."""
         return self.ordering + self.tuning
 
     def rates(self) -> Float[np.ndarray, " T"]:
-        """ε at every frame shown."""
+        """Compute the rate ε for every frame (T,)."""
         return np.geomspace(*self.rate, self.steps)
 
     def radii(self, shape: tuple[int, int]) -> Float[np.ndarray, " O"]:
-        """ρ at every frame of the ordering phase, shown to a map of this `shape`, grid steps."""
+        """Compute ρ for every frame of the ordering phase (O,), in grid steps, for a map of this `shape`."""
         first, last = (max(max(shape) / 2, 1.0), 1.0) if self.radius is None else self.radius
         return np.geomspace(first, last, self.ordering)
 
@@ -79,14 +80,17 @@ def train(
     rates: Float[Array, " T"],
     radii: Float[Array, " O"],
 ) -> tuple[Float[Array, "R C M"], Float[Array, " T"]]:
-    """Weights (R, C, M) after those of the frames (N, M) were shown that `order` (T,) numbers, with these rates (T,),
-    the first O in the ordering phase, with these radii (O,), grid steps, those after them in the tuning phase; and the
-    mean of all weights after each (T,). Under `jax.vmap` too, over starts, orders, rates and radii."""
+    """Train a map; return its weights (R, C, M), and the mean of all weights after each frame shown (T,).
+
+    `weights`: initial weights; `order` (T,): indices of the `frames` (N, M) in the order in which they are shown;
+    `rates` (T,): rate ε for each. The first O frames shown are the ordering phase, with `radii` (O,) in grid steps; the
+    others are the tuning phase. The function may be mapped by `jax.vmap` over weights, orders, rates and radii.
+    """
     shape, middle, ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
 
     def show_all(phase, flat, at_once, order, rates, *radii):
         more = -len(order) % at_once
-        # Frames at a rate of 0 change nothing.
+        # Frames are added to fill the last part; at a rate of 0, they change nothing.
         order_rates = [jnp.pad(one, (0, more)) for one in (order, rates)]
         filled = *order_rates, *(jnp.pad(one, (0, more), "edge") for one in radii)
 
@@ -99,16 +103,19 @@ def train(
 
     flat, curves = (weights - middle).reshape(-1, weights.shape[2]), []
     if ordering:
-        flat, curve = show_all(_ordered, flat, _ORDERED, order[:ordering], rates[:ordering], radii)
+        flat, curve = show_all(_ordering_phase, flat, _ORDERED, order[:ordering], rates[:ordering], radii)
         curves.append(curve)
     if len(order) > ordering:
-        flat, curve = show_all(_tuned, flat, _TUNED, order[ordering:], rates[ordering:])
+        flat, curve = show_all(_tuning_phase, flat, _TUNED, order[ordering:], rates[ordering:])
         curves.append(curve)
     return flat.reshape(weights.shape) + middle, jnp.concatenate(curves) + middle.mean()
 
 
-def _ordered(shape, flat, shown, rates, radii):
-    """Weights (k, M) of a map of this shape after frames (n, M), and their means after each (n,): all neurons move."""
+def _ordering_phase(shape, flat, shown, rates, radii):
+    """Show frames (n, M) to a map of this shape in the ordering phase, in which all neurons move.
+
+    Returns the weights (k, M) after these frames, and their mean after each frame (n,).
+    """
     row, column = jnp.arange(shape[0])[:, None], jnp.arange(shape[1])
 
     def show(state, now):
@@ -121,19 +128,19 @@ def _ordered(shape, flat, shown, rates, radii):
         level = level + share * (mean - level)
         return (distances, level), (share, level.mean())
 
-    start, apart = (_squared(shown, flat), flat.mean(axis=1)), _squared(shown, shown)
+    start, apart = (_squared_distances(shown, flat), flat.mean(axis=1)), _squared_distances(shown, shown)
     each = jnp.arange(len(shown)), rates, radii, apart, shown.mean(axis=1)
     _, (shares, curve) = jax.lax.scan(show, start, each)
-    return _moved(flat, shares, shown), curve
+    return _move_weights(flat, shares, shown), curve
 
 
-def _tuned(shape, flat, shown, rates):
-    """As `_ordered`: the winners alone move."""
+def _tuning_phase(shape, flat, shown, rates):
+    """Show frames in the tuning phase, in which only the winner moves; returns as `_ordering_phase` does."""
 
     def show(state, now):
         distances, level, (winner, moved) = state
         one, rate, to_others, mean = now
-        # Of the frame before: written before anything is read, which spares a copy of all distances.
+        # Write the distances of the previous frame's winner before any are read, which avoids a copy of all distances.
         distances = distances.at[:, winner].set(moved, mode=_THERE)
         row, column = _winner(distances[one], shape)
         winner = row * shape[1] + column
@@ -142,33 +149,36 @@ def _tuned(shape, flat, shown, rates):
         level = level.at[winner].add(rate * (mean - level[winner]), mode=_THERE)
         return (distances, level, (winner, moved)), (winner, level.mean())
 
-    distances, apart = _squared(shown, flat), _squared(shown, shown)
+    distances, apart = _squared_distances(shown, flat), _squared_distances(shown, shown)
     start = distances, flat.mean(axis=1), (jnp.zeros((), int), distances[:, 0])
     each = jnp.arange(len(shown)), rates, apart, shown.mean(axis=1)
     _, (winners, curve) = jax.lax.scan(show, start, each)
     shares = jnp.where(winners[:, None] == winners, rates[:, None], 0.0)
-    return flat.at[winners].set(_moved(flat[winners], shares, shown)), curve
+    return flat.at[winners].set(_move_weights(flat[winners], shares, shown)), curve
 
 
-def _squared(shown, flat):
-    """Squared distances (n, k) of frames (n, M) from weights (k, M)."""
+def _squared_distances(shown, flat):
+    """Compute squared distances (n, k) of frames (n, M) from weights (k, M)."""
     return jnp.sum(shown**2, axis=1)[:, None] + jnp.sum(flat**2, axis=1) - 2 * shown @ flat.T
 
 
 def _winner(distances, shape):
-    """Row and column of the least of distances (k,): of each column's least first, which are found many at once."""
+    """Find the row and the column of the neuron with the smallest of the distances (k,).
+
+    The minimum of each column is found first, since this is done for many columns at once.
+    """
     grid = distances.reshape(shape)
     column = jnp.argmin(grid.min(axis=0))
     return jnp.argmin(grid[:, column]), column
 
 
-def _moved(weights, shares, shown):
-    """Weights (k, M) that were moved to frames (n, M), one after another, by `shares` (n, k) of the way."""
+def _move_weights(weights, shares, shown):
+    """Move weights (k, M) towards frames (n, M), one after another, by `shares` (n, k) of the remaining way."""
 
     def left(after, share):
         return after * (1 - share), after * share
 
-    # From the last to the first: what there is of a frame in the end is what those after it have left.
+    # From the last frame to the first: later frames reduce the contribution of a frame by their own shares.
     kept, moved = jax.lax.scan(left, jnp.ones(len(weights)), shares, reverse=True)
     return kept[:, None] * weights + moved.T @ shown
 

@@ -1,4 +1,4 @@
-"""Answers of learnt skins: folds of held-out presses, and the methods compared on them."""
+"""Learn the quantities of recorded presses: folds of held-out presses, and the comparison of methods on them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from jeit.touch.learnt.numbers import LearntNumbers, learn_numbers
 from jeit.touch.learnt.presses import Presses
 
 NUM_FOLDS = 5
-# The greatest ratio of the distance of held-out presses from the others' places to that of a random fold.
+# Maximum distance of held-out presses from the nearest other press, relative to the same distance for random folds.
 _FARTHER = 2.0
-# Places are repeated if the ratio of their number to that of the presses is lower.
+# Places count as repeated if the number of different places, divided by the number of presses, is lower than this.
 _REPEATED = 0.7
 
 
@@ -34,11 +34,12 @@ def time_folds(
 ) -> tuple[Int[np.ndarray, " N"], tuple[str, ...]]:
     """Assign each press to the fold (N,) in which it is held out; returns folds and notes.
 
-    Presses in order of `time`, or as recorded, are cut into `number` intervals. If these leave out places (`alike`,
-    numbers (N, d)) or `kinds` (N,) or (N, K) altogether, as when one was pressed after the other, presses are cut into
-    more and shorter intervals, which are assigned to the folds in turn. With a `group`, groups are taken in order of
-    their mean time. Presses with the same frame, and at the same place (d > 1), are in one fold: otherwise the answer
-    of one would be known from the other, as is never the case for presses between places.
+    Presses, in order of `time` or as recorded, are cut into `number` intervals, one for each fold. If a training set
+    would lack places (`alike`, (N, d)) or classes (`kinds`, (N,) or (N, K)), because these were pressed one after the
+    other, presses are cut into more and shorter intervals, which are assigned to the folds in turn. Each `group` stays
+    in one fold; groups are ordered by their mean time. Presses with the same frame stay in one fold, and if places
+    (d > 1) are repeated, so do presses at the same place: otherwise the training set would contain copies of held-out
+    presses.
     """
     count = len(frames)
     order = np.arange(count) if time is None else np.argsort(time, kind="stable")
@@ -57,21 +58,21 @@ def time_folds(
     copies = count - same.max() - 1
     if copies:
         notes.append(f"{copies} frames are copies of others: kept in one fold with them.")
-        unit = _joined(unit, same)
+        unit = _connected_sets(unit, same)
     repeated = False
     if alike is not None and alike.shape[1] > 1 and not grouped:
         places = np.unique(alike, axis=0, return_inverse=True)[1].ravel()
         repeated = number <= places.max() + 1 < _REPEATED * count
         if repeated:
             notes.append(f"{places.max() + 1} places were repeated: held out with all of their presses.")
-            unit = _joined(unit, places)
+            unit = _connected_sets(unit, places)
     stretches = number
-    fold = _dealt(unit, rank, number, stretches)
-    while not grouped and stretches < count / 4 and not _covered(fold, alike, kinds):
+    fold = _assign_to_folds(unit, rank, number, stretches)
+    while not grouped and stretches < count / 4 and not _training_sets_cover(fold, alike, kinds):
         stretches *= 2
-        fold = _dealt(unit, rank, number, stretches)
-    if kinds is not None and kinds.ndim == 1 and not grouped and not _covered(fold, None, kinds):
-        fold = _dealt_by_kind(rank, kinds, number)
+        fold = _assign_to_folds(unit, rank, number, stretches)
+    if kinds is not None and kinds.ndim == 1 and not grouped and not _training_sets_cover(fold, None, kinds):
+        fold = _assign_by_class(rank, kinds, number)
     if stretches > number and not repeated:
         what = "labels or keys were given" if alike is None else "places were pressed"
         notes.append(
@@ -81,8 +82,8 @@ def time_folds(
     return fold, tuple(notes)
 
 
-def _dealt(unit: np.ndarray, rank: np.ndarray, number: int, stretches: int) -> Int[np.ndarray, " N"]:
-    """Assign units of presses to folds: intervals of their order, in turn."""
+def _assign_to_folds(unit: np.ndarray, rank: np.ndarray, number: int, stretches: int) -> Int[np.ndarray, " N"]:
+    """Assign units of presses to folds: their order is cut into intervals, which are assigned to the folds in turn."""
     sizes = np.bincount(unit)
     by_time = np.argsort(np.bincount(unit, rank) / sizes, kind="stable")
     middles = np.cumsum(sizes[by_time]) - sizes[by_time] / 2
@@ -91,8 +92,8 @@ def _dealt(unit: np.ndarray, rank: np.ndarray, number: int, stretches: int) -> I
     return np.unique(fold, return_inverse=True)[1][unit]
 
 
-def _dealt_by_kind(rank: np.ndarray, kinds: np.ndarray, number: int) -> Int[np.ndarray, " N"]:
-    """Assign presses of each kind to folds in turn, where some kinds are rare."""
+def _assign_by_class(rank: np.ndarray, kinds: np.ndarray, number: int) -> Int[np.ndarray, " N"]:
+    """Assign the presses of each class to the folds in turn, for data in which some classes are rare."""
     fold = np.empty(len(kinds), int)
     for kind in np.unique(kinds):
         own = np.flatnonzero(kinds == kind)
@@ -100,26 +101,26 @@ def _dealt_by_kind(rank: np.ndarray, kinds: np.ndarray, number: int) -> Int[np.n
     return fold
 
 
-def _covered(fold: np.ndarray, alike: np.ndarray | None, kinds: np.ndarray | None) -> bool:
-    """Whether held-out presses are similar to those in the training set."""
+def _training_sets_cover(fold: np.ndarray, alike: np.ndarray | None, kinds: np.ndarray | None) -> bool:
+    """Whether the training set of each fold contains places and classes like those of the held-out presses."""
     if kinds is not None and kinds.ndim == 2:
-        return all(_covered(fold, None, column) for column in kinds.T)
+        return all(_training_sets_cover(fold, None, column) for column in kinds.T)
     if kinds is not None:
         return all(set(kinds[fold == one]) <= set(kinds[fold != one]) for one in np.unique(fold))
     if alike is None:
         return True
     dealt = np.random.default_rng(0).permutation(fold)
-    return _farthest(alike, fold) <= _FARTHER * _farthest(alike, dealt)
+    return _largest_distance(alike, fold) <= _FARTHER * _largest_distance(alike, dealt)
 
 
-def _farthest(alike: np.ndarray, fold: np.ndarray) -> float:
-    """Mean distance of held-out presses from the others, in the fold where it is greatest."""
+def _largest_distance(alike: np.ndarray, fold: np.ndarray) -> float:
+    """Mean distance of held-out presses from the nearest other press, in the fold in which it is largest."""
     unit = alike.std(axis=0).max() or 1.0
     return max(KDTree(alike[fold != one]).query(alike[fold == one])[0].mean() + 1e-3 * unit for one in np.unique(fold))
 
 
-def _joined(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Number the connected sets, where two elements are connected if they share either number."""
+def _connected_sets(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Number the connected sets of elements, where two elements are connected if they share either of their numbers."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -134,10 +135,11 @@ METHODS = tuple(dict.fromkeys((*number_methods.METHODS, *label_methods.METHODS))
 
 @dataclass(frozen=True)
 class Standing:
-    """How well a quantity was learnt.
+    """Accuracy with which a quantity was learnt, in the units of the quantity.
 
-    The `method` chosen, the errors on held-out presses of all that were `tried`, and the chosen method's prediction for
-    each press when it was held out; in the units of the quantity.
+    `method`: the chosen method; `tried`: all methods that were tried, and their errors on held-out presses; `held_out`:
+    predictions of the chosen method for held-out presses; `right`: the true values; `std`: standard deviations of the
+    predictions.
     """
 
     method: str
@@ -155,9 +157,9 @@ def learn_answers(
     imaged: Imaged | None,
     progress,
 ) -> tuple[dict[str, Any], dict[str, Standing], list[str]]:
-    """Learn `place`, `force`, `label` and `keys`, each None if the presses do not have it.
+    """Learn models of `place`, `force`, `label` and `keys`, each None if the presses lack its quantity.
 
-    Returns the models, how well each was learnt, and notes.
+    Returns the models, their accuracies, and notes.
     """
     notes, standing = [], {}
     found: dict[str, Any] = dict.fromkeys(("place", "force", "label", "keys"))
@@ -170,17 +172,17 @@ def learn_answers(
     if presses.force is not None:
         known = presses.positions is not None and np.isfinite(presses.positions).all()
         alike = presses.positions if known else presses.force[:, None]
-        folds, _ = time_folds(presses.frames, *_when(presses, every), alike=alike)
+        folds, _ = time_folds(presses.frames, *_groups_and_times(presses, every), alike=alike)
         force = presses.force[:, None]
         found["force"], standing["force"] = _numbers(whole, reference, force, every, folds, method, imaged, progress)
     if presses.label is not None:
-        folds, remarks = time_folds(presses.frames, *_when(presses, every), kinds=presses.label)
+        folds, remarks = time_folds(presses.frames, *_groups_and_times(presses, every), kinds=presses.label)
         learnt, tried = learn_labels(
             whole,
             reference,
             presses.label,
             folds,
-            method=_asked(method, label_methods),
+            method=_method_or_auto(method, label_methods),
             imaged=imaged,
             progress=progress,
         )
@@ -189,7 +191,7 @@ def learn_answers(
         methods = [(f"{one.method} on {one.form}", one.error) for one in tried]
         standing["label"] = Standing(methods[0][0], methods, learnt.classes[tried[0].held_out], presses.label)
     if presses.touched is not None:
-        folds, remarks = time_folds(presses.frames, *_when(presses, every), kinds=presses.touched)
+        folds, remarks = time_folds(presses.frames, *_groups_and_times(presses, every), kinds=presses.touched)
         notes += remarks
         if presses.touched.sum(axis=1).max() < 2:
             notes.append("no two keys were pressed together: what is said of keys pressed together is a guess.")
@@ -204,22 +206,22 @@ def places_and_folds(presses: Presses) -> tuple[np.ndarray, np.ndarray, tuple[st
     """Rows of presses that have a place, their cross-validation folds, and notes."""
     positions = np.asarray(presses.positions)
     rows = np.flatnonzero(~np.isnan(positions).any(axis=1))
-    folds, remarks = time_folds(presses.frames[rows], *_when(presses, rows), alike=positions[rows])
+    folds, remarks = time_folds(presses.frames[rows], *_groups_and_times(presses, rows), alike=positions[rows])
     return rows, folds, remarks
 
 
 def _numbers(whole, reference, targets, rows, folds, method, imaged, progress) -> tuple[LearntNumbers, Standing]:
-    """Learn numbers (n, d) from the changes of some rows; returns the model and how well it was learnt."""
-    own, asked = None if reference is None else reference[rows], _asked(method, number_methods)
+    """Learn targets (n, d) from the changes of the given rows; returns the model and its accuracy."""
+    own, asked = None if reference is None else reference[rows], _method_or_auto(method, number_methods)
     learnt, tried = learn_numbers(whole[rows], own, targets, folds, method=asked, imaged=imaged, progress=progress)
     methods = [(one.name, one.error) for one in tried]
     said = tried[0].held_out
     return learnt, Standing(methods[0][0], methods, said, targets, learnt.spread.held_out(said, whole[rows]))
 
 
-def _asked(method: str, methods) -> str:
+def _method_or_auto(method: str, methods) -> str:
     return method if method in methods.METHODS else "auto"
 
 
-def _when(presses: Presses, rows: np.ndarray) -> tuple:
+def _groups_and_times(presses: Presses, rows: np.ndarray) -> tuple:
     return tuple(None if values is None else values[rows] for values in (presses.group, presses.time))

@@ -1,9 +1,7 @@
-"""Trees, nearest neighbours and support vector machines as arrays, for one frame within microseconds.
+"""Decision trees, nearest neighbours and support vector machines as arrays, evaluated within microseconds per frame.
 
-Support vector machines as arrays, with one decision boundary for each pair of classes.
-
-The sums are taken class by class: with thousands of pairs scikit-learn would take a hundredth of a second for one
-frame.
+Support vector machines have one decision boundary for each pair of classes. Their sums are computed class by class:
+with thousands of pairs, scikit-learn would take a hundredth of a second for one frame.
 """
 
 from __future__ import annotations
@@ -17,17 +15,18 @@ from jaxtyping import Float, Int
 
 from jeit.touch.learnt.extras import in_parts
 
-# The number of frames evaluated at once, so that the data stay in the cache.
+# Number of frames evaluated at once, so that the data stay in the processor's cache.
 _AT_ONCE = 128
 
 
 @dataclass(frozen=True)
 class Forest:
-    """T decision trees of up to n nodes.
+    """T decision trees with up to n nodes.
 
-    `feature` (T, n) and `threshold` (T, n) of each node; `left` and `right` (T, n): the next nodes where the feature is
-    not above the threshold, and where it is; leaves lead to themselves. `value` (T, n, d) of leaves: the sum of these
-    and `start` (d,) are the answer. `depth`: the number of steps to a leaf. `classes_` (d,), for classifiers.
+    `feature` and `threshold` (T, n): the test at each node; `left` and `right` (T, n): index of the next node if the
+    feature is at most the threshold, and if it is greater; leaves have their own index. `value` (T, n, d): values of
+    the leaves; the prediction is their sum over the trees plus `start` (d,). `depth`: number of steps to the leaves.
+    `classes_` (d,): the classes, for classifiers.
     """
 
     feature: Int[np.ndarray, "T n"]
@@ -40,15 +39,15 @@ class Forest:
     classes_: np.ndarray
 
     def __post_init__(self):
-        """Check the depth. Raises `ValueError` for a depth that trees of so many nodes do not have."""
+        """Raises `ValueError` for a depth that is negative or exceeds the number of nodes."""
         if not 0 <= self.depth <= self.value.shape[1]:
             raise ValueError(f"depth is {self.depth}, of trees of {self.value.shape[1]} nodes.")
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Sum of the trees' values."""
+        """Compute the sum (n, d) of the trees' values."""
         trees, size, targets = self.value.shape
         first_node = size * np.arange(trees)
-        # Nodes are numbered throughout, and all arrays flat: `take` is faster than indexing two axes.
+        # Nodes are numbered through all trees, and arrays are flat: `take` is faster than indexing two axes.
         feature, threshold = self.feature.ravel(), self.threshold.ravel()
         below, above = ((one + first_node[:, None]).ravel() for one in (self.left, self.right))
         value = self.value.reshape(-1, targets)
@@ -65,12 +64,12 @@ class Forest:
         return in_parts(answer, features, _AT_ONCE) + self.start
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """For classifiers: the trees' votes for each class."""
+        """Compute the score of each class (n, d), for classifiers: the sum of the trees' values."""
         return self.predict(features)
 
     @classmethod
     def of_boosted(cls, models: list[Any]) -> "Forest":
-        """Convert scikit-learn's histogram gradient boosting, one model for each of d targets."""
+        """Convert scikit-learn's histogram gradient boosting regressors, one for each of d targets."""
         trees = []
         for target, model in enumerate(models):
             for (one,) in model._predictors:
@@ -80,13 +79,13 @@ class Forest:
                 leaf = nodes["is_leaf"].astype(bool)
                 trees.append((nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], leaf, value))
         start = np.array([float(np.ravel(model._baseline_prediction)[0]) for model in models])
-        return cls._joined(trees, start, np.arange(len(models)))
+        return cls._pack_trees(trees, start, np.arange(len(models)))
 
     @classmethod
     def of_boosted_classes(cls, model: Any) -> "Forest":
-        """Convert scikit-learn's histogram gradient boosting classifier, to log-odds of its classes.
+        """Convert scikit-learn's histogram gradient boosting classifier to a forest that predicts log-odds.
 
-        Of two classes, the second has half of the model's log-odds, and the first the same with a negative sign.
+        With two classes, the second has half of the model's log-odds, and the first the same with opposite sign.
         """
         trees, number = [], len(model.classes_)
         for one in model._predictors:
@@ -98,11 +97,11 @@ class Forest:
                 trees.append((nodes["feature_idx"], nodes["num_threshold"], nodes["left"], nodes["right"], leaf, value))
         start = np.ravel(model._baseline_prediction).astype(float)
         start = np.array([-0.5, 0.5]) * start[0] if number == 2 else start
-        return cls._joined(trees, start, model.classes_)
+        return cls._pack_trees(trees, start, model.classes_)
 
     @classmethod
     def of_averaged(cls, models: list[Any]) -> "Forest":
-        """Convert scikit-learn's regression trees, whose mean is taken."""
+        """Convert scikit-learn's regression trees to a forest that predicts their mean."""
         trees = []
         for model in models:
             one = model.tree_
@@ -110,11 +109,14 @@ class Forest:
             value = one.value[:, :, 0] / len(models)
             trees.append((one.feature, one.threshold, one.children_left, one.children_right, leaf, value))
         targets = trees[0][-1].shape[1]
-        return cls._joined(trees, np.zeros(targets), np.arange(targets))
+        return cls._pack_trees(trees, np.zeros(targets), np.arange(targets))
 
     @classmethod
     def of_trees(cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool) -> "Forest":
-        """Convert scikit-learn's classification trees: their leaves' class shares, or whole `votes`, weighted."""
+        """Convert scikit-learn's classification trees to a forest that predicts the weighted sum of their class shares.
+
+        If `votes`, each tree has one vote for its most frequent class instead.
+        """
         trees = []
         for model, weight in zip(models, weights, strict=True):
             one = model.tree_
@@ -125,11 +127,11 @@ class Forest:
             value[:, model.classes_.astype(int)] = weight * share
             leaf = one.children_left < 0
             trees.append((one.feature, one.threshold, one.children_left, one.children_right, leaf, value))
-        return cls._joined(trees, np.zeros(len(classes)), classes)
+        return cls._pack_trees(trees, np.zeros(len(classes)), classes)
 
     @classmethod
     def of_stumps(cls, model: Any) -> "Forest":
-        """Convert a `LogitBoostClassifier`: a tree for each stump, with its contribution to all classes."""
+        """Convert a `LogitBoostClassifier`: each stump becomes a tree that contributes to the scores of all classes."""
         rounds, number = model.feature_.shape
         trees = []
         for one, kind in np.ndindex(rounds, number):
@@ -137,10 +139,10 @@ class Forest:
             said = np.outer([0.0, model.below_[one, kind], model.above_[one, kind]], own)
             asked, at = np.array([model.feature_[one, kind], 0, 0]), np.array([model.threshold_[one, kind], 0.0, 0.0])
             trees.append((asked, at, np.array([1, 1, 2]), np.array([2, 1, 2]), np.array([False, True, True]), said))
-        return cls._joined(trees, np.zeros(number), model.classes_)
+        return cls._pack_trees(trees, np.zeros(number), model.classes_)
 
     @classmethod
-    def _joined(cls, trees: list[tuple], start: np.ndarray, classes: np.ndarray) -> "Forest":
+    def _pack_trees(cls, trees: list[tuple], start: np.ndarray, classes: np.ndarray) -> "Forest":
         most, depth = max(len(tree[0]) for tree in trees), 1
         feature, left, right = (np.zeros((len(trees), most), np.int32) for _ in range(3))
         threshold = np.zeros((len(trees), most))
@@ -159,17 +161,17 @@ class Forest:
         return cls(feature, threshold, left, right, value, depth, start, classes)
 
 
-# The number of frames whose distances from all presses are computed at once.
+# Number of frames whose distances from all presses are computed at once.
 _FRAMES = 128
 _COUNTS = (3, 5, 8, 12)
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """Mean of the known values of the `count` presses whose `features` (N, k) are nearest, weighted by inverse
-    distance.
+    """Nearest neighbours: the mean over the `count` nearest presses, weighted by inverse distance.
 
-    `known` (N, d): numbers, or 1 for the class of each; `classes_` (d,).
+    `features` (N, k): features of the presses; `known` (N, d): their targets, or for classes 1 in the column of each
+    press's class and 0 elsewhere; `classes_` (d,): the classes.
     """
 
     features: Float[np.ndarray, "N k"]
@@ -179,7 +181,7 @@ class Nearest:
 
     @classmethod
     def of_numbers(cls, features, targets) -> "Nearest":
-        """Learn targets (N, d), with the count that has the least leave-one-out error."""
+        """Create a regressor of targets (N, d), with the `count` that has the lowest leave-one-out error."""
         count = min(max(_COUNTS), len(features) - 1)
         every = cls(features, targets, count + 1, np.arange(targets.shape[1]))
         distance, number = (one[:, 1:] for one in every._near(features))
@@ -191,26 +193,26 @@ class Nearest:
 
     @classmethod
     def of_classes(cls, features, label) -> "Nearest":
-        """Learn classes, with the single nearest press."""
+        """Create a classifier, which predicts the class of the single nearest press."""
         classes = np.unique(label)
         return cls(features, (np.asarray(label)[:, None] == classes).astype(float), 1, classes)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
-        """Predict means (n, d)."""
+        """Predict targets (n, d)."""
         distance, number = self._near(features)
         weight = 1 / np.maximum(distance, 1e-12)
         return np.einsum("nc,ncd->nd", weight / weight.sum(axis=1, keepdims=True), self.known[number])
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Predict shares of the classes (n, C)."""
+        """Predict the share of each class (n, C) among the nearest presses."""
         return self.predict(features)
 
     def _near(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
-        """Distances of the nearest presses, the nearest first, and their numbers."""
+        """Find the nearest presses: their distances (n, c), the nearest first, and their indices (n, c)."""
 
         def near(some: np.ndarray) -> np.ndarray:
             squared = (-2 * some) @ self.features.T
-            squared += self._squares  # without the frame's own square, which is the same for all
+            squared += self._squares  # the frame's squared norm is left out: it is the same for all presses
             number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
             apart = np.linalg.norm(self.features[number] - some[:, None], axis=2)
             order = np.argsort(apart, axis=1, kind="stable")
@@ -221,17 +223,18 @@ class Nearest:
 
     @cached_property
     def _squares(self) -> Float[np.ndarray, " N"]:
-        """|x|² of every press's features."""
+        """Squared norm of each press's features."""
         return np.sum(self.features**2, axis=1)
 
 
 @dataclass(frozen=True)
 class Machine:
-    """A support vector machine.
+    """A support vector machine with one decision boundary for each pair of classes.
 
-    `support` (S, k): the support vectors sorted by class, those of class c from `start` (C + 1,) c to c + 1; `weights`
-    (C - 1, S): their weights for the boundaries with every other class; `intercepts` (P,) of the pairs (0, 1), (0, 2),
-    …; and the kernel, (gain x·y + offset)^degree. A linear machine has the boundaries' own `slopes` (P, k).
+    `support` (S, k): support vectors, sorted by class; those of class c are the rows from `start[c]` to `start[c + 1]`;
+    `weights` (C - 1, S): their weights for the boundaries with each other class; `intercepts` (P,): one for each of the
+    pairs (0, 1), (0, 2), …. The kernel is (gain x·y + offset)^degree. A linear machine uses the normals of the
+    boundaries instead, `slopes` (P, k).
     """
 
     support: Float[np.ndarray, "S k"]
@@ -246,10 +249,11 @@ class Machine:
 
     @classmethod
     def of(cls, machine) -> "Machine":
-        """Convert scikit-learn's machine, with a linear or a polynomial kernel."""
+        """Convert scikit-learn's support vector classifier with a linear or a polynomial kernel."""
         linear = machine.kernel == "linear"
         start = np.concatenate([[0], np.cumsum(machine.n_support_)])
-        # Of two classes, positive values mean the second in scikit-learn; of more, the first of each pair.
+        # In scikit-learn, a positive value means the second of two classes, but the first class of a pair if there are
+        # more.
         sign = -1.0 if len(machine.classes_) == 2 else 1.0
         return cls(
             machine.support_vectors_,
@@ -264,24 +268,30 @@ class Machine:
         )
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Number of pairwise decisions won by each class (n, C), plus less than a half from the distances."""
+        """Count the pairwise decisions won by each class (n, C).
+
+        A term below 1/2 from the distances to the boundaries is added, which orders classes with equal counts.
+        """
         pairs, side = self._borders(features)
         votes = (pairs > 0) @ (side > 0).astype(float) + (pairs <= 0) @ (side < 0).astype(float)
         sure = pairs @ side
         return votes + sure / (3 * (np.abs(sure) + 1))
 
     def pair_odds(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Sums of the log-probabilities of each class relative to every other (n, C).
+        """Compute, for each class, the sum of its log-probabilities relative to every other class (n, C).
 
-        Relative to one other, the probability is 1 / (1 + exp(-2 d)) at a distance d from their boundary, in units of
-        its margin. Unlike votes, it is a measure of confidence.
+        Relative to one other class, the probability is 1 / (1 + exp(-2 d)) at a distance d from the boundary between
+        the two, in units of its margin. Unlike votes, these sums measure confidence.
         """
         pairs, side = self._borders(features)
         won, lost = -np.logaddexp(0.0, -2 * pairs), -np.logaddexp(0.0, 2 * pairs)
         return won @ (side > 0).astype(float) + lost @ (side < 0).astype(float)
 
     def _borders(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n P"], Float[np.ndarray, "P C"]]:
-        """Distances from the boundaries of all pairs of classes, and which class is on which side."""
+        """Compute signed distances (n, P) from the boundaries of all pairs of classes.
+
+        Also returns the sign of the distance on the side of each class (P, C), 0 for classes that are not of the pair.
+        """
         count = len(self.classes_)
         first, second = np.triu_indices(count, 1)
         if self.slopes is not None:

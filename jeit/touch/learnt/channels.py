@@ -1,15 +1,13 @@
-"""Channels of a learnt skin: noise, missing channels filled in, and how unlike all presses a frame is.
+"""Joint model of a learnt skin's channels: it detects dead channels, replaces their readings, and rates novel frames.
 
-Measure how far a frame is from all presses of the training set.
+Changes of a skin's M channels are modelled as d = s (V z + n), with scales s, a few patterns V, their scores z, and
+noise n; z and n are normal. The scores of a frame with missing channels are the most likely ones. A channel is dead if
+its residual, the deviation from the prediction by the others, exceeds a multiple of the residuals of training presses.
+Its reading is predicted from the covariance of all channels, which contains more than the patterns do: for example,
+that reciprocal channels read the same.
 
-Two touches at once, or one of the opposite sign, are made of the same patterns, but are unlike any recorded press.
-
-Model the joint variation of channels, to detect dead channels and to predict what they would have read.
-
-Changes of a skin's M channels are modelled by the scores of a few patterns and noise, d = s (V z + n), with z and n
-normal. The scores of a frame with missing channels are the most likely ones; a channel is dead if it differs from the
-others' prediction by more than so many deviations. Its reading is predicted from the covariance of all channels, which
-contains more than the patterns do: for example, that reciprocal channels read the same.
+The novelty of a frame includes its distance from all presses of the training set: two simultaneous touches, or a touch
+of the opposite sign, consist of the same patterns as recorded presses, but are unlike any of them.
 """
 
 from __future__ import annotations
@@ -21,17 +19,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
-# The number of scores used, the greatest number of presses kept, and the share of the usual size that is added to the
-# size that distances are relative to.
+# Number of scores used; maximum number of presses stored; fraction of the usual norm of scores that is added to a
+# frame's norm, by which distances are divided.
 _SCORES, _MOST_KEPT, _SMALL = 8, 4000, 0.5
 _USUAL_QUANTILE = 0.99
 
 
 @dataclass(frozen=True)
 class Neighbourhood:
-    """Leading `scores` (N, k) of presses, their usual `size`, and the `usual` distance between neighbours.
+    """Distances of frames from the nearest press of the training set, by their leading scores.
 
-    Distances are relative to the size; all but a hundredth of the presses are nearer to their neighbour than `usual`.
+    `scores` (N, k): leading scores of presses; `size`: their median norm; `usual`: distance from the nearest other
+    press that 99 % of the presses do not exceed. Distances are divided by the norm of the frame's scores plus a
+    fraction of `size`.
     """
 
     scores: Float[np.ndarray, "N k"]
@@ -40,7 +40,7 @@ class Neighbourhood:
 
     @classmethod
     def learn(cls, scores: Float[np.ndarray, "N K"]) -> "Neighbourhood":
-        """Learn from scores of presses (N, K)."""
+        """Fit to the scores of presses (N, K)."""
         kept = scores[:: -(-len(scores) // _MOST_KEPT), :_SCORES]
         size = float(np.median(np.linalg.norm(kept, axis=1))) or 1.0
         found = cls(kept, size, 1.0)
@@ -48,7 +48,7 @@ class Neighbourhood:
         return cls(kept, size, max(float(np.quantile(apart, _USUAL_QUANTILE)), 1e-6))
 
     def __call__(self, scores: Float[np.ndarray, "n K"]) -> Float[np.ndarray, " n"]:
-        """Relative distances (n,) of frames with these scores, 1 at the `usual` distance."""
+        """Compute the distances (n,) of frames with these scores from the nearest press, divided by `usual`."""
         return self._relative(scores[:, :_SCORES]) / self.usual
 
     def _relative(self, scores: np.ndarray, *, second: bool = False) -> np.ndarray:
@@ -60,34 +60,37 @@ class Neighbourhood:
         return KDTree(self.scores)
 
 
-# Share of the variance that patterns leave to noise; the greatest number of patterns; presses required for each.
+# Fraction of the variance that is left to noise; maximum number of patterns; number of presses required for each
+# pattern.
 _LEFT, _MOST, _PRESSES_EACH = 1e-3, 60, 4
-# A channel is dead beyond this multiple of the given quantile of the residuals of training presses.
+# A channel is dead if its residual exceeds this multiple of this quantile of the residuals of training presses.
 _BEYOND, _QUANTILE = 2.0, 0.999
-# A channel that is alive does not read beyond its training range by more than this multiple of its span; the greatest
-# share of channels that may do so before the frame counts as unusual instead.
+# Maximum distance of a working channel's reading from its training range, relative to the width of that range; maximum
+# fraction of channels that may exceed it, above which the frame counts as unusual and the channels as alive.
 _SPANS, _FEW = 2.0, 0.1
-# Variation below this share of the greatest change is rounding.
+# Variation below this fraction of the largest change is rounding error.
 _ROUNDING = 1e-13
-# Values added to the diagonal of the covariance, of channels whose variance is 1.
+# Candidate values added to the diagonal of the covariance of channels, which are scaled to variance 1.
 _DIAGONALS = np.logspace(-6, 0, 13)
-# The greatest share of dead channels; beyond it, the search for dead channels stops.
+# Maximum fraction of dead channels, at which the search for dead channels stops.
 _MOST_DEAD = 0.34
-# The number of consecutive frames with unique sets of missing channels, before all are processed one by one.
+# Number of consecutive frames with a unique set of missing channels after which frames are processed one by one.
 _ALONE = 8
-# The novelty of a frame at the usual distance between presses from the nearest one.
+# Novelty of a frame whose distance from the nearest press is the usual distance between presses.
 _NEAR = 2 / 1.75
 
 
 @dataclass(frozen=True)
 class Channels:
-    """Joint model of M channels, of which some are `used` (M,): those with readings that are not constant.
+    """Joint model of M channels.
 
-    Of the channels used: `scale` (m,) of changes; `range` (2, m), in scales, beyond which no channel reads that is
-    alive; `patterns` (m, k), `spread` (k,) of scores, `noise` (m,) in scales; `farthest` (m,): the greatest residuals
-    of a channel that is alive; `directions` (m, r) of the covariance, the `weight` (r,) of each relative to a diagonal,
-    and the variance (m,) of channels that all others do not predict, `unpredicted`; `usual`: the novelty that all but a
-    hundredth of the presses do not exceed; `neighbourhood`: how near presses are to each other.
+    `used` (M,): whether a channel has readings that are not constant. All other fields are for the m channels used. In
+    units of `scale` (m,), the standard deviation of the changes: `range` (2, m): limits of the readings of a working
+    channel; `patterns` (m, k), the `spread` (k,) of their scores, and the `noise` (m,). `farthest` (m,): maximum
+    residual of a working channel, relative to its noise. `directions` (m, r): principal directions of the changes;
+    `weight` (r,): variance along each, divided by the same variance plus a constant; `unpredicted` (m,): variance of a
+    channel that the others do not predict. `usual`: novelty that 99 % of the presses do not exceed; `neighbourhood`:
+    distances between presses.
     """
 
     used: Bool[np.ndarray, " M"]
@@ -105,7 +108,10 @@ class Channels:
 
     @classmethod
     def learn(cls, changes: Float[np.ndarray, "N M"]) -> "Channels":
-        """Learn from changes (N, M), NaN where there was no reading. Raises `ValueError` where no channel changes."""
+        """Fit the model to changes (N, M), NaN where a reading is missing.
+
+        Raises `ValueError` if no channel changes.
+        """
         missing = np.isnan(changes)
         used = missing.mean(axis=0) < 0.5
         deviation = np.zeros(changes.shape[1])
@@ -117,8 +123,8 @@ class Channels:
         scale = deviation[used]
         scaled = np.where(missing[:, used], 0.0, changes[:, used]) / scale
         there, half = ~missing[:, used], len(scaled) // 2
-        # Residuals of frames outside the training set are greater than of those in it: each half is evaluated with the
-        # patterns of the other.
+        # Residuals are larger for frames outside the training set than in it, so each half of the frames is evaluated
+        # with the patterns of the other half.
         left, apart, misses = [], [], np.zeros((2, len(_DIAGONALS), int(used.sum())))
         for learnt, other in ((slice(None, half), slice(half, None)), (slice(half, None), slice(None, half))):
             variance, directions = _variances(scaled[learnt])
@@ -144,21 +150,21 @@ class Channels:
     def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Replace changes of dead or missing channels by their prediction from the other channels.
 
-        Returns changes (n, m) of the channels used; which are alive (n, m); and novelty (n,), 1 where a frame is as far
-        from the training set as the farthest frame in it.
+        Returns the changes (n, m) of the channels used; whether each is alive (n, m); and the novelty (n,) of the
+        frames, 1 for a frame that is as far from the training set as the farthest frame in it.
         """
         whole = changes[:, self.used] / self.scale
         given, far = ~np.isnan(whole), (whole < self.range[0]) | (whole > self.range[1])
-        # Where many channels are out of range, the frame is unusual, not the channels.
+        # If many channels are out of range, the frame is unusual, and the channels are not dead.
         given &= ~far | (far.sum(axis=1, keepdims=True) > max(1, _FEW * whole.shape[1]))
         whole, alive = np.where(given, whole, 0.0), given.copy()
         scores, residual = self._explain_all(whole)
         left, alone = np.flatnonzero((np.abs(residual) > self.farthest).any(axis=1) | ~given.all(axis=1)), 0
         while left.size:
-            # Most frames lack the same channels: the pattern found for one frame is tried on all that remain.
+            # Most frames have the same dead channels, so the set found for one frame is tried on all remaining frames.
             pattern = self._alive(whole[left[0]], given[left[0]])
             some = left if alone < _ALONE else left[:1]
-            beyond, some_scores, some_residual = self._beyond(whole[some], given[some], pattern)
+            beyond, some_scores, some_residual = self._deviations(whole[some], given[some], pattern)
             same = (beyond <= 1) == pattern
             borne = same.all(axis=1)
             borne[0] = True
@@ -172,13 +178,14 @@ class Channels:
         return whole * self.scale, alive, np.maximum(novelty, _NEAR * self.neighbourhood(scores))
 
     def _alive(self, frame: np.ndarray, given: np.ndarray) -> np.ndarray:
-        """Which channels of a frame agree with the prediction from the others.
+        """Determine which channels of a frame agree with the prediction from the others.
 
-        Those that agree least are removed repeatedly; then those that agree with the remaining ones are restored.
+        The channels with the largest deviations are removed repeatedly; then channels that agree with the remaining
+        ones are restored.
         """
         alive, fewest, back = given.copy(), (1 - _MOST_DEAD) * len(frame), False
         while alive.sum() > fewest:
-            (beyond,) = self._beyond(frame[None], given[None], alive)[0]
+            (beyond,) = self._deviations(frame[None], given[None], alive)[0]
             worst = np.max(beyond, where=alive, initial=0.0)
             if worst <= 1 and back:
                 break
@@ -188,11 +195,11 @@ class Channels:
                 alive &= beyond < (worst if back else max(1.0, worst / 2))
         return alive
 
-    def _beyond(self, whole, given, alive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Deviations of channels in frames (n, m) from the prediction by those `alive` (m,).
+    def _deviations(self, whole, given, alive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Compute the deviations of channels in frames (n, m) from the prediction by the channels `alive` (m,).
 
-        1 is the greatest deviation of a channel that is alive; infinite where not `given` (n, m). Also returns the
-        frames' scores (n, k) and residuals (n, m).
+        They are divided by the maximum deviation of a working channel, and infinite for readings that are not `given`
+        (n, m). Also returns the frames' scores (n, k) and residuals (n, m).
         """
         weighted = self.patterns * (alive / self.noise**2)[:, None]
         gain = weighted @ np.linalg.inv(weighted.T @ self.patterns + np.diag(1 / self.spread**2))
@@ -200,20 +207,20 @@ class Channels:
         residual = (whole - scores @ self.patterns.T) / self.noise
         free = 1 - np.einsum(
             "ij,ij->i", self.patterns, gain
-        )  # variance of the residual; the channel itself explains the rest
+        )  # variance of a residual, which the channel's weight in its own prediction reduces
         beyond = np.where(given, np.abs(residual) / np.sqrt(np.maximum(free, 1e-6)) / self.farthest, np.inf)
         return beyond, scores, residual
 
     def _predicted(self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray) -> Float[np.ndarray, "n m-a"]:
-        """Predict the most likely readings of channels that are not `alive` (m,)."""
+        """Predict the most likely readings of the channels that are not `alive` (m,) from those that are."""
         dead = self.directions[~alive] * self.weight
         predicted = dead @ (alive_readings @ self.directions[alive]).T
         return np.linalg.solve(np.eye(len(dead)) - dead @ self.directions[~alive].T, predicted).T
 
     def unsure(self, alive: Bool[np.ndarray, "n m"], number: int) -> Float[np.ndarray, "q n m"]:
-        """Errors of predicted readings, of frames with some channels `alive`.
+        """Compute the errors of readings that are predicted for frames with some channels `alive`.
 
-        They are the q ≤ `number` greatest independent deviations, in the unit of changes.
+        Returns the q ≤ `number` largest independent errors, each of one standard deviation, in the unit of changes.
         """
         found = np.zeros((min(number, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
         patterns, kind = np.unique(alive, axis=0, return_inverse=True)
@@ -228,23 +235,23 @@ class Channels:
         return found
 
     def _explain_all(self, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Scores and residuals of frames (n, m) of which all channels are alive."""
+        """Compute scores and residuals of frames (n, m) whose channels are all alive."""
         scores = whole @ self._gain
         return scores, (whole - scores @ self.patterns.T) / self.noise
 
     @cached_property
     def _gain(self) -> Float[np.ndarray, "m k"]:
-        """Matrix from channels, all of them alive, to scores."""
+        """Matrix that maps the readings of all channels to scores, if all channels are alive."""
         weighted = self.patterns / self.noise[:, None] ** 2
         return np.linalg.solve(weighted.T @ self.patterns + np.diag(1 / self.spread**2), weighted.T).T
 
 
 def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "m r"]]:
-    """Principal directions of frames, and the variance along each, the greatest first."""
+    """Compute the variance along each principal direction of the frames, in decreasing order, and the directions."""
     number, channels = scaled.shape
     if channels <= number:
         squares, directions = np.linalg.eigh(scaled.T @ scaled)
-    else:  # fewer products
+    else:  # the smaller of the two matrices
         squares, combined = np.linalg.eigh(scaled @ scaled.T)
         directions = scaled.T @ combined / np.sqrt(np.maximum(squares, 1e-300))
     kept = np.flatnonzero(squares > _ROUNDING * squares[-1])[::-1]
@@ -252,7 +259,10 @@ def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"
 
 
 def _factors(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Patterns (m, k), the deviations of their scores, and of the noise that they leave in each channel."""
+    """Compute the patterns (m, k), and the standard deviations of their scores (k,) and of the noise (m,).
+
+    The noise is the part of each channel that the patterns do not explain.
+    """
     explained = np.cumsum(variance) / np.sum(variance)
     number = min(int(np.searchsorted(explained, 1 - _LEFT)) + 1, _MOST, max(1, len(scaled) // _PRESSES_EACH))
     number = min(number, max(1, scaled.shape[1] // 2))
@@ -263,10 +273,10 @@ def _factors(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _missed(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
-    """Mean squared prediction errors of channels, for covariances with each diagonal.
+    """Compute mean squared prediction errors of channels, for covariances with each of the diagonals.
 
-    First, of the error of each channel as predicted by the others; second, of that times the share `free` of the
-    others, the variance that `unsure` uses.
+    Returns two arrays (D, m): the error of each channel as predicted by the others, and this error times `free`, one
+    minus the weight of the channel in its own prediction; `unsure` uses the second.
     """
     scores, found = scaled @ directions, []
     for diagonal in _DIAGONALS:
@@ -278,7 +288,7 @@ def _missed(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
 
 
 def _explain(whole, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:
-    """Most likely scores (n, k) of frames (n, m), and residuals in deviations of the noise.
+    """Compute the most likely scores (n, k) of frames (n, m), and the residuals divided by the noise.
 
     Residuals are 0 for channels that are not `alive` (n, m).
     """
@@ -292,7 +302,10 @@ def _explain(whole, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndar
 
 
 def _novelty(scores, residual, alive, spread) -> np.ndarray:
-    """The greater of the root mean squares of residuals and of scores, each in its own deviations."""
+    """Compute the larger of two root mean squares for each frame (n,): of its residuals, and of its scores.
+
+    Residuals are relative to the noise, and scores relative to their spread.
+    """
     left = np.sqrt(np.sum(residual**2, axis=1) / np.maximum(alive.sum(axis=1), 1))
     return np.maximum(left, np.sqrt(np.mean((scores / spread) ** 2, axis=1)))
 
@@ -302,8 +315,8 @@ def choose_channels(
 ) -> Int[np.ndarray, " n"]:
     """Select channels by simultaneous orthogonal matching pursuit (Tropp et al. 2006), the most informative first.
 
-    Each explains most of what the previous channels leave unexplained of the answers, by least squares. Products of the
-    answers with one another are explained too, since places are not linear in voltages.
+    Each channel explains most of what the previous ones leave unexplained of the `answers`, by least squares. Products
+    of the answers are explained too, since places are not linear in voltages.
     """
     products = [answers[:, i] * answers[:, j] for i in range(answers.shape[1]) for j in range(i + 1)]
     left = np.column_stack([answers, *(one - one.mean() for one in products[:20])])

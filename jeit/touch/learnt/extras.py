@@ -1,4 +1,4 @@
-"""Control how much of the machine learning uses: threads and memory."""
+"""Limit the threads and the memory that learning uses."""
 
 from __future__ import annotations
 
@@ -14,27 +14,29 @@ from jeit_solvers import number_of_cores
 
 
 def one_thread() -> AbstractContextManager:
-    """Return a context within which libraries use one thread.
+    """Return a context manager within which libraries use one thread.
 
-    With thousands of presses, more threads wait for each other longer than they work.
+    With thousands of presses, several threads spend more time waiting for each other than computing.
     """
     from threadpoolctl import threadpool_limits
 
-    import_module("sklearn.ensemble")  # only libraries that are loaded are limited
+    import_module("sklearn.ensemble")  # the limit applies only to libraries that are already loaded
 
     return threadpool_limits(1)
 
 
 def in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
-    """Apply `function` to some rows at a time and concatenate the results, to keep intermediate results small."""
+    """Apply `function` to `at_once` rows at a time, which limits memory, and concatenate the results."""
     return np.concatenate([function(rows[some]) for some in _parts(len(rows), at_once)])
 
 
 def over_threads(
     function: Callable[..., dict[str, np.ndarray]], *arrays: np.ndarray, at_once: int
 ) -> dict[str, np.ndarray]:
-    """Apply `function` to some rows of `arrays` at a time, in parallel where there are many, and concatenate the
-    arrays."""
+    """Apply `function` to `at_once` rows of the `arrays` at a time, and concatenate the arrays that it returns.
+
+    Many parts are computed in parallel.
+    """
     parts = _parts(len(arrays[0]), at_once)
     if len(parts) < 4:
         found = [function(*(one[some] for one in arrays)) for some in parts]
@@ -45,7 +47,10 @@ def over_threads(
 
 
 def over_folds(function: Callable[[int], Any], number: int) -> list[Any]:
-    """Apply `function` to 0 … `number` - 1 in parallel, each with one thread: OpenMP counts each thread's own."""
+    """Apply `function` to 0 … `number` - 1 in parallel, each call with one thread.
+
+    The limit is set in every call, since OpenMP keeps a separate number of threads for each calling thread.
+    """
 
     def alone(fold: int) -> Any:
         with one_thread():

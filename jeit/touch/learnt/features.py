@@ -1,4 +1,4 @@
-"""Features of frames: principal components and other forms, and their whitening."""
+"""Features of frames: several forms of the changes, standardised, and their principal components."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ from jaxtyping import Float
 
 from jeit.touch.learnt.imaged import Contacts, Imaged, Images
 
-# The least number of frames that repeat another.
+# Minimum number of frames with the same answers as another frame, to estimate their noise.
 _FEWEST = 20
 
 
 @dataclass(frozen=True)
 class Whitened:
-    """Features: changes times `root` (m, m), so that the variation between repeated frames has unit covariance."""
+    """Features: changes times `root` (m, m), which gives unit covariance to the variation between repeated frames."""
 
     root: Float[np.ndarray, "m m"]
 
     @classmethod
     def learn(cls, changes: Float[np.ndarray, "N m"], answers: Float[np.ndarray, "N d"]) -> "Whitened":
-        """Learn from frames of which some repeat others, that is, have the same answers; shrunk after Ledoit and Wolf
-        (2004)."""
+        """Fit the whitening to frames, of which some have the same `answers`.
+
+        The covariance of the variation between frames with the same answers is shrunk as in Ledoit and Wolf (2004).
+        """
         from sklearn.covariance import ledoit_wolf
 
         scale = np.maximum(changes.std(axis=0), 1e-300)
@@ -43,22 +45,22 @@ class Whitened:
         return changes @ self.root
 
     def deviation(self, values: Float[np.ndarray, "N m"]) -> Float[np.ndarray, " m"]:
-        """The unit of each feature, the same for all."""
+        """Unit of each feature, the same for all: the root mean square of their standard deviations."""
         return np.full(values.shape[1], np.sqrt(np.mean(values.var(axis=0))))
 
 
 def are_repeated(answers: Float[np.ndarray, "N d"]) -> bool:
-    """Whether enough frames repeat others for their noise to be estimated."""
+    """Whether enough frames have the same answers as another frame to estimate their noise."""
     return int(np.sum(_groups(answers)[1] - 1)) >= _FEWEST
 
 
 def _groups(answers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Group numbers (N,) of frames, one for each answer, and the size of each group."""
+    """Number the frames (N,) such that frames with the same answers have the same number; also count each group."""
     group, count = np.unique(answers, axis=0, return_inverse=True, return_counts=True)[1:]
     return group.ravel(), count
 
 
-# The greatest number of components, and presses required for each.
+# Maximum number of principal components; number of presses required for each.
 _MOST, _PRESSES_EACH = 60, 3
 
 
@@ -87,7 +89,7 @@ def _shapes(changes, reference, unit):
     return np.hstack([changes / size, np.log(size)])
 
 
-# Functions of changes (n, m), the reference (n, m), and a unit (m,) for each channel, that return features.
+# Forms of features: functions of changes (n, m), the reference (n, m), and a unit (m,) for each channel.
 FORMS = {
     "differences": _differences,
     "ratios": _ratios,
@@ -101,9 +103,11 @@ Maker = Callable[[np.ndarray, np.ndarray], Whitened | Contacts | Images]
 
 @dataclass(frozen=True)
 class Features:
-    """Features of one `form`: standardised by `mean` and `deviation` (p,), then scores of any `components` (p, k).
+    """Features of one `form`, standardised, and optionally reduced to principal components.
 
-    `made` computes the features of a learnt form; other forms have a `unit` (m,) of each channel.
+    `mean` and `deviation` (p,) standardise the features; `components` (p, k): the principal components, or None.
+    `made`: computes the features if the form is learnt, None otherwise; `unit` (m,): unit of each channel for the other
+    forms.
     """
 
     form: str
@@ -123,7 +127,10 @@ class Features:
         made: Whitened | Contacts | Images | None = None,
         rotated: bool = True,
     ) -> "Features":
-        """Learn from changes and their reference; many numbers are reduced to components, unless not `rotated`."""
+        """Fit the features to changes of voltage and their reference.
+
+        If `rotated`, features are reduced to principal components, except the few features of a contact.
+        """
         if made is None:
             unit, values, mean, deviation = standardisation(form, changes, reference)
         else:
@@ -136,17 +143,17 @@ class Features:
         return cls(form, unit, mean, deviation, components, made)
 
     def __call__(self, changes: np.ndarray, reference: np.ndarray) -> Float[np.ndarray, "n k"]:
-        """Compute the scores (n, k) of changes (n, m)."""
+        """Compute the features (n, k) of changes (n, m)."""
         values = FORMS[self.form](changes, reference, self.unit) if self.made is None else self.made(changes)
         standard = (values - self.mean) / self.deviation
         return standard if self.components is None else standard @ self.components
 
 
 def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Compute how features of a `form` are standardised, from changes (N, m).
+    """Compute the standardisation of features of a `form` from changes (N, m).
 
-    Returns each channel's unit, its usual size; features (N, p) of the form, and their mean and deviation, infinite
-    where one never changes.
+    Returns the unit of each channel (m,), its usual absolute change; the features (N, p); and their mean and standard
+    deviation (p,), which is infinite for a feature that never changes.
     """
     size = np.abs(changes)
     unit = np.median(size, axis=0)
@@ -162,15 +169,17 @@ def _or_infinite(deviation: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Forms:
-    """The `names` of the available forms of features, and the `makers` of learnt forms: of repeated frames, and of
-    images."""
+    """The forms of features that are available.
+
+    `names`: names of all forms; `makers`: functions that fit the learnt forms, which need repeated frames or images.
+    """
 
     names: tuple[str, ...]
     makers: dict[str, Maker]
 
     @classmethod
     def of(cls, answers: Float[np.ndarray, "N d"], imaged: Imaged | None, *, has_reference: bool) -> "Forms":
-        """Select the forms that can be computed from what is known."""
+        """Select the forms that can be computed from the data."""
         makers: dict[str, Maker] = {"whitened": Whitened.learn} if are_repeated(answers) else {}
         if imaged is not None:
             makers |= {"contacts": lambda changes, answers: Contacts(imaged)}
@@ -179,6 +188,6 @@ class Forms:
         return cls((*plain, *makers), makers)
 
     def learn(self, form: str, changes, reference, answers, *, rotated: bool = True) -> Features:
-        """Learn features of one form, see `Features.learn`."""
+        """Fit features of one form, as `Features.learn` does."""
         made = self.makers[form](changes, answers) if form in self.makers else None
         return Features.learn(form, changes, reference, made=made, rotated=rotated)

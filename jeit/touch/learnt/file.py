@@ -1,9 +1,8 @@
-"""Read and write learnt skins: arrays and estimators of scikit-learn in the format of skops, never a pickle.
+"""Read and write learnt skins as files in the format of skops: arrays and estimators of scikit-learn, never a pickle.
 
-Archives of scikit-learn's estimators in skops' format: the same bytes for the same content, and a checksum.
-
-skops numbers objects by their address in memory, and dates its members; here they are numbered in their order, without
-dates. The seal, a checksum, distinguishes a file that was changed from one that jeit wrote; it is no secret.
+Files are ZIP archives with the same bytes for the same content: skops numbers objects by their address in memory and
+stores the time of writing, whereas here objects are numbered in order of appearance, without dates. A checksum, the
+seal, detects files that were changed after jeit wrote them. It contains no secret, so it is no signature.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ from jeit.touch.learnt.numbers import LearntNumbers, Spread
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 _SCHEMA = "schema.json"
-# The number of an object, or the file that is named after it.
+# Matches the number of an object in the schema, and where it is part of the name of a file.
 _NUMBER = re.compile(r'("__id__": |"file": ")(\d+)')
 
 
 def write_sealed(content: Any, file: BinaryIO) -> None:
-    """Write arrays, estimators, and lists and dictionaries of them."""
+    """Write `content` to a sealed archive: arrays and estimators, or lists and dictionaries of them."""
     from skops.io import dumps
 
     with zipfile.ZipFile(io.BytesIO(dumps(content))) as archive:
@@ -59,7 +58,7 @@ def write_sealed(content: Any, file: BinaryIO) -> None:
 
 
 def check_seal(path: Path) -> None:
-    """Raise `ValueError` for an archive that is not as it was written."""
+    """Check the seal of an archive. Raises `ValueError` if the archive was changed after it was written."""
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
         if archive.comment != _seal(members):
@@ -74,7 +73,7 @@ def _seal(members: dict[str, bytes]) -> bytes:
 
 
 _KIND, _VERSION = "a jeit learnt skin", 2
-# Names that fields have in files of version 0.2.
+# Names of fields in files of version 0.2, and their present names.
 _OLD_FIELDS = {"unforetold": "unpredicted"}
 _OURS = {
     one.__name__: one
@@ -114,8 +113,8 @@ def write_skin(skin: LearntSkin, path: str | Path) -> None:
 def read_skin(path: str | Path) -> LearntSkin:
     """Read a learnt skin from a file, or from the folder that `jeit touch fit` made.
 
-    Nothing in the file is executed: it holds numbers, and estimators of scikit-learn. Raises `FileNotFoundError`, and
-    `ValueError` for files of another kind, and those that hold anything else.
+    Nothing in the file is executed: it may contain only numbers and estimators of scikit-learn.
+    Raises `FileNotFoundError`, and `ValueError` for files of another kind or with any other content.
     """
     path = Path(path)
     if path.is_dir():
@@ -126,22 +125,24 @@ def read_skin(path: str | Path) -> LearntSkin:
 
 
 def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], example: str) -> None:
-    """Write the fields of an object, by name, to one file: arrays, estimators, and objects of our own classifiers.
+    """Write the fields `own` of an object, by name, to one file: arrays, estimators, and objects of jeit's classes.
 
-    Raises `ValueError` for a folder; `example`: a file name that the message suggests.
+    `kind` and `version` identify the type of file; `example`: a file name that the error message suggests.
+    Raises `ValueError` if `path` is a folder.
     """
     need_extra("learn", "a file of a learnt skin")
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
     with written_whole(path) as file:
-        write_sealed({"kind": kind, "version": version, "skin": _plain(own)}, file)
+        write_sealed({"kind": kind, "version": version, "skin": _to_plain(own)}, file)
 
 
 def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[dict[str, Any]], Any]) -> Any:
-    """Read a file that `write_plain` wrote, and return what `make` makes of its fields.
+    """Read a file that `write_plain` wrote, and return `make(fields)`, where `fields` are those written, by name.
 
-    Nothing in the file is executed. Raises `ValueError`, which states that it is not what `said` names, for files of
-    another kind, and those that hold anything else.
+    Nothing in the file is executed. `said`: what the file should contain, as error messages name it.
+    Raises `ValueError` for files of another kind, and if the file contains anything but arrays, estimators and objects
+    of jeit's classes.
     """
     need_extra("learn", "a file of a learnt skin")
     from skops.io import get_untrusted_types, load
@@ -157,26 +158,29 @@ def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[d
         if content["version"] != version:
             raise ValueError(f"it is of version {describe(content['version'])}, and this jeit reads {version}")
         check_seal(path)
-        own: Any = _whole(content["skin"])
+        own: Any = _from_plain(content["skin"])
         return make(own)
-    except Exception as error:  # of any kind: classes of many packages are made from the file
+    except Exception as error:  # any exception: the file may create objects of many packages
         raise ValueError(f"'{path}' is not a {said} that can be read ({reason(error)}); fit it again.") from None
 
 
-def _plain(value):
-    """Convert objects of our own classes to dictionaries of their fields."""
+def _to_plain(value):
+    """Convert objects of jeit's classes (`_OURS`) to dictionaries of their fields, recursively."""
     if type(value).__name__ in _OURS and type(value) is _OURS[type(value).__name__]:
-        return {"jeit": type(value).__name__, **{one.name: _plain(getattr(value, one.name)) for one in fields(value)}}
+        return {
+            "jeit": type(value).__name__,
+            **{one.name: _to_plain(getattr(value, one.name)) for one in fields(value)},
+        }
     if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _to_plain(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_to_plain(one) for one in value]
     return value
 
 
-def _whole(value):
-    """Undo `_plain`."""
+def _from_plain(value):
+    """Convert the dictionaries that `_to_plain` made back to objects of jeit's classes."""
     if isinstance(value, dict):
-        held = {_OLD_FIELDS.get(key, key): _whole(one) for key, one in value.items() if key != "jeit"}
+        held = {_OLD_FIELDS.get(key, key): _from_plain(one) for key, one in value.items() if key != "jeit"}
         return _OURS[value["jeit"]](**held) if "jeit" in value else held
-    return [_whole(one) for one in value] if isinstance(value, list) else value
+    return [_from_plain(one) for one in value] if isinstance(value, list) else value

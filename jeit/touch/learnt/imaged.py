@@ -1,4 +1,4 @@
-"""Compute linear images from changes of voltages with a model of the skin, and the strongest contact in each."""
+"""Linear images of changes of voltage, computed with a model of the skin, and the strongest contact in each."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from jeit.mesh import centroids, measures
 from jeit.touch.learnt.extras import in_parts
 from jeit_solvers.engines import as_array
 
-# A contact is the region above this share of its peak, among the cells nearest to the peak, this share of all.
+# A contact is the region above this fraction of its peak, among the cells nearest to the peak; the number of these
+# cells, as a fraction of all.
 _LEVEL, _ROUND = 0.7, 0.2
-# The weight of each number that describes the contact, where each cell of the image weighs one.
+# Weight of each feature of the contact, where each cell of the image has weight 1.
 _WEIGHT = 3.0
 _AT_ONCE = 128
 
 
 @dataclass(frozen=True)
 class Imaged:
-    """Linear images in c cells of changes of m channels, by `matrix` (m, c); touches are positive.
+    """Linear reconstruction of images with c cells from changes of m channels; touches are positive.
 
-    `centres` (c, d), metres, and `sizes` (c,) of the cells; `around` (c, k): the cells nearest to each.
+    `matrix` (m, c): an image is changes times this matrix; `centres` (c, d): centroids of the cells, metres; `sizes`
+    (c,): areas or volumes of the cells; `around` (c, k): indices of the cells nearest to each cell.
     """
 
     matrix: Float[np.ndarray, "m c"]
@@ -38,10 +40,10 @@ class Imaged:
     def create(
         cls, model: ForwardModel, changes: Float[np.ndarray, "N m"], used: Bool[np.ndarray, " M"], reference
     ) -> tuple["Imaged", list[str]]:
-        """Create one-step images of the channels `used`, with a model calibrated on the `reference` (M,), if there is
-        one.
+        """Create a one-step reconstruction from the channels `used`.
 
-        Also returns notes. The sign of touches is determined from the changes of presses.
+        If a `reference` (M,) is given, the model is calibrated on it. The sign of touches is determined from the
+        changes of presses. Also returns notes.
         """
         notes, conductivity, mask = [], 1.0, as_array(used)
         if reference is not None and np.abs(reference[used]).max() > 0:
@@ -58,7 +60,7 @@ class Imaged:
         return cls(sign * matrix, centres, sizes, np.reshape(around, (len(centres), -1))), notes
 
     def contacts(self, images: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "n d+3"]:
-        """Describe the strongest contact of each image: its centroid (d), and the logarithms of peak, integral and
+        """Describe the strongest contact of each image: its centroid (d,), and the logarithms of its peak, integral and
         size."""
         row = np.arange(len(images))[:, None]
         cells = self.around[images.argmax(axis=1)]
@@ -73,7 +75,7 @@ class Imaged:
 
 @dataclass(frozen=True)
 class Contacts:
-    """Features: the strongest contact of the image."""
+    """Features of changes: the strongest contact in their image."""
 
     imaged: Imaged
 
@@ -82,13 +84,16 @@ class Contacts:
         return in_parts(lambda some: self.imaged.contacts(some @ self.imaged.matrix), changes, _AT_ONCE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """The unit of each feature: its own deviation."""
+        """Unit of each feature: its standard deviation."""
         return values.std(axis=0)
 
 
 @dataclass(frozen=True)
 class Images:
-    """Features: the strongest contact, and the image relative to its own size, with the logarithm of that size."""
+    """Features of changes: the strongest contact in their image, and the image itself.
+
+    The image is divided by its root mean square, whose logarithm is another feature.
+    """
 
     imaged: Imaged
 
@@ -103,14 +108,18 @@ class Images:
         return in_parts(features, changes, _AT_ONCE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
-        """The unit of each feature: for the contact a share of its own deviation, for cells that of all."""
+        """Unit of each feature.
+
+        For the contact and the logarithm, it is a fraction of the feature's standard deviation; for all cells of the
+        image, it is the root mean square of their standard deviations.
+        """
         number = values.shape[1] - len(self.imaged.sizes)
         own = values.std(axis=0)
         return np.concatenate([own[:number] / _WEIGHT, np.full(len(own) - number, np.sqrt(np.mean(own[number:] ** 2)))])
 
 
 def check_imaged(model: ForwardModel, num_channels: int) -> None:
-    """Raise `ValueError` for what is no model, and one of another number of channels."""
+    """Check the model of a skin. Raises `ValueError` if it is no model, or has another number of channels."""
     check_kind("model", model, ForwardModel, "a ForwardModel(mesh, electrodes, protocol)")
     number = model.protocol.num_measurements
     if number != num_channels:

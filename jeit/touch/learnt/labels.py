@@ -1,4 +1,4 @@
-"""Learnt labels and keys."""
+"""Learn to classify touches by labels, and which keys are pressed."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _QUICK = "linear-discriminant"
 
 @dataclass(frozen=True)
 class TriedLabels:
-    """A `method` on a `form` of the features, and its results on held-out presses.
+    """Result of a `method` on a `form` of the features, for held-out presses.
 
-    They are the predicted labels (N,), the log-odds (N, C), and the share of errors.
+    `held_out` (N,): indices of the predicted labels; `odds` (N, C): log-odds of the classes; `error`: share of errors.
     """
 
     method: str
@@ -35,7 +35,11 @@ class TriedLabels:
 
 @dataclass(frozen=True)
 class LearntLabels:
-    """A classifier of features, its `classes` (C,), and the sharpness of its probabilities; `notes` on it."""
+    """A classifier of features.
+
+    `classes` (C,): the labels; `sharpness`: factor of the log-odds from which probabilities are computed; `notes`:
+    remarks on the fit.
+    """
 
     features: Features
     model: Any
@@ -44,7 +48,7 @@ class LearntLabels:
     notes: list[str]
 
     def predict(self, changes, reference) -> tuple[np.ndarray, Float[np.ndarray, " n"]]:
-        """Predict labels (n,) and the probability of each (n,)."""
+        """Predict labels (n,) and their probabilities (n,)."""
         odds = log_odds(self.model, self.features(changes, reference))
         return self.classes[odds.argmax(axis=1)], probabilities(odds, self.sharpness).max(axis=1)
 
@@ -59,11 +63,11 @@ def learn_labels(
     imaged: Imaged | None = None,
     progress: Callable[[str], None] = lambda said: None,
 ) -> tuple[LearntLabels, list[TriedLabels]]:
-    """Learn `label` (N,) from changes (N, m), their reference, and images of them where there are any.
+    """Learn labels (N,) from changes (N, m), their reference, and images of the changes if `imaged` is given.
 
-    By `method`, or by the one of the nine with the least error. Also returns the predictions of every method that was
-    tried, in order of their errors on `folds` (N,). The form of the features is the one that suits the linear
-    discriminant best.
+    `method`: one of the nine classifiers; "auto" chooses the one with the lowest error. Also returns the results of all
+    methods that were tried, in order of their errors in cross-validation on `folds` (N,). All use the form of the
+    features with which the linear discriminant has the lowest error.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
@@ -114,14 +118,15 @@ def _hold_out(method, form, forms: Forms, changes, reference, right, folds) -> T
 
 _STRENGTHS = (1e-3, 1e-2, 1e-1, 1.0)
 _FORMS = ("differences", "compressed")
-# The number of channels that best separate one key from the others, for methods that use few; the number of trees.
+# Number of channels that the discriminant and the trees use, those that best separate a key from the others; number of
+# trees.
 _FEW, _TREES = 200, 150
 _TREE: dict[str, Any] = {"max_features": 0.3, "min_samples_leaf": 2, "random_state": 0}
 
 
 @dataclass(frozen=True)
 class Standardised:
-    """Standardised features of one `form`: all of them, or those numbered `chosen`."""
+    """Standardised features of one `form`: all features, or those with the indices `chosen`."""
 
     form: str
     unit: Float[np.ndarray, " m"]
@@ -131,7 +136,7 @@ class Standardised:
 
     @classmethod
     def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "Standardised":
-        """Learn from changes (N, m) and their reference."""
+        """Fit the standardisation to changes (N, m) and their reference."""
         unit, _, mean, deviation = standardisation(form, changes, reference)
         return cls(form, unit, mean, deviation)
 
@@ -143,7 +148,10 @@ class Standardised:
 
 @dataclass(frozen=True)
 class LearntKeys:
-    """For each of K keys: features, a classifier, and the sharpness of its probability."""
+    """Classifiers of K keys.
+
+    `members`: the features, the classifier, and the sharpness of the probability of each key.
+    """
 
     members: list[tuple[Standardised, Any, float]]
 
@@ -157,7 +165,10 @@ class LearntKeys:
 
 @dataclass(frozen=True)
 class TriedKeys:
-    """Methods, one for each key, and their predictions for held-out presses (N, K)."""
+    """Results of the chosen method of each key for held-out presses.
+
+    `methods`: the chosen methods; `held_out` (N, K): predictions; `errors` (K,): shares of errors.
+    """
 
     methods: list[str]
     held_out: Bool[np.ndarray, "N K"]
@@ -172,8 +183,11 @@ def learn_keys(
     *,
     progress: Callable[[str], None] = lambda said: None,
 ) -> tuple[LearntKeys, TriedKeys]:
-    """Learn to classify which of K keys are pressed from changes (N, m); each by the method with the least error on
-    `folds`."""
+    """Learn to predict which of K keys are pressed from changes (N, m).
+
+    Each key is classified by the method with the lowest loss in cross-validation on `folds`. Also returns the results
+    of these methods.
+    """
     reference = np.zeros_like(changes) if reference is None else reference
     number, keys = touched.shape
     odds = {name: np.empty((number, keys)) for name in _candidates()}
@@ -183,7 +197,7 @@ def learn_keys(
         for form in _FORMS:
             features = Standardised.learn(form, changes[~out], reference[~out])
             learnt, asked = features(changes[~out], reference[~out]), features(changes[out], reference[out])
-            rotation = np.linalg.svd(learnt, full_matrices=False)[2].T  # loses nothing linear, and saves much time
+            rotation = np.linalg.svd(learnt, full_matrices=False)[2].T  # faster, and equivalent for linear methods
             linear = learnt @ rotation, asked @ rotation
             for key in range(keys):
                 answers = touched[~out, key].astype(int)
@@ -198,7 +212,7 @@ def learn_keys(
                         model = _logistic(linear[0], answers, strength)
                         odds[name][out, key] = model.decision_function(linear[1])
                     else:
-                        few = _discriminative(learnt, answers)
+                        few = _select_features(learnt, answers)
                         model = _METHODS[needs](learnt[:, few], answers)
                         said = log_odds(model, asked[:, few])
                         odds[name][out, key] = said[:, 1] - said[:, 0]
@@ -208,7 +222,7 @@ def learn_keys(
     members, methods, held_out = [], [], np.empty((number, keys), bool)
     for key in range(keys):
         right = touched[:, key]
-        # The method with the greatest likelihood, not the fewest errors, of which many have the same number.
+        # Choose by the error rate and the likelihood, since many methods have the same number of errors.
         name = min(odds, key=lambda name: _loss(odds[name][:, key], right))
         methods.append(name)
         held_out[:, key] = odds[name][:, key] > 0
@@ -218,7 +232,7 @@ def learn_keys(
 
 
 def _candidates() -> dict[str, tuple[str, float]]:
-    """Candidate methods by name: their kind, and the strength of the fit."""
+    """Candidate methods by name: the kind of classifier, and the constant C of logistic regression."""
     found = {}
     for form in _FORMS:
         found |= {f"logistic, C = {strength:g} on {form}": ("linear", strength) for strength in _STRENGTHS}
@@ -233,14 +247,14 @@ def _member(name: str, changes, reference, answers, odds) -> tuple[Standardised,
     values = features(changes, reference)
     sharp = sharpness_of(np.column_stack([np.zeros(len(odds)), odds]), answers)
     if needs == "linear":
-        return features, _unrotated(values, answers, strength), sharp
-    few = _discriminative(values, answers)
+        return features, _fit_rotated(values, answers, strength), sharp
+    few = _select_features(values, answers)
     chosen = Standardised(features.form, features.unit, features.mean, features.deviation, few)
     return chosen, _METHODS[needs](values[:, few], answers), sharp
 
 
-def _unrotated(values, answers, strength):
-    """Fit logistic regression to rotated features, and convert its coefficients to the given features."""
+def _fit_rotated(values, answers, strength):
+    """Fit logistic regression to rotated features, and convert its coefficients to the original features."""
     rotation = np.linalg.svd(values, full_matrices=False)[2].T
     model = _logistic(values @ rotation, answers, strength)
     model.coef_ = model.coef_ @ rotation.T
@@ -270,15 +284,16 @@ def _trees(values, answers):
 _METHODS = {"discriminant": _discriminant, "trees": _trees}
 
 
-def _discriminative(values: np.ndarray, answers: np.ndarray) -> np.ndarray:
-    """Select the features that differ most between the two answers, relative to their spread within each."""
+def _select_features(values: np.ndarray, answers: np.ndarray) -> np.ndarray:
+    """Select the features whose means differ most between the two classes, relative to the spread within them."""
     one, other = values[answers == 1], values[answers == 0]
     within = np.sqrt((one.var(axis=0) * len(one) + other.var(axis=0) * len(other)) / len(values))
     return np.sort(np.argsort(-np.abs(one.mean(axis=0) - other.mean(axis=0)) / np.maximum(within, 1e-12))[:_FEW])
 
 
 def _loss(odds: np.ndarray, right: np.ndarray) -> float:
-    """Error rate, plus a small multiple of the negative log-likelihood of the answers at the best sharpness."""
+    """Compute the error rate plus 0.1 times the mean negative log-likelihood of the true answers, at the best
+    sharpness."""
     columns = np.column_stack([np.zeros(len(odds)), odds])
     sharp = sharpness_of(columns, right.astype(int))
     likely = probabilities(columns, sharp)[np.arange(len(right)), right.astype(int)]

@@ -35,27 +35,28 @@ from jeit.touch.learnt.presses import (
     standardised,
 )
 
-# A frame is unlike the training set beyond this novelty, 1 for the farthest frame in it; or if a smaller share of its
-# channels is alive.
+# A frame is unlike the training set above this novelty, which is 1 for the farthest frame in it, or below this fraction
+# of channels that are alive.
 _UNLIKE, _FEWEST = 2.0, 0.66
 _AT_ONCE = 256
-# The number of error directions of predicted readings whose effect is computed, the greatest first.
+# Number of principal directions of the error of predicted readings that are propagated to predictions.
 _UNSURE = 4
-# The number of touched frames in which a channel that is alive does not read the same.
+# Minimum number of touched frames for the detection of stuck channels.
 _MANY = 20
-# A reference is another skin's if it is less similar to those of the training set, or if its size differs by this
-# factor.
+# Minimum cosine similarity of a reference to that of the training set; maximum ratio of their norms. Beyond these
+# limits, it is taken for the reference of another skin.
 _ALIKE, _SIZES = 0.8, 5.0
 
 
 @dataclass(frozen=True)
 class LearntSkin:
-    """Models learnt from presses, each None if the presses do not have the quantity; make it with `LearntSkin.fit`.
+    """Models learnt from presses by `LearntSkin.fit`; a model is None if the presses lack its quantity.
 
-    `channels`: their joint model. `place`, `force`, `label`, `keys`: the models of each quantity. `quiet`: frames with
-    smaller changes, in the channels' scales, are of an untouched skin. `mean_reference` (M,). `lag`: rows by which
-    frames came after their presses in the recording. `per_session`: whether changes are standardised by session.
-    `standing`: how well each was learnt, on held-out presses; `notes`: what was corrected.
+    `channels`: joint model of the channels. `place`, `force`, `label`, `keys`: model of each quantity. `quiet`: root
+    mean square of the changes, in the channels' scales, below which the skin counts as untouched. `mean_reference`
+    (M,): mean reference of the training set. `lag`: number of rows by which frames lagged behind their presses.
+    `per_session`: whether changes are standardised by session. `standing`: accuracy of each model on held-out presses;
+    `notes`: corrections that were made.
     """
 
     channels: Channels
@@ -82,14 +83,15 @@ class LearntSkin:
         per_session: bool = False,
         progress: Callable[[str], None] | None = None,
     ) -> "LearntSkin":
-        """Learn from recorded presses.
+        """Fit models to recorded presses.
 
-        `method`: "auto" chooses what has the least error on held-out presses, in intervals of time; or one of
-        `METHODS`, for what it can learn. `model` of the skin, if one is known, of some hundred nodes: its images of the
-        changes, and the contacts in them, are used as features too. `num_channels`: only so many channels, the most
-        informative, are used. `per_session`: changes of each `group` are standardised by themselves, against drift.
-        `progress` is called with what is being tried. Raises `ValueError` for another method, one that cannot learn
-        what the presses have, presses that nothing can be learnt from, and a model of another number of channels.
+        `method`: one of `METHODS`, which applies to the quantities it can learn; "auto" chooses the method with the
+        lowest error on presses held out in intervals of time. `model`: a forward model of the skin, if one is known,
+        with some hundred nodes; its images of the changes, and the contacts in them, are used as additional features.
+        `num_channels`: number of channels to use, the most informative; by default all. `per_session`: standardise the
+        changes of each `group` separately, against drift. `progress`: is called with a description of each step.
+        Raises `ValueError` for an unknown method, a method that can learn none of the presses' quantities, presses from
+        which nothing can be learnt, and a model with another number of channels.
         """
         _check_fit(presses, method, model, num_channels, per_session)
         with one_thread():
@@ -99,7 +101,7 @@ class LearntSkin:
     @classmethod
     def _fit(cls, presses: Presses, method, model, num_channels, per_session, progress) -> "LearntSkin":
         notes = list(presses.notes)
-        presses, dropped = _usable(presses)
+        presses, dropped = _usable_presses(presses)
         notes += dropped
         changes = changes_of(presses.frames, presses.reference)
         if per_session:
@@ -107,7 +109,7 @@ class LearntSkin:
         progress("channels")
         channels = Channels.learn(changes)
         if num_channels is not None:
-            channels, said = _fewer(channels, changes, presses, num_channels)
+            channels, said = _reduce_channels(channels, changes, presses, num_channels)
             notes.append(said)
         elif not channels.used.all():
             silent = np.flatnonzero(~channels.used)
@@ -119,8 +121,8 @@ class LearntSkin:
             notes.append(
                 f"{100 * (1 - alive.mean()):.2g} % of the readings were not borne out by the others: replaced."
             )
-        whole, presses, lag, said = _in_step(whole, presses)
-        quiet = _quiet(whole / channels.scale, presses)
+        whole, presses, lag, said = _align_frames(whole, presses)
+        quiet = _quiet_threshold(whole / channels.scale, presses)
         mean = None if presses.reference is None else mean_reference(presses.reference)
         imaged = None
         if model is not None:
@@ -145,17 +147,17 @@ class LearntSkin:
     def predict(self, frames: ArrayLike, reference: ArrayLike | None = None, group: ArrayLike | None = None) -> Touches:
         """Predict the touches of frames (n, M).
 
-        `reference` (M,) or (n, M) is required if the training presses had one, and the session of each frame (`group`)
-        if sessions are standardised. Channels that have died since are detected and replaced; frames unlike the
-        training set are marked, and have no other prediction. Raises `ValueError` for frames of another number of
-        channels, a reference that is missing, superfluous or another skin's.
+        `reference` (M,) or (n, M) is required if the training presses had a reference; `group` (n,) is the session of
+        each frame, if the skin was learnt `per_session`. Channels that no longer work are detected, and their readings
+        replaced; frames unlike the training set are marked, and have no other prediction. Raises `ValueError` for
+        frames with another number of channels, and for a reference that is missing, superfluous, or of another skin.
         """
         frames = self._check(frames)
         reference = self._reference(frames, reference)
         changes = changes_of(frames, reference)
         if self.per_session:
             changes = standardised(changes, group)
-        changes = np.where(self._stuck(frames, changes), np.nan, changes)
+        changes = np.where(self._stuck_channels(frames, changes), np.nan, changes)
         found = over_threads(
             self._predict,
             changes,
@@ -163,12 +165,13 @@ class LearntSkin:
             at_once=_AT_ONCE,
         )
         said: dict[str, Any] = {one.name: found.get(one.name) for one in fields(Touches) if one.name != "notes"}
-        return Touches(**said, notes=self._doubts(found["alive"], found["unlike"]))
+        return Touches(**said, notes=self._prediction_notes(found["alive"], found["unlike"]))
 
-    def _stuck(self, frames: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Detect channels (M,) that read the same in all of many touched frames, though others change.
+    def _stuck_channels(self, frames: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Detect stuck channels (M,), whose readings are the same in all frames although many frames are touched.
 
-        Untouched frames do not count, since a coarse converter may read the same for long.
+        Only touched frames count, since a coarse converter may give the same readings of an untouched skin for a long
+        time.
         """
         same = (frames == frames[0]).all(axis=0)
         if same.all() or not same.any() or len(frames) < _MANY:
@@ -177,10 +180,11 @@ class LearntSkin:
         return same & (np.count_nonzero(np.sqrt(np.mean(scaled**2, axis=1)) > self.quiet) >= _MANY)
 
     def _predict(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
-        """Predict the fields of `Touches` for some frames, as far as they were learnt."""
+        """Predict the fields of `Touches` that were learnt, for frames with these changes."""
         whole, alive, novelty = self.channels.complete(changes)
         touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
-        # Small changes are no touch, but frames with missing channels may be any.
+        # Small changes mean that the skin is untouched, but frames with too many missing channels always count as
+        # unlike.
         unlike = (novelty > _UNLIKE) & touching | (alive.mean(axis=1) < _FEWEST)
         found = {"novelty": novelty, "unlike": unlike, "alive": np.zeros(changes.shape, bool)}
         found["alive"][:, self.channels.used] = alive
@@ -205,7 +209,10 @@ class LearntSkin:
         return found
 
     def _numbers(self, learnt: LearntNumbers, whole, reference, alive) -> tuple[np.ndarray, np.ndarray]:
-        """Predict numbers (n, d) and their deviations, which include the error of predicted readings."""
+        """Predict targets (n, d) and their standard deviations.
+
+        The standard deviations include the uncertainty of the readings predicted for dead channels.
+        """
         said, std = learnt.predict(whole, reference)
         lacking = np.flatnonzero(~alive.all(axis=1))
         if not lacking.size:
@@ -252,7 +259,7 @@ class LearntSkin:
             )
         return reference
 
-    def _doubts(self, alive: np.ndarray, unlike: np.ndarray) -> tuple[str, ...]:
+    def _prediction_notes(self, alive: np.ndarray, unlike: np.ndarray) -> tuple[str, ...]:
         notes = []
         numbers = np.flatnonzero(self.channels.used)
         alive = alive[:, numbers]
@@ -293,8 +300,11 @@ def _check_fit(presses: Presses, method: str, model, num_channels: int | None, p
         raise ValueError("per_session: presses have no group that says the session of each.")
 
 
-def _usable(presses: Presses) -> tuple[Presses, list[str]]:
-    """Select presses in which at least two thirds of the channels that ever have readings have one."""
+def _usable_presses(presses: Presses) -> tuple[Presses, list[str]]:
+    """Select the presses that have readings of at least two thirds of the channels.
+
+    Channels without a reading in any press do not count.
+    """
     changes = changes_of(presses.frames, presses.reference)
     there = np.isfinite(changes)
     ever = there.any(axis=0)
@@ -310,7 +320,7 @@ def _usable(presses: Presses) -> tuple[Presses, list[str]]:
     return presses.rows(fair), notes
 
 
-def _fewer(channels: Channels, changes: np.ndarray, presses: Presses, number: int) -> tuple[Channels, str]:
+def _reduce_channels(channels: Channels, changes: np.ndarray, presses: Presses, number: int) -> tuple[Channels, str]:
     scaled = np.where(np.isnan(changes), 0.0, changes)[:, channels.used] / channels.scale
     chosen = np.flatnonzero(channels.used)[choose_channels(scaled, _answers(presses), number)]
     kept = np.full(changes.shape, np.nan)
@@ -319,7 +329,7 @@ def _fewer(channels: Channels, changes: np.ndarray, presses: Presses, number: in
 
 
 def _answers(presses: Presses) -> np.ndarray:
-    """All answers of presses (N, q), standardised; 0 where not known."""
+    """Return all quantities of the presses as standardised columns (N, q); 0 where unknown."""
     columns = []
     if presses.positions is not None:
         columns.append(presses.positions)
@@ -334,10 +344,10 @@ def _answers(presses: Presses) -> np.ndarray:
     return np.nan_to_num((values - np.nanmean(values, axis=0)) / np.where(deviation > 0, deviation, 1.0))
 
 
-def _quiet(scaled: np.ndarray, presses: Presses) -> float:
-    """Threshold between the sizes of changes of untouched and of touched frames.
+def _quiet_threshold(scaled: np.ndarray, presses: Presses) -> float:
+    """Compute the root mean square change that separates untouched from touched frames.
 
-    If none was untouched, it is half of the least size of a touch.
+    With fewer than five untouched frames, it is half of the 1 % quantile of the touched frames.
     """
     still = np.zeros(len(scaled), bool)
     if presses.positions is not None:
@@ -350,15 +360,15 @@ def _quiet(scaled: np.ndarray, presses: Presses) -> float:
     if still.sum() < 5:
         return 0.5 * float(np.quantile(size[~still], 0.01))
     sizes = np.sort(size)
-    # The threshold with the fewest errors, each kind counted by its share.
+    # Choose the threshold with the lowest sum of the error rates of untouched and of touched frames.
     wrong = [np.mean(size[still] > at) + np.mean(size[~still] <= at) for at in sizes]
     return float(sizes[int(np.argmin(wrong))])
 
 
-def _in_step(whole: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
-    """Align frames with their presses where they were clearly recorded some rows late.
+def _align_frames(whole: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
+    """Align frames with their presses if the recording clearly has a lag.
 
-    Returns frames, presses, the number of rows, and notes.
+    Returns changes, presses, the lag in rows, and notes.
     """
     if presses.positions is None:
         return whole, presses, 0, []

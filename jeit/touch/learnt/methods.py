@@ -1,8 +1,7 @@
 """Methods of learnt skins: regressors of places and forces, and classifiers of labels.
 
-Regressors of numbers, places or forces, from features, and the Gaussian process among them.
-
-Each takes features (N, k) and standardised targets (N, d), and returns an object with `predict(features)`.
+A regressor is a function of features (N, k) and standardised targets (N, d) that returns an object with
+`predict(features)`. A classifier is a function of features and labels (N,); `log_odds` evaluates what it returns.
 """
 
 from __future__ import annotations
@@ -25,19 +24,19 @@ from jeit.touch.learnt.extras import in_parts
 from jeit.touch.learnt.network import Network
 from jeit_solvers import number_of_cores
 
-# The number of presses from which length and noise are estimated; the greatest number of centres (all presses, if there
-# are no more).
+# Number of presses from which length and noise are estimated; maximum number of centres. If there are no more presses
+# than this, all are centres.
 _TUNED_ON, _CENTRES = 400, 640
 _AT_ONCE = 512
 
 
 @dataclass(frozen=True)
 class GaussianProcess:
-    """A Gaussian process: Σ `weights` (m, d) × kernel of the distance from `centres` (m, k), in `length`s.
+    """Gaussian process regression: the sum of kernels at `centres` (m, k) with `weights` (m, d).
 
-    The kernel is Matérn's of order 3/2, (1 + √3 r) e^(−√3 r). Length and noise maximise the marginal likelihood,
-    Rasmussen and Williams (2006), eq. 5.8; where there are fewer centres than presses, the method is the subset of
-    regressors, section 8.3.1.
+    The kernel is the Matérn kernel of order 3/2, (1 + √3 r) e^(−√3 r), of the distance r from a centre divided by
+    `length`. Length and noise maximise the marginal likelihood, Rasmussen and Williams (2006), eq. 5.8; if there are
+    fewer centres than presses, the method is the subset of regressors, section 8.3.1.
     """
 
     centres: Float[np.ndarray, "m k"]
@@ -80,8 +79,10 @@ def _kernel(distance: np.ndarray) -> np.ndarray:
 
 
 def _tuned(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
-    """Estimate the length, and the ratio of the noise's variance to that of the function, whose own variance is solved
-    for."""
+    """Estimate the length, and the ratio of the variance of the noise to that of the function.
+
+    The variance of the function follows from these two in closed form.
+    """
     apart = cdist(features, features)
     usual = float(np.sqrt(np.mean(apart**2))) or 1.0
 
@@ -108,7 +109,7 @@ def _tuned(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
 
 _ALPHAS = np.logspace(-2, 5, 15)
 _TREES = 100
-# The number of times that each of few presses is presented to a map, in each phase.
+# Maximum number of times that each press is presented to a map, in each phase.
 _SHOWN = 50
 
 
@@ -120,7 +121,7 @@ def ridge(features, targets) -> Any:
 
 
 def trees(features, targets) -> Any:
-    """Fit gradient-boosted trees, a sequence for each target."""
+    """Fit gradient-boosted regression trees, one model for each target."""
     from sklearn.ensemble import HistGradientBoostingRegressor
 
     options = {"max_iter": 100, "max_leaf_nodes": 15, "min_samples_leaf": 8, "l2_regularization": 1.0}
@@ -129,7 +130,7 @@ def trees(features, targets) -> Any:
 
 
 def forest(features, targets) -> Any:
-    """Fit trees with random splits, averaged (Geurts et al. 2006)."""
+    """Fit trees with random splits, whose predictions are averaged (Geurts et al. 2006)."""
     from sklearn.ensemble import ExtraTreesRegressor
 
     targets = targets[:, 0] if targets.shape[1] == 1 else targets
@@ -138,7 +139,7 @@ def forest(features, targets) -> Any:
 
 
 def som(features, targets) -> Any:
-    """Fit Kohonen's map, whose neurons have the targets of the presses that each won, and values between them."""
+    """Fit a self-organising map, which interpolates between the mean targets of the presses that each neuron won."""
     import jax
 
     shown = min(Schedule().ordering, _SHOWN * len(features))
@@ -157,14 +158,14 @@ REGRESSORS: dict[str, Callable[..., Any]] = {
 }
 # Methods that are quick enough to be tried on every form of the features.
 QUICK = ("ridge", "neighbours")
-# Methods that select few informative channels: they are applied to channels, not to their principal components.
+# Methods that select few informative channels: they use the channels instead of principal components.
 OF_CHANNELS = ("forest",)
 
 
-# Of the paper's ensembles: numbers of members, and of leaves of a boosted tree.
+# For the ensembles of Russo et al. (2017): number of members; number of leaves of a boosted tree.
 _MEMBERS, _LEAVES = 30, 21
-# Shrinkage of the covariances of classes with fewer presses than twice the features; and their least variance, relative
-# to their greatest.
+# Shrinkage of covariances if a class has fewer presses than twice the number of features; minimum variance of a class
+# along any axis, relative to the maximum.
 _SHRUNK, _LEAST = 0.1, 1e-4
 
 
@@ -173,26 +174,26 @@ def tree(features, label) -> Any:
     from sklearn.tree import DecisionTreeClassifier
 
     found = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(features, label)
-    return Forest.of_trees([_renumbered(found)], np.ones(1), np.unique(label), votes=False)
+    return Forest.of_trees([_with_numbered_classes(found)], np.ones(1), np.unique(label), votes=False)
 
 
 def linear_discriminant(features, label) -> Any:
-    """Fit a linear discriminant: normal classes with one covariance, with Ledoit-Wolf shrinkage."""
+    """Fit a linear discriminant: normal classes with a common covariance, with Ledoit-Wolf shrinkage."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
     try:
         return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(features, label)
     except np.linalg.LinAlgError:
-        # LAPACK's least squares fail on some singular covariances, although they are finite.
+        # LAPACK's least squares fails for some singular covariances, although their elements are finite.
         return LinearDiscriminantAnalysis(solver="eigen", shrinkage="auto").fit(features, label)
 
 
 @dataclass(frozen=True)
 class QuadraticDiscriminant:
-    """A quadratic discriminant: normal classes with a mean (C, k) and a covariance each.
+    """A quadratic discriminant: normal classes, each with its own `mean` (C, k) and covariance.
 
-    `whiten` (C, k, k) is the inverse factor of the covariance, and `offset` (C,) the logarithm of the density at the
-    mean and of the class's share (Russo et al. 2017, eq. 1).
+    `whiten` (C, k, k): factor of the inverse covariance; `offset` (C,): logarithm of the density at the mean times the
+    class's share of the presses, up to a constant (Russo et al. 2017, eq. 1).
     """
 
     mean: Float[np.ndarray, "C k"]
@@ -202,7 +203,10 @@ class QuadraticDiscriminant:
 
     @classmethod
     def fit(cls, features, label) -> "QuadraticDiscriminant":
-        """Fit the classes; covariances are shrunk towards their mean variance where presses are too few for one."""
+        """Fit the classes.
+
+        If a class has too few presses for a covariance, all covariances are shrunk towards multiples of the identity.
+        """
         classes, number = np.unique(label, return_inverse=True)
         shrunk, size = shrinkage_of(features, label), features.shape[1]
         everywhere = np.mean(np.var(features, axis=0))
@@ -219,7 +223,7 @@ class QuadraticDiscriminant:
         return cls(np.array(means), np.array(whiten), np.array(offset), classes)
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Logarithms of the densities of the classes, times their shares."""
+        """Compute the logarithms (n, C) of each class's density times its share of the presses, up to a constant."""
         found = np.empty((len(features), len(self.offset)))
         for one, (mean, whiten, offset) in enumerate(zip(self.mean, self.whiten, self.offset, strict=True)):
             found[:, one] = offset - 0.5 * np.sum(((features - mean) @ whiten) ** 2, axis=1)
@@ -241,18 +245,20 @@ def quadratic_svm(features, label) -> Any:
 
 
 def boosted_trees(features, label) -> Any:
-    """Fit trees boosted by AdaBoost, with one weighted vote each."""
+    """Fit decision trees by AdaBoost, in which each tree has one weighted vote."""
     from sklearn.ensemble import AdaBoostClassifier
     from sklearn.tree import DecisionTreeClassifier
 
     one = DecisionTreeClassifier(max_leaf_nodes=_LEAVES, random_state=0)
     found = AdaBoostClassifier(one, n_estimators=_MEMBERS, random_state=0).fit(features, label)
     members, weights = found.estimators_, found.estimator_weights_[: len(found.estimators_)]
-    return Forest.of_trees([_renumbered(one, found) for one in members], weights, np.unique(label), votes=True)
+    return Forest.of_trees(
+        [_with_numbered_classes(one, found) for one in members], weights, np.unique(label), votes=True
+    )
 
 
 def bagged_trees(features, label) -> Any:
-    """Fit trees to resampled presses, independently of each other."""
+    """Fit decision trees, each independently to a bootstrap sample of the presses."""
     from joblib import parallel_config
     from sklearn.ensemble import BaggingClassifier
     from sklearn.tree import DecisionTreeClassifier
@@ -263,11 +269,13 @@ def bagged_trees(features, label) -> Any:
     with parallel_config("threading"):
         found = bagged.fit(features, label)
     weights = np.full(_MEMBERS, 1 / _MEMBERS)
-    return Forest.of_trees([_renumbered(one) for one in found.estimators_], weights, np.unique(label), votes=False)
+    return Forest.of_trees(
+        [_with_numbered_classes(one) for one in found.estimators_], weights, np.unique(label), votes=False
+    )
 
 
 def subspace_discriminant(features, label) -> Any:
-    """Fit linear discriminants, each to half of the features."""
+    """Fit an ensemble of linear discriminants, each to a random half of the features."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
     from sklearn.ensemble import BaggingClassifier
 
@@ -278,8 +286,10 @@ def subspace_discriminant(features, label) -> Any:
 
 @dataclass(frozen=True)
 class LinearEnsemble:
-    """An ensemble of T linear classifiers, with `weights` (T, C, k) and `intercepts` (T, C), whose probabilities are
-    averaged."""
+    """An ensemble of T linear classifiers, whose probabilities are averaged.
+
+    `weights` (T, C, k) and `intercepts` (T, C) give the log-odds of the classes.
+    """
 
     weights: Float[np.ndarray, "T C k"]
     intercepts: Float[np.ndarray, "T C"]
@@ -287,26 +297,26 @@ class LinearEnsemble:
 
     @classmethod
     def of(cls, bagged, number: int) -> "LinearEnsemble":
-        """Convert scikit-learn's linear discriminants, each on some of `number` features."""
+        """Convert a scikit-learn ensemble of linear discriminants, each fitted to some of `number` features."""
         members = bagged.estimators_
         weights = np.zeros((len(members), len(bagged.classes_), number))
         intercepts = np.zeros(weights.shape[:2])
         for one, some, weight, intercept in zip(members, bagged.estimators_features_, weights, intercepts, strict=True):
-            binary = len(one.coef_) == 1  # two classes: the odds of the second
+            binary = len(one.coef_) == 1  # two classes: only the log-odds of the second are given
             weight[-1 if binary else slice(None), some] = one.coef_[0] if binary else one.coef_
             intercept[-1 if binary else slice(None)] = one.intercept_[0] if binary else one.intercept_
         return cls(weights, intercepts, bagged.classes_)
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Probabilities of the classes."""
+        """Compute the probabilities (n, C) of the classes, averaged over the ensemble."""
         found = np.zeros((len(features), len(self.classes_)))
         for weight, intercept in zip(self.weights, self.intercepts, strict=True):
             found += probabilities(features @ weight.T + intercept, 1.0)
         return found / len(self.weights)
 
 
-def _renumbered(tree, among=None):
-    """Convert a tree so that its classes are indices of its leaves' shares among all `classes_`."""
+def _with_numbered_classes(tree, among=None):
+    """Replace the classes of a tree by their indices, among the classes of the ensemble `among` if it is given."""
     tree.classes_ = np.arange(len(tree.classes_)) if among is None else np.searchsorted(among.classes_, tree.classes_)
     return tree
 
@@ -325,15 +335,16 @@ CLASSIFIERS: dict[str, Callable[..., Any]] = {
 
 
 def shrinkage_of(features, label) -> float:
-    """Shrinkage of the covariances of classes, 0 where every class has twice as many presses as features."""
+    """Shrinkage of the covariances of classes; 0 if every class has at least twice as many presses as features."""
     fewest = np.unique(label, return_counts=True)[1].min()
     return _SHRUNK if fewest < 2 * features.shape[1] else 0.0
 
 
 def log_odds(model, features) -> Float[np.ndarray, "n C"]:
-    """A classifier's scores for each class (n, C).
+    """Compute a classifier's scores for each class (n, C).
 
-    They are logarithms of probabilities, alone or relative to every other class, or distances from decision boundaries.
+    Depending on the classifier, they are logarithms of probabilities, sums of these over pairs of classes, votes, or
+    distances from decision boundaries.
     """
     if hasattr(model, "predict_proba"):
         return np.log(np.maximum(model.predict_proba(features), 1e-6))
@@ -344,14 +355,14 @@ def log_odds(model, features) -> Float[np.ndarray, "n C"]:
 
 
 def probabilities(odds: np.ndarray, sharpness: float) -> Float[np.ndarray, "n C"]:
-    """Probabilities of each class (n, C), from its log-odds times the `sharpness`."""
+    """Compute the probability of each class (n, C) from its log-odds times the `sharpness`."""
     scaled = sharpness * odds
     powers = np.exp(scaled - scaled.max(axis=1, keepdims=True))
     return powers / powers.sum(axis=1, keepdims=True)
 
 
 def sharpness_of(odds: np.ndarray, right: np.ndarray) -> float:
-    """The sharpness that maximises the likelihood of held-out presses, of classes `right` (N,)."""
+    """Choose the sharpness that maximises the likelihood of the true classes `right` (N,) of held-out presses."""
     candidates = np.geomspace(0.02, 50, 60)
     rows = np.arange(len(right))
     likely = [np.mean(np.log(np.maximum(probabilities(odds, one)[rows, right], 1e-9))) for one in candidates]

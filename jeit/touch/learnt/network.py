@@ -11,13 +11,16 @@ import numpy as np
 from jaxtyping import Float
 
 _WIDTH, _BATCH, _EPOCHS, _RATE, _DECAY = 64, 64, 150, 3e-3, 1e-2
-# Noise added to features in every batch, relative to their scale.
+# Standard deviation of the noise added to features in each batch, relative to their scale.
 _NOISE = 0.1
 
 
 @dataclass(frozen=True)
 class Network:
-    """Layers of weights (out, in) and biases (out,), hyperbolic tangents between them; `scale` (k,) of features."""
+    """A fully connected network: `weights` (out, in) and `biases` (out,) of each layer, with tanh between layers.
+
+    Features are divided by `scale` (k,) first.
+    """
 
     weights: list[Float[np.ndarray, "o i"]]
     biases: list[Float[np.ndarray, " o"]]
@@ -33,7 +36,7 @@ class Network:
 
     @classmethod
     def train(cls, features, targets) -> "Network":
-        """Train by Adam with weight decay and decreasing steps, on batches with noise added to their features."""
+        """Train by Adam with weight decay and a decreasing rate, with noise added to the features of each batch."""
         import jax
         import jax.numpy as jnp
 
@@ -42,8 +45,8 @@ class Network:
         steps = _EPOCHS * max(1, -(-len(features) // _BATCH))
         rng = np.random.default_rng(0)
         order = np.concatenate([rng.permutation(len(features)) for _ in range(_EPOCHS)])
-        # Rows that pad to the next batch, none of which is used: folds of about the same size share the compiled
-        # function.
+        # The number of rows is padded to a multiple of the batch size, so that folds of about the same size share the
+        # compiled function; no batch uses the added rows.
         more = ((0, -len(features) % _BATCH), (0, 0))
         layers = _training(steps)(
             jnp.asarray(np.pad(features / scale, more), jnp.float32),
@@ -59,7 +62,7 @@ class Network:
 def _training(steps: int) -> Callable[..., Any]:
     """Return a function that trains a network in `steps` steps, compiled once for each shape.
 
-    It returns the layers, from features, targets, the rows of each batch, and two keys.
+    The function returns the layers, from features, targets, the rows of each batch, and two keys.
     """
     import equinox as eqx
     import jax

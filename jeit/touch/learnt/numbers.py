@@ -1,4 +1,4 @@
-"""Learnt numbers: predictions of places or forces with calibrated standard deviations."""
+"""Learn to predict places or forces, with calibrated standard deviations."""
 
 from __future__ import annotations
 
@@ -17,18 +17,23 @@ from jeit.touch.learnt.imaged import Imaged
 from jeit.touch.learnt.methods import OF_CHANNELS, QUICK, REGRESSORS
 
 _LIKE, _SHARES = 40, ((1.0, 0.6827), (1.96, 0.95))
-# The weight of a frame's size relative to its place, and of the mean of all errors relative to those of similar
-# presses.
+# Weight of the size of the changes relative to the predicted values, in the distance between presses; fraction of a
+# variance that is the mean squared error of all presses, where the rest is that of similar presses.
 _SIZE, _ALL = 0.3, 0.15
-# The least number of presses from which the coverage of a deviation is estimated.
+# Minimum number of presses from which the coverage of standard deviations is estimated.
 _ENOUGH = 30
-# The least standard deviation, as a share of the spread of the training set.
+# Minimum standard deviation, relative to the spread of the predictions for the training set.
 _LEAST = 1e-4
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Squared errors (N, d) of held-out presses, at their places `where` (N, d + 1); `unit` (d + 1,) of these."""
+    """Model of the standard deviations of predictions, from the errors of similar held-out presses.
+
+    `where` (N, d + 1): predicted values of the held-out presses and the logarithm of the size of their changes, minus
+    `low` (d + 1,) and divided by `unit` (d + 1,); `squares` (N, d): squared errors of these presses; `factor` (d,):
+    calibration factors of the standard deviations.
+    """
 
     where: Float[np.ndarray, "N e"]
     squares: Float[np.ndarray, "N d"]
@@ -38,10 +43,11 @@ class Spread:
 
     @classmethod
     def learn(cls, said: np.ndarray, changes: np.ndarray, errors: np.ndarray, last: np.ndarray) -> "Spread":
-        """Learn from predictions (N, d) for held-out presses, their changes (N, m), and their errors (N, d).
+        """Fit to predictions `said` (N, d) for held-out presses, their changes (N, m), and their errors (N, d).
 
-        `last` (N,): presses that came before or after all others when they were held out, as future presses do:
-        deviations are calibrated on those, if there are enough.
+        `last` (N,): presses recorded before or after all presses that their predictions were learnt from. If there are
+        enough of them, the standard deviations are calibrated on these alone, since future presses are predicted
+        likewise.
         """
         where = np.column_stack([said, _size(changes)])
         low, unit = where.mean(axis=0), where.std(axis=0)
@@ -50,22 +56,22 @@ class Spread:
         most = np.quantile(np.abs(errors), 0.99, axis=0)  # one large error is not representative of its neighbours
         squares = np.minimum(np.abs(errors), most) ** 2
         found = cls((where - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
-        local = found._local(found.where, own=True)
+        local = found._local_deviations(found.where, own=True)
         last = last if last.sum() >= _ENOUGH else np.ones_like(last)
         factor = [_factor(np.abs(error) / one) for error, one in zip(errors[last].T, local[last].T, strict=True)]
         return cls(found.where, squares, low, unit, np.array(factor))
 
     def __call__(self, said: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "n d"]:
-        """Standard deviations (n, d) of predictions (n, d) for frames with these changes."""
+        """Compute the standard deviations (n, d) of predictions `said` (n, d) for frames with these changes (n, m)."""
         where = (np.column_stack([said, _size(changes)]) - self.low) / self.unit
-        return self.factor * self._local(where)
+        return self.factor * self._local_deviations(where)
 
     def held_out(self, said: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "N d"]:
-        """Standard deviations of the presses of the training set, each without its own error."""
+        """Compute the standard deviations (N, d) of the held-out presses, each without its own error."""
         where = (np.column_stack([said, _size(changes)]) - self.low) / self.unit
-        return self.factor * self._local(where, own=True)
+        return self.factor * self._local_deviations(where, own=True)
 
-    def _local(self, where: np.ndarray, *, own: bool = False) -> np.ndarray:
+    def _local_deviations(self, where: np.ndarray, *, own: bool = False) -> np.ndarray:
         number = min(_LIKE, len(self.where) - 1)
         near = np.asarray(self._tree.query(where, number + own)[1])[:, int(own) :]
         like = self.squares[near].mean(axis=1)
@@ -82,7 +88,11 @@ def _size(changes: np.ndarray) -> np.ndarray:
 
 
 def _factor(ratios: np.ndarray) -> float:
-    """The factor by which the coverage of one deviation and of 1.96 is nearest to that of a normal variable."""
+    """Compute the calibration factor of standard deviations from the ratios of errors to standard deviations.
+
+    With this factor, the shares of errors within 1 and 1.96 standard deviations are nearest to those of a normal
+    distribution.
+    """
     candidates = np.geomspace(0.2, 5, 200)
     missed = [
         max(abs(np.mean(ratios <= times * candidate) - share) for times, share in _SHARES) for candidate in candidates
@@ -92,13 +102,16 @@ def _factor(ratios: np.ndarray) -> float:
 
 BLEND = "blend"
 METHODS = ("auto", *REGRESSORS, BLEND)
-# The greatest number of methods that are blended; the error that a blend must be below, relative to the best alone.
+# Maximum number of methods in a blend; maximum error of a blend, relative to that of the best single method.
 _BLENDED, _BETTER = 3, 0.98
 
 
 @dataclass(frozen=True)
 class Tried:
-    """A `method` on a `form` of the features, and its predictions for held-out presses (N, d)."""
+    """Result of a `method` on a `form` of the features.
+
+    `held_out` (N, d): predictions for held-out presses; `error`: their mean error.
+    """
 
     method: str
     form: str
@@ -107,16 +120,16 @@ class Tried:
 
     @property
     def name(self) -> str:
-        """The method and the form; of a blend, those that it consists of."""
+        """Name of the method and the form; for a blend, the names of its members."""
         return f"{self.method}: {self.form}" if self.method == BLEND else f"{self.method} on {self.form}"
 
 
 @dataclass(frozen=True)
 class LearntNumbers:
-    """An average of models, with standard deviations of its predictions.
+    """The average of several regressors, with standard deviations of its predictions.
 
-    `members`, each features and a model, whose mean is the standardised answer: targets are `mean` + `scale` × that;
-    `spread` estimates its standard deviation.
+    `members`: pairs of features and a regressor of standardised targets; a prediction is `mean` + `scale` × the average
+    of the members. `spread`: model of the standard deviations.
     """
 
     members: list[tuple[Features, Any]]
@@ -125,7 +138,7 @@ class LearntNumbers:
     spread: Spread
 
     def predict(self, changes, reference) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-        """Predict numbers (n, d) and their standard deviations (n, d)."""
+        """Predict targets (n, d) and their standard deviations (n, d)."""
         said = 0.0
         for features, model in self.members:
             said = said + np.asarray(model.predict(features(changes, reference))).reshape(len(changes), -1)
@@ -143,16 +156,16 @@ def learn_numbers(
     imaged: Imaged | None = None,
     progress: Callable[[str], None] = lambda said: None,
 ) -> tuple[LearntNumbers, list[Tried]]:
-    """Learn `targets` (N, d) from changes (N, m), their reference, and images of them where there are any.
+    """Learn `targets` (N, d) from changes (N, m), their reference, and images of the changes if `imaged` is given.
 
-    By `method`, or by the best of all. Also returns the predictions of every method that was tried, in order of its
-    mean error on `folds` (N,). Quick methods are tried on all forms of the features, the others on the two forms that
-    suited those best.
+    `method`: one of `METHODS`; "auto" chooses the best method, or a blend if it is better. Also returns the results of
+    all methods that were tried, in order of their mean errors in cross-validation on `folds` (N,). Quick methods are
+    tried on all forms of the features, the others on the one or two forms with the lowest error of a quick method.
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
     forms = Forms.of(targets, imaged, has_reference=has_reference)
-    cut = _Cut(changes, reference, targets, folds, forms)
+    cut = _CrossValidation(changes, reference, targets, folds, forms)
     tried = []
     for form in forms.names:
         for quick in QUICK:
@@ -170,7 +183,7 @@ def learn_numbers(
     chosen = _chosen(tried, targets, blend=method == BLEND) if method in ("auto", BLEND) else tried[:1]
     said = np.mean([one.held_out for one in chosen], axis=0)
     if len(chosen) > 1:
-        tried.insert(0, Tried(BLEND, " + ".join(one.name for one in chosen), said, _off(said, targets)))
+        tried.insert(0, Tried(BLEND, " + ".join(one.name for one in chosen), said, _mean_distance(said, targets)))
     members = []
     for one in chosen:
         progress(f"{one.method}, all presses")
@@ -183,12 +196,12 @@ def learn_numbers(
 
 
 def _chosen(tried: list[Tried], targets: np.ndarray, *, blend: bool) -> list[Tried]:
-    """The best alone, or the best of each method together where that is better, or required."""
+    """Choose the best method alone, or a blend of several methods if it is better or `blend` requires it."""
     own = list({one.method: one for one in reversed(tried)}.values())
     own = sorted(own, key=_error)[:_BLENDED]
     together = [own[:number] for number in range(2, len(own) + 1)]
-    best = min(together, key=lambda some: _off(np.mean([one.held_out for one in some], axis=0), targets))
-    error = _off(np.mean([one.held_out for one in best], axis=0), targets)
+    best = min(together, key=lambda some: _mean_distance(np.mean([one.held_out for one in some], axis=0), targets))
+    error = _mean_distance(np.mean([one.held_out for one in best], axis=0), targets)
     return best if blend or error < _BETTER * own[0].error else own[:1]
 
 
@@ -196,13 +209,13 @@ def _error(one: Tried) -> float:
     return one.error
 
 
-def _off(said: np.ndarray, targets: np.ndarray) -> float:
-    """Mean distance of predictions from targets."""
+def _mean_distance(said: np.ndarray, targets: np.ndarray) -> float:
+    """Compute the mean distance of predictions from targets."""
     return float(np.linalg.norm(said - targets, axis=1).mean())
 
 
-class _Cut:
-    """Presses cut into folds, with the features of each form computed once for all methods."""
+class _CrossValidation:
+    """Cross-validation of methods, in which the features of each form and fold are computed once for all methods."""
 
     def __init__(self, changes, reference, targets, folds, forms: Forms):
         self.changes, self.reference, self.targets, self.folds = changes, reference, targets, folds
@@ -221,7 +234,7 @@ class _Cut:
             said[out] = self.mean + self.scale * np.asarray(model.predict(asked)).reshape(int(out.sum()), -1)
 
         over_folds(predict, self.folds.max() + 1)
-        return Tried(method, form, said, _off(said, self.targets))
+        return Tried(method, form, said, _mean_distance(said, self.targets))
 
     def _scores(self, form: str, fold: int, out: np.ndarray, *, rotated: bool) -> tuple[np.ndarray, np.ndarray]:
         if (form, fold, rotated) not in self.features:

@@ -1,4 +1,4 @@
-"""Recorded presses: frames with known places and forces, changes from rest, and the lag between the two."""
+"""Recorded presses: frames with known places and forces, changes from the untouched skin, and the lag of the frames."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from jeit.arguments import readings
 from jeit.files import need, npz_arrays
 from jeit.touch.learnt.features import Features
 
-# The least number of frames of a session that can be standardised by itself.
+# Minimum number of frames of a session, if sessions are standardised separately.
 _SESSION = 20
 
 
 def changes_of(frames: Float[np.ndarray, "n M"], reference: np.ndarray | None) -> Float[np.ndarray, "n M"]:
-    """Subtract the reference from frames, if there is one."""
+    """Subtract the reference from the frames; without a reference, return the frames."""
     return frames if reference is None else frames - reference
 
 
 def standardised(changes: np.ndarray, group) -> np.ndarray:
-    """Standardise changes (n, M): subtract their session's median, and divide by their session's deviation.
+    """Standardise changes (n, M): subtract the median of their session, and divide by its standard deviation.
 
-    All are one session unless `group` (n,) is given. Raises `ValueError` for sessions of fewer than 20 frames.
+    `group` (n,): the session of each frame; without it, all frames are of one session. Raises `ValueError` for sessions
+    of fewer than 20 frames, and for a `group` of another shape.
     """
     group = np.zeros(len(changes), int) if group is None else np.asarray(group)
     if group.shape != (len(changes),):
@@ -46,7 +47,7 @@ def standardised(changes: np.ndarray, group) -> np.ndarray:
 
 
 def mean_reference(reference: np.ndarray) -> np.ndarray:
-    """Mean reference of every channel; 0 where it has no reading at all."""
+    """Compute the mean reference of each channel; 0 for channels without any reading."""
     there = np.isfinite(reference)
     return np.where(there, reference, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
 
@@ -54,21 +55,21 @@ def mean_reference(reference: np.ndarray) -> np.ndarray:
 def reference_used(
     reference: np.ndarray | None, mean: np.ndarray | None, used: Bool[np.ndarray, " M"], number: int
 ) -> Float[np.ndarray, "n m"]:
-    """Reference (n, M) of the channels `used`; zeros if there is none.
+    """Return the reference (n, m) of the channels `used`; zeros if there is no reference.
 
-    Where it has no reading, the `mean` (M,) of the training set is used.
+    Missing readings are replaced by the `mean` (M,) reference of the training set.
     """
     if reference is None or mean is None:
         return np.zeros((number, int(used.sum())))
     return np.where(np.isnan(reference), mean, reference)[:, used]
 
 
-# No known skin is longer: its coordinates would be in millimetres.
+# Maximum extent of the positions: larger ones must be in millimetres.
 _LONGEST = 5.0  # m
-# No press is harder: forces would be in grams or millinewtons.
+# Maximum force of a press: larger ones must be in grams or millinewtons.
 _HARDEST = 2000.0  # N
 _FEWEST, _FEWEST_OF_A_KIND = 10, 4
-# The label of a frame of an untouched skin.
+# Label of a frame of the untouched skin.
 NO_TOUCH = "none"
 _NO_TOUCH = ("none", "no touch", "no-touch", "no_touch", "notouch")
 _ROWS = ("positions", "force", "label", "touched", "group", "time")
@@ -76,16 +77,17 @@ _ROWS = ("positions", "force", "label", "touched", "group", "time")
 
 @dataclass(frozen=True)
 class Presses:
-    """N presses on a skin of M channels; what is None was not recorded. Make them with `Presses.create`.
+    """N presses on a skin with M channels, created by `Presses.create`; quantities that were not recorded are None.
 
     **Fields**
 
-    - `frames`: (N, M), in any unit; NaN where there is no reading.
-    - `reference`: (N, M), the untouched skin's frame that goes with each, None if frames are changes already.
-    - `positions`: (N, 2 or 3) metres, NaN where nothing touched; `force`: (N,) N; `label`: (N,) text, "none" where
-      nothing touched; `touched`: (N, K), which of K keys were pressed.
-    - `group`: (N,), the session or person of each: cross-validation never splits one; `time`: (N,) s.
-    - `name`, for errors and reports; `notes`: what was mended.
+    - `frames`: (N, M), in any unit; NaN where a reading is missing.
+    - `reference`: (N, M), the frame of the untouched skin that belongs to each frame; None if frames are already
+      changes.
+    - `positions`: (N, 2) or (N, 3), metres, NaN where nothing touched; `force`: (N,), newtons; `label`: (N,), text,
+      "none" where nothing touched; `touched`: (N, K), which of K keys were pressed.
+    - `group`: (N,), the session or person of each press, which cross-validation never splits; `time`: (N,), seconds.
+    - `name`: the name in errors and reports; `notes`: corrections that were made.
     """
 
     frames: Float[np.ndarray, "N M"]
@@ -113,10 +115,11 @@ class Presses:
         time: ArrayLike | None = None,
         name: str = "presses",
     ) -> "Presses":
-        """Validate recorded presses; shapes and units as of the fields, `reference` also (M,) for all.
+        """Create presses from recorded arrays, and validate them.
 
-        Raises `ValueError` for shapes that disagree, fewer than ten presses, positions in millimetres, nothing to
-        learn, and values that cannot be.
+        Shapes and units are those of the fields; `reference` may also be one frame (M,) for all presses.
+        Raises `ValueError` for inconsistent shapes, fewer than ten presses, positions that seem to be in millimetres,
+        presses without any quantity to learn, and invalid values.
         """
         frames = check_frames("frames", frames)
         if len(frames) < _FEWEST:
@@ -140,25 +143,24 @@ class Presses:
         return replace(cls(frames, reference, name=name), **given)
 
     def rows(self, index: ArrayLike | slice) -> "Presses":
-        """Select presses by number, or by a slice."""
+        """Select presses by their indices, or by a slice."""
         kept = {key: getattr(self, key) for key in ("frames", "reference", *_ROWS)}
         return replace(self, **{key: None if values is None else values[index] for key, values in kept.items()})
 
 
 def read_presses(path: str | Path) -> Presses:
-    """Read presses from an NPZ file with arrays named as the fields of `Presses`: `frames`, and any of the others.
+    """Read presses from an NPZ file with arrays named as the fields of `Presses`: `frames`, and optionally the others.
 
-    Raises `FileNotFoundError`, and `ValueError` for what is no such file and as `Presses.create` does.
+    Raises `FileNotFoundError`, and `ValueError` for any other file and as `Presses.create` does.
     """
     with _naming(path):
         return Presses.create(**_arrays(path, "frames", "reference", *_ROWS), name=Path(path).name)
 
 
 def read_frames(path: str | Path) -> dict[str, np.ndarray]:
-    """Read the arguments of `LearntSkin.predict` from an NPZ file: `frames`, and `reference` and `group` if it has
-    them.
+    """Read the arguments of `LearntSkin.predict` from an NPZ file: `frames`, and optionally `reference` and `group`.
 
-    Raises `FileNotFoundError`, and `ValueError` for what is no such file.
+    Raises `FileNotFoundError`, and `ValueError` for any other file.
     """
     with _naming(path):
         arrays = _arrays(path, "frames", "reference", "group")
@@ -166,7 +168,7 @@ def read_frames(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def _arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
-    """Read the named arrays that a file has, `frames` at least."""
+    """Read the named arrays from a file: `frames`, which is required, and the others if the file contains them."""
     if Path(path).is_dir():
         raise ValueError("it is a folder; give an NPZ file.")
     if not Path(path).is_file():
@@ -178,7 +180,7 @@ def _arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
 
 @contextmanager
 def _naming(path: str | Path) -> Iterator[None]:
-    """Add the name of the file to errors."""
+    """Add the name of the file to any `ValueError` raised in this context."""
     try:
         yield
     except ValueError as error:
@@ -186,9 +188,9 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 
 def check_frames(name: str, given) -> Float[np.ndarray, "N M"]:
-    """Convert frames (N, M) to numbers; infinite ones and those beyond any instrument become NaN.
+    """Convert frames (N, M) to floating-point numbers; readings that are infinite or impossibly large become NaN.
 
-    Raises `ValueError` for what is none.
+    Raises `ValueError` for anything but a two-dimensional array of real numbers.
     """
     try:
         frames = np.asarray(given)
@@ -203,8 +205,10 @@ def check_frames(name: str, given) -> Float[np.ndarray, "N M"]:
 
 
 def check_reference(given, frames) -> Float[np.ndarray, "N M"]:
-    """Return a reference (N, M) for each of the `frames`; raises `ValueError` for other shapes, and where it is not
-    finite."""
+    """Return a reference (N, M) with a row for each of the `frames`; infinite readings become NaN.
+
+    Raises `ValueError` for other shapes and types.
+    """
     reference = np.asarray(given)
     if reference.dtype.kind not in "fiu" or reference.shape not in (frames.shape, frames.shape[1:]):
         raise ValueError(
@@ -316,15 +320,17 @@ def _one_dimensional(name: str, given: ArrayLike) -> np.ndarray:
 
 
 _MOST, _NEIGHBOURS, _COMPONENTS = 2, 8, 12
-# A lag is found if the error of places estimated without one is at least this share of that of a guess, that with the
-# lag is less, and that with any other lag is greater by this many standard errors.
+# Conditions for a lag, by the mean errors of estimated places. Without a lag, the error is more than this fraction of
+# the error of guessing the mean place, and with the lag it is less. With any other lag, the error is larger by more
+# than this number of standard errors.
 _GUESS, _STANDARD_ERRORS = 0.95, 4.0
 
 
 def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tuple[int, float, float]:
-    """Estimate by how many rows frames come after their presses, 0 unless there is clear evidence.
+    """Estimate by how many rows frames lag behind their presses; 0 without clear evidence of a lag.
 
-    Also returns the mean error of places estimated from the nearest frames without a lag and with it, metres.
+    Also returns two mean errors, metres, of places estimated from the most similar frames: without the lag, and with
+    it.
     """
     features = Features.learn("normalised", changes, np.zeros_like(changes))
     scores = features(changes, np.zeros_like(changes))[:, :_COMPONENTS]
@@ -339,7 +345,7 @@ def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tup
 
 
 def shifted(number: int, lag: int) -> tuple[slice, slice]:
-    """Rows of frames, and of their presses, among `number` rows that were recorded with a lag."""
+    """Return slices of frames and of the presses they belong to, for a recording of `number` rows with this `lag`."""
     return slice(max(lag, 0), number + min(lag, 0)), slice(max(-lag, 0), number - max(lag, 0))
 
 
@@ -357,16 +363,18 @@ def _errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: i
 
 @dataclass(frozen=True)
 class Touches:
-    """Predictions for n frames; what was not learnt is None.
+    """Predictions for n frames; quantities that were not learnt are None.
 
     **Fields**
 
-    - `position` (n, 2 or 3) metres with standard deviations `position_std`; `force` (n,) N with `force_std`; `label`
-      (n,) text with `probability`; `touched` (n, K), which keys are pressed, with `key_probability`. NaN, "" and false
-      where nothing touches, and in frames that are unlike the training set.
-    - `unlike` (n,): frames unlike the training set, by their `novelty` (n,), 1 for the farthest frame in it.
-    - `alive` (n, M): channels that were used.
-    - `notes`: what was corrected.
+    - `position` (n, 2) or (n, 3), metres, with standard deviations `position_std`; `force` (n,), newtons, with
+      `force_std`; `label` (n,), text, with its `probability`; `touched` (n, K), which keys are pressed, with
+      `key_probability`. In frames unlike the training set, numbers are NaN, labels "" and keys false. Where nothing
+      touches, positions are NaN, forces 0, labels "none" and keys false.
+    - `unlike` (n,): whether a frame is unlike the training set; `novelty` (n,): its distance from the training set, 1
+      for the farthest frame in it.
+    - `alive` (n, M): whether a channel was used.
+    - `notes`: corrections that were made.
     """
 
     position: Float[np.ndarray, "n d"] | None

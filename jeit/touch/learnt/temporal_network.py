@@ -1,7 +1,7 @@
-"""A small network on the course of a touch: convolutions over time, pooled, with features of the whole touch.
+"""A small convolutional network that classifies touches from their course over time and features of the whole touch.
 
-A few networks are trained at once with equinox and optax from different initial weights, and their probabilities are
-averaged; they are evaluated in NumPy, where a touch takes a fraction of a millisecond.
+A few networks with different initial weights are trained at once with equinox and optax, and their probabilities are
+averaged. They are evaluated in NumPy, which takes a fraction of a millisecond per touch.
 """
 
 from __future__ import annotations
@@ -16,19 +16,21 @@ from jaxtyping import Float
 
 _HIDDEN, _DENSE, _WIDE = 24, 32, 5
 _MEMBERS, _BATCH, _EPOCHS, _RATE, _DECAY = 2, 64, 45, 3e-3, 2e-2
-# Noise added to features in every batch, relative to their scale; label smoothing; the share of the pooled values that
-# is dropped in each batch.
+# Standard deviation of the noise added to features in each batch, relative to their scale; amount of label smoothing;
+# dropout rate of the values that enter the dense layer.
 _NOISE, _SMOOTHED, _DROPPED = 0.15, 0.05, 0.2
 
 
 @dataclass(frozen=True)
 class TemporalNetwork:
-    """An ensemble of s networks that classify the course of a touch.
+    """An ensemble of s networks that classify touches from their course over time.
 
-    Features (n, k) are `whole` numbers, then a course of T places with c values each, place by place.
+    Each row of the features (n, k) contains `whole` features of the whole touch, then c values for each of T time
+    steps, step by step.
 
-    **Fields**: weights of the `first` (s, h, 5 c) and `second` (s, h, 5 h) convolution, of the `dense` layer (s, d,
-    whole + 2 h) and the `last` (s, C, d), of s networks, with a `..._bias` each; `whole`; `classes_` (C,).
+    **Fields**: `first` (s, h, 5 c) and `second` (s, h, 5 h): weights of the convolutions; `dense` (s, d, whole + 2 h)
+    and `last` (s, C, d): weights of the fully connected layers; `..._bias`: the biases of each layer; `whole`: number
+    of features of the whole touch; `classes_` (C,): the classes.
     """
 
     first: Float[np.ndarray, "s h i"]
@@ -43,7 +45,7 @@ class TemporalNetwork:
     classes_: np.ndarray
 
     def predict_proba(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n C"]:
-        """Probabilities (n, C) of the classes, averaged over the networks."""
+        """Compute the probabilities (n, C) of the classes, averaged over the networks."""
         course = features[:, self.whole :].reshape(len(features), -1, self.first.shape[2] // _WIDE)
         said = np.zeros((len(features), len(self.classes_)))
         for one in range(len(self.first)):
@@ -60,7 +62,10 @@ class TemporalNetwork:
     def fit(
         cls, features: Float[np.ndarray, "n k"], label: np.ndarray, *, whole: int, values: int
     ) -> "TemporalNetwork":
-        """Learn classes `label` (n,), by AdamW on batches with noise added to the features; `values`: c, a place's."""
+        """Train networks on the classes `label` (n,) by AdamW, with noise added to the features of each batch.
+
+        `whole`: number of features of the whole touch; `values`: number of values at each time step, c.
+        """
         import jax
         import jax.numpy as jnp
 
@@ -68,8 +73,8 @@ class TemporalNetwork:
         steps = _EPOCHS * max(1, -(-len(features) // _BATCH))
         rng = np.random.default_rng(0)
         order = np.concatenate([rng.permutation(len(features)) for _ in range(_EPOCHS)])
-        # Rows that pad to the next batch, none of which is used: folds of about the same size share the compiled
-        # function.
+        # The number of rows is padded to a multiple of the batch size, so that folds of about the same size share the
+        # compiled function; no batch uses the added rows.
         more = -len(features) % _BATCH
         trained = _training(steps, whole, values, len(classes))(
             jnp.asarray(np.pad(features, ((0, more), (0, 0))), jnp.float32),
@@ -85,7 +90,7 @@ def _relu(values):
 
 
 def _windows(course, engine):
-    """Each place (n, T, 5 c) with the two before and the two after it; zeros beyond the ends."""
+    """Concatenate each time step with the two before and the two after it (n, T, 5 c); zeros beyond the ends."""
     half, length = _WIDE // 2, course.shape[-2]
     padded = engine.pad(course, ((0, 0), (half, half), (0, 0)))
     return engine.concatenate([padded[:, one : one + length] for one in range(_WIDE)], axis=-1)
@@ -95,8 +100,8 @@ def _windows(course, engine):
 def _training(steps: int, whole: int, values: int, classes: int) -> Callable[..., Any]:
     """Return a function that trains networks in `steps` steps, compiled once for each shape.
 
-    It returns their weights and biases, in order, from features, numbers of classes, the rows of each batch, and a key
-    for each network.
+    The function returns weights and biases, layer by layer, from features, indices of the classes, the rows of each
+    batch, and a key for each network.
     """
     import jax
     import jax.numpy as jnp

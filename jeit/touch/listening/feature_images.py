@@ -1,12 +1,13 @@
 """Feature images of sound: the intensity of every microphone over time, above the spectrogram of the loudest one.
 
-They follow Park et al. (2022): a window of 0.5 s has 41 frames, 12 ms apart; an image has M rows of intensity, one for
-each microphone, and 64 rows of the spectrogram, so that 25 microphones give 89 × 41. Sampled at 10 kHz, a frame is 128
-samples under a Hann window, 120 samples after the one before, and bins 1 to 64 of its transform are the 64 bands.
+The images are those of Park et al. (2022): a window of 0.5 s has 41 frames, 12 ms apart; an image has M rows of
+intensity, one for each microphone, and 64 rows of the spectrogram, so that 25 microphones give 89 × 41. At a sampling
+rate of 10 kHz, a frame consists of 128 samples under a Hann window, and begins 120 samples after the previous frame;
+bins 1 to 64 of its Fourier transform are the 64 bands.
 
-At any other rate, frames have the same duration, and bands are made of bins by their frequency: nothing is resampled.
-Up to `highest` = 5 kHz all bands are as wide as a bin, 78 Hz; for a higher `highest`, the lowest band keeps this width,
-and each band is wider than the one below it by the same factor.
+At any other rate, frames have the same duration, and bins are assigned to bands by their frequency; sound is not
+resampled. Up to `highest` = 5 kHz, all bands are as wide as a bin, 78 Hz; for a larger `highest`, the lowest band has
+this width, and each band is wider than the one below it by the same factor.
 """
 
 from __future__ import annotations
@@ -24,14 +25,14 @@ from jeit.acoustic import Recording
 from jeit.arguments import check_kind, describe, is_number
 
 BANDS, FRAMES = 64, 41
-# Seconds: duration of a frame, from frame to frame, from window to window.
+# Duration of a frame, time from frame to frame, and time from window to window, seconds.
 FRAME, HOP, EVERY = 0.0128, 0.012, 0.1
 LENGTH = FRAME + (FRAMES - 1) * HOP
-"""Seconds of a window."""
-# Hertz: the highest frequency at which all bands are as wide as a bin; the least `highest`, below which fewer than 8
-# bins are left.
+"""Duration of a window, seconds."""
+# Maximum of `highest` for which all bands are as wide as a bin; minimum of `highest`, below which fewer than 8 bins
+# would be left; hertz.
 EVEN, LOWEST = 5000.0, 625.0
-# The number of windows whose images are made at once.
+# Number of windows whose images are computed at once.
 _AT_ONCE = 128
 
 
@@ -39,9 +40,10 @@ _AT_ONCE = 128
 class SoundImages:
     """Feature images of W windows of one recording.
 
-    `times` (W,): the middles of the windows, in seconds; `intensity` (W, M, 41): the power of each microphone;
-    `spectrum` (W, 64, 41): the power of the `strongest` microphone (W,) in each band, per bin. Powers are in the square
-    of the samples' unit. `known` (W,): whether more than half of a window's samples are finite.
+    `times` (W,): middles of the windows, seconds; `intensity` (W, M, 41): power of each microphone; `strongest` (W,):
+    index of the loudest microphone; `spectrum` (W, 64, 41): power of this microphone in each band, divided by the
+    number of bins in the band. Powers are in the square of the samples' unit. `known` (W,): whether more than half of a
+    window's samples are finite.
     """
 
     times: Float[np.ndarray, " W"]
@@ -65,18 +67,18 @@ class SoundImages:
 
     @property
     def levelled(self) -> "SoundImages":
-        """The same windows with powers divided by the `loudness` of each; silent windows stay as they are."""
+        """The same windows, with powers divided by the `loudness` of each window; silent windows are unchanged."""
         least = np.where(self.loudness > 0, self.loudness, 1.0)[:, None, None]
         return replace(self, intensity=self.intensity / least, spectrum=self.spectrum / least)
 
     @classmethod
     def joined(cls, parts: "list[SoundImages]") -> "SoundImages":
-        """Concatenate the windows of several recordings; the times of each recording begin at its own zero."""
+        """Concatenate the windows of several recordings; times remain relative to the start of each recording."""
         return cls(*(np.concatenate([getattr(one, name) for one in parts]) for name in cls.__dataclass_fields__))
 
 
 def check_highest(highest: float) -> float:
-    """Check the highest frequency of sound images, Hz. Raises `ValueError` for what is none."""
+    """Check the maximum frequency of sound images, Hz. Raises `ValueError` if it is no number or too low."""
     if not (is_number(highest) and LOWEST <= highest < np.inf):
         raise ValueError(
             f"highest must be a frequency in Hz, {LOWEST:g} or more, of the features; it is {describe(highest)}."
@@ -85,11 +87,15 @@ def check_highest(highest: float) -> float:
 
 
 def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
-    """Edges of the 64 bands, Hz; where all bands are even, `highest` is the middle of the last."""
+    """Compute the edges of the 64 bands, Hz.
+
+    Up to `highest` = 5 kHz, all bands have the same width; at 5 kHz, `highest` is the middle of the last band.
+    """
     bin_width = 1 / FRAME
     if highest <= EVEN:
         return bin_width * (0.5 + np.arange(BANDS + 1))
-    # f = a (e^(bk) - 1) from half a bin on, a b = one bin; brentq finds b with the last edge half a bin above highest.
+    # The edges are half a bin plus a (e^(bk) - 1), where a b is the width of a bin; `brentq` finds b such that the last
+    # edge is half a bin above `highest`.
     number = np.arange(BANDS + 1)
     factor: Any = brentq(lambda b: bin_width * np.expm1(b * BANDS) / b - highest, 1e-9, 1.0)
     return bin_width * (0.5 + np.expm1(factor * number) / factor)
@@ -98,9 +104,9 @@ def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
 def sound_images(recording: Recording, highest: float = EVEN) -> SoundImages:
     """Compute the feature images of all windows of a recording, every 0.1 s.
 
-    Sound above `highest` Hz is left out; bands above half the rate are empty. A recording shorter than 0.5 s is padded
-    with 0.3 s of silence before and after it. Samples that are not finite count as zero. Raises `ValueError` for what
-    is no recording of samples, rates below 1250 Hz, and no frequency.
+    Sound above the frequency `highest`, Hz, is left out; bands above half the sampling rate are empty. A recording
+    shorter than 0.5 s is padded with 0.3 s of silence before and after it. Samples that are not finite count as zero.
+    Raises `ValueError` if `recording` is no recording of samples, its rate is below 1250 Hz, or `highest` is invalid.
     """
     return SoundImages.joined(list(image_blocks(recording, highest)))
 
@@ -108,7 +114,7 @@ def sound_images(recording: Recording, highest: float = EVEN) -> SoundImages:
 def image_blocks(recording: Recording, highest: float = EVEN) -> Iterator[SoundImages]:
     """Compute the images of `sound_images` in blocks of windows, for recordings of any length.
 
-    Raises `ValueError` as `sound_images`.
+    Raises `ValueError` as `sound_images` does.
     """
     check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
     check_highest(highest)
@@ -153,22 +159,22 @@ def _blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
 
 
 def _powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarray) -> Float[np.ndarray, "F 64"]:
-    """Power in each band and frame, before scaling."""
+    """Compute the power in each frame and band (F, 64), before scaling."""
     frames = sliding_window_view(channel, len(taper))[::hop]
-    # A constant offset would leak into the lowest band.
+    # The mean is subtracted, since a constant offset would leak into the lowest band.
     spectrum = np.fft.rfft((frames - frames.mean(axis=1, keepdims=True)) * taper)
     return (np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ weights
 
 
 def _per_frame(finite: np.ndarray, length: int, hop: int) -> np.ndarray:
-    """Share of each frame's samples that are finite (M, F)."""
+    """Compute the share of each frame's samples that are finite (M, F)."""
     return sliding_window_view(finite, length, axis=1)[:, ::hop].mean(axis=-1)
 
 
 def _weights(length: int, rate: float, highest: float) -> Float[np.ndarray, "K 64"]:
-    """Share of each bin's interval of frequency, (k ± 1/2) rate / length, that lies in each band.
+    """Compute the share of each bin's frequency interval, (k ± 1/2) rate / length, that lies in each band.
 
-    Bin 0, and frequencies above half the rate or above `highest`, have no share.
+    The share is 0 for bin 0, and for frequencies above half the rate or above `highest`.
     """
     edges = band_edges(highest)
     width = rate / length

@@ -14,9 +14,9 @@ from jeit.acoustic import Intensities, Recording, read_recording
 from jeit.arguments import check_kind, counted
 from jeit.touch.listening.feature_images import LOWEST
 
-# The greatest number of unread files that a note names.
+# Maximum number of unread files that a note describes.
 _NAMED = 4
-# Relative difference of sampling rates below which they are taken as equal.
+# Relative difference of sampling rates below which they count as equal.
 _SAME_RATE = 1e-3
 
 
@@ -37,9 +37,10 @@ class _Files(Sequence):
 class LabelledClips:
     """n labelled clips of sound.
 
-    `recordings`: a sequence of `Recording`; `labels` (n,): their classes; `groups` (n,): names of the people or things
-    that they are held out with; `channels`: the number of channels of all, 1 where they are mixed; `highest`: the
-    frequency, Hz, up to which all of them have sound; `notes`: notes on them.
+    `recordings`: a sequence of `Recording`; `labels` (n,): their classes; `groups` (n,): names of the groups, such as
+    of people or things, in which clips are held out together; `channels`: number of channels of all clips, 1 if they
+    are mixed; `highest`: frequency up to which all clips have sound, Hz; `notes`: remarks on the clips; `name`: their
+    name.
     """
 
     recordings: Sequence[Recording]
@@ -60,11 +61,12 @@ class LabelledClips:
         notes: Sequence[str] = (),
         name: str = "clips",
     ) -> "LabelledClips":
-        """Create labelled clips from `recordings` of classes `labels`; each is a group of its own unless `groups` are
-        given.
+        """Create labelled clips from `recordings` and their classes `labels`.
 
-        Clips with different numbers of channels are mixed to one. `notes` are kept, together with those made here.
-        Raises `ValueError` for numbers that do not match, what is no recording of samples, and fewer than two classes.
+        `groups`: the group of each clip; by default each clip is a group of its own. Clips with different numbers of
+        channels are mixed to one channel. `notes` are stored together with those made here. Raises `ValueError` if
+        there is not one label and group for each recording, for anything but recordings of samples, and for fewer than
+        two classes.
         """
         check_kind("recordings", recordings, Sequence, "a list of Recording, as of read_recording(path)")
         named = np.asarray(labels)
@@ -98,7 +100,7 @@ class LabelledClips:
         return cls(recordings, named.astype(str), own, width, low / 2, tuple(said), name)
 
     def clip(self, number: int) -> Recording:
-        """Return one clip, mixed to one channel where all are."""
+        """Return the clip with this index, mixed to one channel if all clips are."""
         return self.recordings[number] if self.channels > 1 else mixed(self.recordings[number])
 
     def __len__(self) -> int:
@@ -109,11 +111,11 @@ class LabelledClips:
 def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = None) -> LabelledClips:
     """Read labelled clips: every sub-folder of `folder` is a class, and every file in it a clip of that class.
 
-    Files are WAV, NPZ, or what `soundfile` reads where it is installed. Clips in a folder within a class's folder, such
-    as of a person or a day, are one group, together with those of the other classes in a folder of the same name;
-    otherwise every file is a group. Files that cannot be read are left out and listed in `notes`; hidden files are
-    ignored. `progress` is called with a description of the progress. Raises `ValueError` where there is no such folder,
-    fewer than two classes, or a class none of whose clips can be read.
+    Files are WAV, NPZ, or any format that `soundfile` reads if it is installed. Clips in a folder within the folder of
+    a class, such as of one person or day, are one group, together with the clips of other classes in a folder of the
+    same name; any other file is a group of its own. Files that cannot be read are left out and listed in `notes`;
+    hidden files are ignored. `progress` is called with a description of the progress. Raises `ValueError` if there is
+    no such folder, there are fewer than two classes, or no clip of a class can be read.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -142,14 +144,14 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
         if len(read) == before:
             why = failed[-1][1] if files else "it is empty"
             raise ValueError(f"'{one}': there is no clip in it that can be read ({why}).")
-    notes = [_not_read(failed)] if failed else []
+    notes = [_describe_unread(failed)] if failed else []
     if beside:
         notes.append(f"{counted(len(beside), 'file')} of no class, beside their folders, left out ('{min(beside)}').")
     return LabelledClips.of(_Files(read), labels, groups, notes=notes, name=folder.name or str(folder))
 
 
-def _not_read(failed: list[tuple[str, str]]) -> str:
-    """Describe how many files were not read, and why: one of each kind first."""
+def _describe_unread(failed: list[tuple[str, str]]) -> str:
+    """Describe how many files were not read, and why; reasons for files of different formats come first."""
     seen: dict[str, int] = {}
     order = []
     for place, (kind, why) in enumerate(failed):
@@ -161,7 +163,7 @@ def _not_read(failed: list[tuple[str, str]]) -> str:
 
 
 def _check_clip(clip: Recording | Intensities, name: str) -> None:
-    """Raise `ValueError` for a clip that cannot be learnt from."""
+    """Raise `ValueError` for a clip that is of no use for training."""
     if not isinstance(clip, Recording):
         raise ValueError(f"{name}: it holds intensities, not samples.")
     known = clip.samples[np.isfinite(clip.samples)]
@@ -174,7 +176,7 @@ def _check_clip(clip: Recording | Intensities, name: str) -> None:
 
 
 def mixed(recording: Recording) -> Recording:
-    """Mix all channels of a recording to one, their mean."""
+    """Mix all channels of a recording to one channel, their mean."""
     if len(recording.samples) == 1:
         return recording
     mean = recording.samples.mean(axis=0, keepdims=True)

@@ -1,7 +1,7 @@
 """Classifiers of sound windows: the network, boosted trees on hand-made features, and linear discriminants.
 
-The discriminants use the hand-made features alone, or with the spectrum in all its bands. Each learner is a class with
-`learn`; what it gives has `log_odds` of the classes 0 … C − 1, and arrays that a file stores.
+The discriminants use the hand-made features alone, or with the spectrum in all its bands. The method `learn` of each
+learner returns a classifier, which has `log_odds` of the classes 0 … C − 1, and arrays that are stored in a file.
 """
 
 from __future__ import annotations
@@ -23,23 +23,24 @@ from jeit.touch.listening.modality_network import ModalityNetwork, NetworkAnswer
 from jeit.touch.listening.window_features import Levels, sound_features, spectrum_features
 from jeit.touch.training import Plan
 
-# Rounds of boosting, leaves of a tree, and the least number of windows in a leaf, for sets that are large enough.
+# Number of boosting rounds; number of leaves of a tree; minimum number of windows in a leaf if the set is large.
 _ROUNDS, _LEAVES, _IN_A_LEAF = 100, 15, 10
 BATCHES = 1500
-"""The greatest number of training batches, by default."""
-# The greatest number of passes through the windows of a small set, and the least number of batches.
+"""Default of the maximum number of training batches."""
+# Limits for small sets: maximum number of passes through the windows, unless these are fewer batches than the second
+# number.
 _THROUGH, _FEWEST = 40, 100
-# Of the groups of each class, one in this number is held out for early stopping of the network's training.
+# One in this number of groups of each class is held out for early stopping of the network's training.
 _STOPPING = 6
 
 
 class Lesson(NamedTuple):
     """A training set of windows, and the settings of a training.
 
-    `images`: the windows; `right` (W,): their classes, 0 … C − 1 of `classes`; `groups` (W,): numbers of what was
-    recorded together; `key`: draws the networks' weights; `batches`: the greatest number of training batches;
-    `checkpoint`: the file in which an unfinished training is stored; `progress`: is called with a description of the
-    progress.
+    `images`: the windows; `right` (W,): their classes, 0 … C − 1; `classes`: the number of classes C; `groups` (W,):
+    numbers that are equal for windows recorded together; `key`: draws the initial weights of networks; `batches`:
+    maximum number of training batches; `checkpoint`: file in which an unfinished training is stored; `progress`: is
+    called with a description of the progress.
     """
 
     images: SoundImages
@@ -54,7 +55,7 @@ class Lesson(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkListener:
-    """A trained network, and the `levels` that scale its images."""
+    """A trained network, and the `levels` that compute its images."""
 
     network: ModalityNetwork
     levels: Levels
@@ -66,23 +67,26 @@ class NetworkListener:
         return cls(network, levels, NetworkAnswers(network))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
-        """Log-odds (W, C) of the classes."""
+        """Compute the log-odds (W, C) of the classes."""
         return self.answers.log_odds(self.levels(images))
 
     def kept(self) -> tuple[dict[str, Any], Any]:
-        """Header and arrays to store."""
+        """Return the header and the arrays to store in a file."""
         levels = {name: getattr(self.levels, name).tolist() for name in Levels.__dataclass_fields__}
         return {"levels": levels}, self.network
 
 
 @dataclass(frozen=True)
 class NetworkLearner:
-    """Trains a network, by the schedule of `plan(windows, batches=)`."""
+    """Trains a network by the schedule `plan(windows, batches=)`."""
 
     plan: Callable[..., Plan]
 
     def learn(self, lesson: Lesson) -> NetworkListener:
-        """Train a network, stopped by the loss on held-out groups: one in six of each class, where there are enough."""
+        """Train a network with early stopping, by the loss on held-out groups.
+
+        One in six groups of each class is held out, if it has enough groups.
+        """
         held = stopping_rows(lesson.right, lesson.groups)
         levels = Levels.of(lesson.images[~held])
         shown = levels(lesson.images)
@@ -105,12 +109,12 @@ class NetworkLearner:
 
     @staticmethod
     def like(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Arrays of the same shapes."""
+        """Create arrays with the shapes of the stored ones."""
         return ModalityNetwork.draw(jax.random.key(0), rows, 41, classes)
 
     @staticmethod
     def made(head: dict[str, Any], arrays: Any) -> NetworkListener:
-        """Restore a listener from what `NetworkListener.kept` returned."""
+        """Restore a classifier from the header and arrays of `NetworkListener.kept`."""
         return NetworkListener.of(arrays, Levels(**{name: np.array(value) for name, value in head["levels"].items()}))
 
 
@@ -122,7 +126,7 @@ class TreesListener:
 
     @classmethod
     def learn(cls, lesson: Lesson) -> "TreesListener":
-        """Fit the trees; leaves may be smaller in small sets."""
+        """Fit the trees; the minimum number of windows in a leaf is lower in small sets."""
         from sklearn.ensemble import HistGradientBoostingClassifier
 
         fewest = int(np.bincount(lesson.right, minlength=lesson.classes).min())
@@ -140,11 +144,11 @@ class TreesListener:
         return cls(Forest.of_boosted_classes(model))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
-        """Log-odds (W, C) of the classes."""
+        """Compute the log-odds (W, C) of the classes."""
         return self.forest.decision_function(sound_features(images))
 
     def kept(self) -> tuple[dict[str, Any], Any]:
-        """Header and arrays to store."""
+        """Return the header and the arrays to store in a file."""
         own = self.forest
         head = {"trees": own.value.shape[0], "nodes": own.value.shape[1], "depth": own.depth}
         arrays = [own.feature, own.left, own.right, own.threshold, own.value, own.start]
@@ -152,7 +156,7 @@ class TreesListener:
 
     @staticmethod
     def like(head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Arrays of the same shapes."""
+        """Create arrays with the shapes of the stored ones."""
         shape = (int(head["trees"]), int(head["nodes"]))
         shapes = [(shape, np.int32)] * 3 + [
             (shape, np.float32),
@@ -163,7 +167,10 @@ class TreesListener:
 
     @classmethod
     def made(cls, head: dict[str, Any], arrays: Any) -> "TreesListener":
-        """Restore a listener from what `kept` returned. Raises `ValueError` for trees that no features lead down."""
+        """Restore a classifier from the header and arrays of `kept`.
+
+        Raises `ValueError` for trees with features or nodes that do not exist.
+        """
         feature, left, right, threshold, value, start = (np.asarray(one) for one in arrays)
         nodes = value.shape[1]
         sound = (feature >= 0).all() and (feature < num_features()).all() and 0 < int(head["depth"]) < 1000
@@ -197,11 +204,11 @@ class LinearListener:
     offset: Float[np.ndarray, " C"]
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
-        """Log-odds (W, C) of the classes."""
+        """Compute the log-odds (W, C) of the classes."""
         return (self.features(images) - self.mean) / self.deviation @ self.weights + self.offset
 
     def kept(self) -> tuple[dict[str, Any], Any]:
-        """Header and arrays to store."""
+        """Return the header and the arrays to store in a file."""
         return {}, [np.asarray(one, np.float32) for one in (self.mean, self.deviation, self.weights, self.offset)]
 
 
@@ -212,10 +219,11 @@ class LinearLearner:
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
 
     def learn(self, lesson: Lesson) -> LinearListener:
-        """Fit the discriminant; all classes have the same prior probability, however many windows they have."""
+        """Fit the discriminant; all classes have the same prior probability, whatever their number of windows."""
         features = self.features(lesson.images)
         mean, deviation = features.mean(axis=0), features.std(axis=0)
-        # Features that are constant but for rounding carry no information, and make the covariance singular.
+        # Features that are constant except for rounding errors carry no information, and would make the covariance
+        # singular.
         varies = deviation > 1e-5
         deviation = np.where(varies, deviation, 1.0)
         model = CLASSIFIERS["linear-discriminant"](((features - mean) / deviation)[:, varies], lesson.right)
@@ -223,17 +231,17 @@ class LinearLearner:
         weights = np.zeros((len(mean), len(model.coef_)))
         weights[varies] = model.coef_.T
         offset = model.intercept_ - (share if len(share) > 2 else share[1] - share[0])
-        if weights.shape[1] == 1:  # two classes: the odds of the second
+        if weights.shape[1] == 1:  # two classes: only the log-odds of the second are given
             weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
         return LinearListener(self.features, mean, deviation, weights, offset)
 
     def like(self, head: dict[str, Any], classes: int, rows: int) -> Any:
-        """Arrays of the same shapes."""
+        """Create arrays with the shapes of the stored ones."""
         number = self.features(_NOTHING).shape[1]
         return [jax.numpy.zeros(one, np.float32) for one in ((number,), (number,), (number, classes), (classes,))]
 
     def made(self, head: dict[str, Any], arrays: Any) -> LinearListener:
-        """Restore a listener from what `LinearListener.kept` returned."""
+        """Restore a classifier from the header and arrays of `LinearListener.kept`."""
         return LinearListener(self.features, *(np.asarray(one, float) for one in arrays))
 
 
@@ -244,8 +252,8 @@ LEARNERS: dict[str, Any] = {
     "spectrum": LinearLearner(spectrum_features),
     "linear": LinearLearner(sound_features),
 }
-"""Learners by name; the network by the schedule of the paper, and by our own. Of those that are equally accurate the
-last is taken, which is the simplest."""
+"""Learners by name, the simplest last, which is chosen among equally accurate ones; the network is trained by the
+schedule of the paper, or by this library's."""
 
 
 def num_features() -> int:
@@ -259,7 +267,7 @@ _NOTHING = SoundImages(np.zeros(0), np.zeros((0, 1, 41)), np.zeros((0, 64, 41)),
 def stopping_rows(right: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -> np.ndarray:
     """Choose the windows (W,) that are held out for early stopping: whole groups, spread over the classes.
 
-    None is taken of a class that has fewer than three groups.
+    No group is held out of a class that has fewer than three.
     """
     held = np.zeros(len(right), bool)
     chosen: set[int] = set()
@@ -271,5 +279,5 @@ def stopping_rows(right: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -
         order = np.random.default_rng(int(one)).permutation(len(rest))
         chosen |= {rest[place] for place in order[: max(0, wanted - len(already))]}
     held = np.isin(groups, sorted(chosen))
-    # Every class must remain in the training set.
+    # Every class must remain in the training set, otherwise nothing is held out.
     return held if set(right[~held].tolist()) == set(right.tolist()) else np.zeros(len(right), bool)

@@ -1,4 +1,4 @@
-"""`Listener`: a sound classifier, trained on labelled clips, that names the sound in a recording every 0.1 s."""
+"""`Listener`: a sound classifier, trained on labelled clips, that classifies the sound of a recording every 0.1 s."""
 
 from __future__ import annotations
 
@@ -25,15 +25,16 @@ from jeit.touch.listening.windows import LOUD, Windows, held_out_folds
 from jeit.touch.training import read_model, write_model
 
 METHODS = ("auto", *LEARNERS)
-# Methods that "auto" tries: our own schedule gives an equally good network in fewer batches.
+# Methods that "auto" tries: the paper's schedule is left out, since this library's gives an equally good network in
+# fewer batches.
 _TRIED = tuple(name for name in LEARNERS if name != "paper-network")
-# The greatest number of folds by which the method is chosen. Windows whose power is below this share of that of the
-# quietest in the training set are quiet.
+# Maximum number of folds in which clips are held out; power below which a window is quiet, relative to that of the
+# quietest training window.
 _FOLDS, _QUIET = 3, 0.25
-# The least loudness of a recording with lower gain, as a share of the softest clip's power; the number of windows from
-# which on a network is tried.
+# Minimum loudness of a recording with a lower gain than the clips, relative to that of the softest clip; minimum number
+# of windows for which a network is tried.
 _SOFTER, _FOR_NETWORKS = 1 / 16, 3000
-# Samples within which a working microphone has changed its reading.
+# Number of samples within which the readings of a working microphone change.
 _LOOKED_AT = 100_000
 _KIND, _VERSION = "a jeit listener", 2
 
@@ -42,13 +43,14 @@ _KIND, _VERSION = "a jeit listener", 2
 class Listener:
     """A trained classifier of sounds.
 
-    **Fields**: `names` (C,): the classes; `method` and the trained `model`; `channels`: the number of microphones, 1
-    where they are mixed; `highest`: the highest frequency used, Hz; `loudness`: whether loudness is a feature, or all
-    windows are made equally loud; `quietest`: the least loudness in the training set; `clips_loudness`: that of the
-    softest and of the loudest clip; `sharpness` of the probabilities; `doubt`: the share of each probability that is
-    spread evenly over all names, 1 / (n + 2) for n held-out clips, which limits the confidence to what these can
-    support. `standing`: the prediction for each held-out clip, and the errors of all methods that were tried, the best
-    first, None for a listener read from a file; `notes` on it.
+    **Fields**: `names` (C,): the classes; `method` and the trained `model`; `channels`: number of microphones, 1 if
+    they are mixed; `highest`: maximum frequency used, Hz; `loudness`: whether loudness is a feature, otherwise all
+    windows are scaled to equal loudness; `quietest`: minimum loudness of a training window; `clips_loudness`: loudness
+    of the softest and of the loudest clip; `sharpness`: factor of the log-odds from which probabilities are computed;
+    `doubt`: fraction of the probability that is spread evenly over all classes, 1 / (n + 2) for n held-out clips, since
+    these support no higher confidence. `standing`: predictions for the held-out clips, and errors of all methods that
+    were tried, the best first; None for a listener that was read from a file; `notes`: remarks on the training; `name`:
+    name of the clips.
     """
 
     names: tuple[str, ...]
@@ -77,16 +79,17 @@ class Listener:
         folder: str | Path | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> "Listener":
-        """Train on labelled clips by one of `METHODS`, or by "auto", the method most accurate on held-out clips.
+        """Train a listener on labelled clips.
 
-        Clips are held out in three folds, with all of their group; a clip counts as right if it is classified correctly
-        as a whole. The training windows of a clip are those no more than 20 dB below its loudest, since the rest is not
-        what the label describes; in clips longer than 4 s every sound counts as a clip. `loudness`: whether it is used
-        as a feature; unless given, it is used if a linear discriminant classifies more clips correctly with it, by more
-        than chance. "auto" leaves out the network where windows are few. `key` draws the networks' weights, each
-        trained for `batches` at most; `folder`: where checkpoints are stored, so that an interrupted training can
-        resume. `progress` is called with a description of the progress. Raises `ValueError` for what are no clips, key,
-        or method; `ImportError` without the extra `learn`.
+        `method`: one of `METHODS`; "auto" chooses the one that classifies most held-out clips correctly, each as a
+        whole. Clips are held out in three folds, together with all clips of their group. The training windows of a clip
+        are those at most 20 dB below its loudest, since the label does not describe the rest; in clips longer than 4 s,
+        every sound counts as a clip. "auto" does not try the network if there are few windows. `loudness`: whether
+        loudness is used as a feature; by default, it is if a linear discriminant then classifies more clips correctly,
+        by more than chance. `key`: draws the initial weights of the networks, each trained for at most `batches`;
+        `folder`: folder for checkpoints, from which an interrupted training can resume; `progress`: is called with a
+        description of the progress. Raises `ValueError` for invalid clips, key or method; `ImportError` without the
+        extra `learn`.
         """
         need_extra("learn", "learning what is heard")
         check_kind("clips", clips, LabelledClips, "clips as of read_clips(folder)")
@@ -118,11 +121,13 @@ class Listener:
         for name in names:
             found.append((name, _held_out(name, windows, fold, key, batches, folder, report)))
         kept = [(windows.errors(odds), place, name, odds) for place, (name, odds) in enumerate(found)]
-        # Of methods with equal errors, the last is the simplest.
+        # Methods are listed with the simplest last, which is chosen among methods with equal errors.
         kept.sort(key=lambda one: (*one[0], -one[1]))
         (_, _, chosen, odds) = kept[0]
         report(f"{chosen}, all clips")
-        everything = windows.lesson(np.ones(len(windows.clip), bool), key, batches, _file(folder, chosen), report)
+        everything = windows.lesson(
+            np.ones(len(windows.clip), bool), key, batches, _checkpoint_path(folder, chosen), report
+        )
         model = LEARNERS[chosen].learn(everything)
         out = np.isfinite(odds).all(axis=1)
         standing = None
@@ -134,8 +139,8 @@ class Listener:
             notes.append(
                 "no class has clips of two groups: nothing could be held out, and nobody knows how good it is."
             )
-        # If all of a few clips are classified correctly, the fitted confidence has no bound; the rule of succession
-        # limits it.
+        # If all of a few held-out clips are classified correctly, the likelihood alone does not limit the confidence;
+        # `doubt`, from the rule of succession, does.
         sharpness = min(1.0, sharpness_of(odds[out], windows.right[out])) if out.any() else 1.0
         asked = 0 if standing is None else len(standing.right)
         return cls(
@@ -155,12 +160,12 @@ class Listener:
         )
 
     def hear(self, recording: Recording, *, calibration: Calibration | None = None) -> SoundLabels:
-        """Classify every window of a recording, 0.5 s long and 0.1 s after the one before.
+        """Classify every window of a recording; windows are 0.5 s long and begin every 0.1 s.
 
         A shorter recording is padded with silence. With a `calibration` of the microphones, places are estimated where
-        the localiser finds one. A listener of one channel mixes those of a recording. Raises `ValueError` for what is
-        no recording of samples, another number of microphones, sound that does not reach up to `highest`, and as
-        `locate_touches` does.
+        the localiser finds them. If the listener has one channel, the channels of the recording are mixed.
+        Raises `ValueError` if `recording` is no recording of samples, has another number of microphones, or no sound up
+        to the frequency `highest`, and as `locate_touches` does.
         """
         check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
         notes = []
@@ -196,7 +201,7 @@ class Listener:
             for one in image_blocks(recording, self.highest)
         ]
         times, loudness, known, strongest, odds = (np.concatenate(own) for own in zip(*parts, strict=True))
-        quiet = loudness < self._quiet(float(loudness.max()))
+        quiet = loudness < self._quiet_threshold(float(loudness.max()))
         if quiet.all() and loudness.max() > 0:
             notes.append("all of it is quieter than anything learnt from: is the gain another?")
         place, std = (None, None) if calibration is None else _places(whole, calibration, times)
@@ -215,20 +220,20 @@ class Listener:
             std,
         )
 
-    def _quiet(self, loudest: float) -> float:
-        """Loudness below which windows are quiet, in a recording whose loudest window is `loudest`.
+    def _quiet_threshold(self, loudest: float) -> float:
+        """Compute the loudness below which windows are quiet, in a recording whose loudest window is `loudest`.
 
-        Where loudness is not a feature, the gain may differ from that of the clips: up to 12 dB lower, or any amount
-        higher.
+        If loudness is not a feature, the recording's gain may differ from that of the clips: up to 12 dB lower, or any
+        amount higher.
         """
         softest, greatest = self.clips_loudness
         gain = 1.0 if self.loudness else float(np.clip(loudest / softest, _SOFTER, 1)) * max(1.0, loudest / greatest)
         return _QUIET * self.quietest * gain
 
     def write(self, path: str | Path) -> None:
-        """Write the listener to one file, without its `standing`: a JSON header, and arrays.
+        """Write the listener, without its `standing`, to one file that consists of a JSON header and arrays.
 
-        Raises `ValueError` for a folder.
+        Raises `ValueError` if `path` is a folder.
         """
         own, arrays = self.model.kept()
         head = {
@@ -249,7 +254,7 @@ class Listener:
 
     @classmethod
     def read(cls, path: str | Path) -> "Listener":
-        """Read a listener that `write` wrote, also from the folder that `jeit listen fit` made.
+        """Read a listener from a file that `write` wrote, or from the folder that `jeit listen fit` made.
 
         Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for files of another kind.
         """
@@ -290,20 +295,23 @@ class Listener:
 
 
 def _held_out(name: str, windows: Windows, fold: np.ndarray, key: Array, batches: int, folder, report) -> np.ndarray:
-    """Log-odds (W, C) of windows, by the model fitted without their clip's fold; NaN for those never held out."""
+    """Compute the log-odds (W, C) of windows by models that are fitted without the fold of their clip.
+
+    They are NaN for windows that are never held out.
+    """
     odds = np.full((len(windows.images), windows.classes), np.nan)
     for number in range(int(fold.max()) + 1):
         report(f"{name}, fold {number + 1} of {int(fold.max()) + 1}")
         out = (fold == number)[windows.clip]
-        lesson = windows.lesson(~out, key, batches, _file(folder, f"{name}-{number}"), report)
+        lesson = windows.lesson(~out, key, batches, _checkpoint_path(folder, f"{name}-{number}"), report)
         odds[out] = LEARNERS[name].learn(lesson).log_odds(windows.images[out])
     return odds
 
 
 def _loudness_counts(windows: Windows, fold: np.ndarray, key: Array, report) -> bool:
-    """Determine whether loudness improves a discriminant, by more than a standard deviation of chance.
+    """Determine whether loudness improves a linear discriminant by more than one standard deviation of chance.
 
-    Where nothing can be held out, loudness counts if there are several microphones, which share one gain.
+    If no clip can be held out, loudness is used if there are several microphones, which share one gain.
     """
     if fold.max() < 0:
         return windows.images.intensity.shape[1] > 1
@@ -315,14 +323,14 @@ def _loudness_counts(windows: Windows, fold: np.ndarray, key: Array, report) -> 
     return bool(more - fewer > np.sqrt(more + fewer))
 
 
-def _file(folder: str | Path | None, name: str) -> Path | None:
+def _checkpoint_path(folder: str | Path | None, name: str) -> Path | None:
     return None if folder is None else Path(folder) / f"{name}.training"
 
 
 def _places(recording: Recording, calibration: Calibration, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the touched places (W, d) and their standard deviations, metres, around the middle of each window.
 
-    They are from the frames of the smoothed track; NaN where there are none.
+    They are means over the frames of the smoothed track, NaN if there are none.
     """
     found = locate_touches(recording, calibration)
     place, spread = found.track.position, np.sqrt(np.diagonal(found.track.covariance, axis1=1, axis2=2))

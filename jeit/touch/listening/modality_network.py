@@ -1,10 +1,10 @@
 """The network of Park et al. (2022) that classifies touch by its sound: trained with equinox and optax, run in NumPy.
 
-Two layers, each a convolution without padding, batch normalisation, rectification and max-pooling: 5 × 5 to 32
-channels, then 3 × 3 to 64; then a dense layer and softmax. Training uses Adam with a rate of 2e-4, divided by ten after
-every five epochs, and batches of 64; the held-out loss is evaluated every 50 batches, and training ends after 20
-evaluations without a decrease. The size of the second convolution and of the pools, 3 × 3 and 2 × 2, is this library's
-choice; so is the noise that images are augmented by.
+The network has two layers, each a convolution without padding, batch normalisation, rectification and max-pooling:
+5 × 5 to 32 channels, then 3 × 3 to 64. A dense layer and softmax follow. Training uses Adam with a rate of 2e-4,
+divided by ten after every five epochs, and batches of 64; the held-out loss is evaluated every 50 batches, and training
+ends after 20 evaluations without a decrease. This library's own choices are the size of the second convolution and of
+the pools, 3 × 3 and 2 × 2, and the noise added to images.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from jeit.touch.training import Objective, Plan, Trained, fit
 
-# Of both layers: sizes of kernels and of pools, in pixels, and numbers of channels.
+# For the two layers: sizes of kernels and of pools, in pixels, and numbers of channels.
 _KERNELS, _POOLS, _CHANNELS = (5, 3), (3, 2), (32, 64)
-# The weight of each batch's mean and variance in the running ones; the constant added to variances.
+# Weight of a batch's mean and variance in the running ones; constant added to variances.
 _TAKEN, _LITTLE = 0.05, 1e-5
 NOISE, COPIES = 0.2, 5
-"""The standard deviation of the normal noise added to images, whose own is 1; and the number of noisy copies of each
-image in an epoch, as in the paper."""
-# The number of windows evaluated at once.
+"""Standard deviation of the normal noise added to images, whose own standard deviation is 1; number of noisy copies of
+each image in an epoch, as in the paper."""
+# Number of windows evaluated at once.
 _AT_ONCE = 32
 
 
 class ModalityNetwork(eqx.Module):
     """Weights of the network, in single precision.
 
-    Kernels `first` (5, 5, 1, 32) and `second` (3, 3, 32, 64); after each a `gain` and a `shift`, and running `mean` and
-    `variance`, a pair of each; `dense` (n, C) and `bias` (C,).
+    `first` (5, 5, 1, 32) and `second` (3, 3, 32, 64): kernels of the two convolutions; `gain`, `shift`, running `mean`
+    and `variance`: batch normalisation after the first and the second; `dense` (n, C) and `bias` (C,): the last layer.
     """
 
     first: Float[Array, "5 5 1 32"]
@@ -53,8 +53,10 @@ class ModalityNetwork(eqx.Module):
 
     @classmethod
     def draw(cls, key: Array, rows: int, columns: int, classes: int) -> "ModalityNetwork":
-        """Create an untrained network for images (rows, columns): normal kernels, the variance as in He et al.
-        (2015)."""
+        """Create an untrained network for images (rows, columns).
+
+        Kernels are drawn from normal distributions with the variance of He et al. (2015).
+        """
         for size, pool in zip(_KERNELS, _POOLS, strict=True):
             rows, columns = ((side - size + 1) // pool for side in (rows, columns))
         keys = jax.random.split(key, 3)
@@ -70,12 +72,15 @@ class ModalityNetwork(eqx.Module):
         return cls(first, second, ones, zeros, zeros, ones, dense, bias)
 
     def answer(self, images: Float[Array, "b rows columns"]) -> Float[Array, "b C"]:
-        """Log-odds of the classes, normalised by the running means and variances."""
-        return self._through(images, self.mean, self.variance)[0]
+        """Compute the log-odds (b, C) of the classes, normalised by the running means and variances."""
+        return self._forward(images, self.mean, self.variance)[0]
 
     def learn(self, images: Float[Array, "b rows columns"]) -> tuple[Float[Array, "b C"], "ModalityNetwork"]:
-        """Log-odds normalised by the batch's own means and variances, and the network with updated running ones."""
-        said, means, variances = self._through(images, None, None)
+        """Compute the log-odds (b, C) of the classes, normalised by the batch's own means and variances.
+
+        Also returns the network with updated running means and variances.
+        """
+        said, means, variances = self._forward(images, None, None)
         kept = jax.tree.map(
             lambda old, new: (1 - _TAKEN) * old + _TAKEN * jax.lax.stop_gradient(new),
             (self.mean, self.variance),
@@ -83,7 +88,7 @@ class ModalityNetwork(eqx.Module):
         )
         return said, eqx.tree_at(lambda one: (one.mean, one.variance), self, kept)
 
-    def _through(self, images, mean, variance):
+    def _forward(self, images, mean, variance):
         values, means, variances = images[..., None], [], []
         for layer, kernel in enumerate((self.first, self.second)):
             values = jax.lax.conv_general_dilated(
@@ -98,11 +103,11 @@ class ModalityNetwork(eqx.Module):
             variances.append(own[1])
             factor = self.gain[layer] / jnp.sqrt(own[1] + _LITTLE)
             values = values * factor + (self.shift[layer] - own[0] * factor)
-            values = _pooled(jnp.maximum(values, 0), _POOLS[layer], jnp)
+            values = _max_pool(jnp.maximum(values, 0), _POOLS[layer], jnp)
         return values.reshape(len(images), -1) @ self.dense + self.bias, tuple(means), tuple(variances)
 
 
-def _pooled(values, size: int, namespace):
+def _max_pool(values, size: int, namespace):
     """Maximum of every `size` × `size` block (b, h, w, c); rows and columns that do not fill a block are left out."""
     height, width = (side // size * size for side in values.shape[1:3])
     values = values[:, :height, :width]
@@ -111,11 +116,11 @@ def _pooled(values, size: int, namespace):
 
 
 class NetworkAnswers:
-    """A trained network evaluated in NumPy, where one window takes a few milliseconds, without compilation."""
+    """A trained network that is evaluated in NumPy: a few milliseconds for one window, without compilation."""
 
     def __init__(self, network: ModalityNetwork):
         whole = jax.tree.map(np.asarray, network)
-        # The normalisation is one factor and one offset for each channel, which are merged into the kernels.
+        # The normalisation is a factor and an offset for each channel; the factor is merged into the kernels.
         factors = [gain / np.sqrt(own + _LITTLE) for gain, own in zip(whole.gain, whole.variance, strict=True)]
         self.kernels = [
             np.ascontiguousarray((kernel * factor).transpose(2, 0, 1, 3).reshape(-1, kernel.shape[-1]))
@@ -127,25 +132,25 @@ class NetworkAnswers:
         self.dense, self.bias = whole.dense, whole.bias
 
     def log_odds(self, images: Float[np.ndarray, "W rows columns"]) -> Float[np.ndarray, "W C"]:
-        """Log-odds (W, C) of the classes."""
-        parts = [self._some(images[first : first + _AT_ONCE]) for first in range(0, len(images), _AT_ONCE)]
+        """Compute the log-odds (W, C) of the classes."""
+        parts = [self._evaluate_some(images[first : first + _AT_ONCE]) for first in range(0, len(images), _AT_ONCE)]
         return np.concatenate([np.zeros((0, len(self.bias)), np.float32), *parts]).astype(float)
 
-    def _some(self, images: np.ndarray) -> np.ndarray:
+    def _evaluate_some(self, images: np.ndarray) -> np.ndarray:
         values = images[..., None]
         for kernel, offset, size, pool in zip(self.kernels, self.offsets, _KERNELS, _POOLS, strict=True):
             patches = sliding_window_view(values, (size, size), axis=(1, 2))
             values = patches.reshape(*patches.shape[:3], -1) @ kernel
             values += offset
-            values = _pooled(np.maximum(values, 0, out=values), pool, np)
+            values = _max_pool(np.maximum(values, 0, out=values), pool, np)
         return values.reshape(len(images), -1) @ self.dense + self.bias
 
 
 def paper_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
-    """The paper's schedule for a training set of `windows` windows: at most `batches`, but at least one pass.
+    """Training schedule of the paper for a training set of `windows` windows.
 
-    Noise is drawn anew in every batch, so that no image is repeated; `COPIES` passes through the windows correspond to
-    one epoch of noisy copies.
+    Training has at most `batches`, but at least one pass through the windows. Noise is drawn anew in every batch, so
+    that no image is repeated; `COPIES` passes through the windows correspond to one epoch of noisy copies.
     """
     least = min(batch, windows)
     return Plan(
@@ -160,8 +165,10 @@ def paper_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
 
 
 def plan_of(windows: int, *, batches: int, batch: int = 64) -> Plan:
-    """Our own schedule, which learns small sets as well in fewer batches: a rate of 1e-3, a tenth of it in the last
-    third."""
+    """Training schedule of this library, which needs fewer batches for the same accuracy on small sets.
+
+    The rate is 1e-3, and a tenth of it in the last third of the training.
+    """
     plan = paper_plan(windows, batches=batches, batch=batch)
     return replace(plan, rate=1e-3, decay_epochs=max(1, round(2 * plan.epochs / 3)))
 
@@ -178,10 +185,11 @@ def train_network(
     checkpoint: str | Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Trained:
-    """Train a network on images of the classes `right`, until its loss on the images `held` out no longer decreases.
+    """Train a network on images of the classes `right`, until its loss on held-out images no longer decreases.
 
-    The same `key` gives the same bits. `plan`: as from `plan_of`; `noise`: the standard deviation of the noise added to
-    images; `checkpoint` and `progress` as in `jeit.touch.training.fit`, whose errors are raised.
+    `held`: the held-out images and their classes; `plan`: as from `plan_of`; `noise`: standard deviation of the noise
+    added to images; `checkpoint` and `progress` as in `jeit.touch.training.fit`, whose errors are raised. The same
+    `key` gives identical results.
     """
     drawn, trained = jax.random.split(key)
     network = ModalityNetwork.draw(drawn, images.shape[1], images.shape[2], classes)

@@ -1,4 +1,4 @@
-"""The classified sounds of a recording: a name for every 0.1 s, and events of consecutive windows of one name."""
+"""The classified sounds of a recording: a class every 0.1 s, and events of consecutive windows of the same class."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from jeit.touch.listening.feature_images import EVERY
 class Event:
     """A sound from `start` to `end`, seconds.
 
-    `name`: its class, "" for quiet; `probability`: the mean over its windows; `place` (2,) or (3,): the mean estimated
-    place, metres, None where there is none.
+    `name`: its class, "" for quiet; `probability`: mean over its windows; `place` (2,) or (3,), metres: mean of the
+    estimated places, None if there are none.
     """
 
     start: float
@@ -29,11 +29,12 @@ class Event:
 class SoundLabels:
     """The classification of W windows of a recording by a listener.
 
-    `times` (W,): the middles of the windows, in seconds; `probabilities` (W, C) of the classes `names` (C,); `quiet`
-    (W,): windows quieter than any in the training set, whose probabilities do not count; `known` (W,): whether a
-    window's samples are finite; `strongest` (W,): the loudest microphone; `loud` (W,): windows no more than 20 dB below
-    the recording's loudest, which `whole` uses. `position` (W, d), metres, and `position_std`: the estimated place, NaN
-    where there is none, None without a calibration. `name`: the name of the recording; `notes`: notes on it.
+    `times` (W,): middles of the windows, seconds; `probabilities` (W, C) of the classes `names` (C,); `quiet` (W,):
+    whether a window is quieter than all in the training set, so that its probabilities do not count; `known` (W,):
+    whether a window's samples are finite; `strongest` (W,): index of the loudest microphone; `loud` (W,): whether a
+    window is at most 20 dB below the loudest of the recording, for `whole`. `position` (W, d), metres, with standard
+    deviations `position_std`: estimated place, NaN if there is none; both are None without a calibration. `name`: name
+    of the recording; `notes`: remarks on it.
     """
 
     times: Float[np.ndarray, " W"]
@@ -54,21 +55,21 @@ class SoundLabels:
 
     @property
     def named(self) -> np.ndarray:
-        """The likeliest name of each window (W,), "" where it is quiet or not finite."""
+        """The most likely class of each window (W,); "" for windows that are quiet or not finite."""
         likeliest = np.array([*self.names, ""])[self.probabilities.argmax(axis=1)]
         return np.where(self.quiet | ~self.known, "", likeliest)
 
     @property
     def probability(self) -> Float[np.ndarray, " W"]:
-        """Probability of the likeliest name of each window."""
+        """Probability (W,) of the most likely class of each window."""
         return self.probabilities.max(axis=1)
 
     @property
     def whole(self) -> tuple[str, float]:
-        """Classify the recording as one sound: the likeliest name of its loud windows together, and its probability.
+        """The most likely class of the whole recording, from its loud windows together, and its probability.
 
         The probability is the geometric mean over the windows, so that overlapping windows are not counted as
-        independent; the name is "" where all are quiet.
+        independent; the class is "" if all windows are quiet.
         """
         some = self.loud & self.known & ~self.quiet
         if not some.any():
@@ -79,9 +80,9 @@ class SoundLabels:
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Intervals of consecutive windows of the same name."""
+        """Events: intervals of consecutive windows of the same class."""
         names, found = self.named, []
-        # A name extends half way to the next window.
+        # An event extends half way to the window after it, and to the one before.
         steps = [self.times[:1] - EVERY / 2, (self.times[1:] + self.times[:-1]) / 2, self.times[-1:] + EVERY / 2]
         edges = np.maximum(np.concatenate(steps), 0).tolist()
         cuts = np.flatnonzero(names[1:] != names[:-1]) + 1

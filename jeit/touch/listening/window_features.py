@@ -1,4 +1,4 @@
-"""Features of windows made by hand: spectra, and levels between microphones."""
+"""Hand-made features of windows of sound: loudness, spectra, and levels of the microphones."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ from jaxtyping import Float
 
 from jeit.touch.listening.feature_images import BANDS, FRAMES, HOP, SoundImages
 
-# Decibels below the loudest that are resolved; and the share of powers that are no louder than that.
+# Range of levels below the loudest, decibels; quantile of the powers that counts as the loudest.
 _RANGE, _LOUDEST = 60.0, 0.999
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Scale from powers to standardised levels in decibels, first of intensities, then of spectrograms.
+    """Conversion of powers to standardised levels in decibels; all fields are for intensities, then for spectrograms.
 
-    Levels are clipped at 60 dB below the `loudest` (2,) of the training set (all but a thousandth of it is no louder),
-    then standardised by their `mean` (2,) and `deviation` (2,). One scale holds for all rows, so that a louder window
-    has greater values.
+    Levels are clipped at 60 dB below `loudest` (2,), the 99.9 % quantile of the training set, then standardised by
+    their `mean` (2,) and `deviation` (2,). All rows are converted alike, so that a louder window has larger values.
     """
 
     loudest: Float[np.ndarray, " 2"]
@@ -28,7 +27,7 @@ class Levels:
 
     @classmethod
     def of(cls, images: SoundImages) -> "Levels":
-        """Compute the scale from windows of the training set."""
+        """Compute the conversion from windows of the training set."""
         loudest, mean, deviation = [], [], []
         for power in (images.intensity, images.spectrum):
             top = _decibels(np.quantile(power, _LOUDEST), -np.inf)
@@ -39,10 +38,10 @@ class Levels:
         return cls(np.array(loudest), np.array(mean), np.array(deviation))
 
     def __call__(self, images: SoundImages) -> Float[np.ndarray, "W rows 41"]:
-        """Feature images (W, M + 64, 41), single precision: M rows of intensity, then 64 of the spectrogram.
+        """Compute feature images (W, M + 64, 41), in single precision: M rows of intensity, then 64 of the spectrogram.
 
-        Microphones are sorted by their loudness in the window, the loudest first: the paper does not state their order,
-        and so a touch looks the same wherever it is.
+        Microphones are sorted by their loudness in the window, the loudest first, so that a touch looks the same
+        wherever it is; the paper does not state their order.
         """
         order = np.argsort(-images.intensity.sum(axis=2), axis=1, kind="stable")
         intensity = np.take_along_axis(images.intensity, order[..., None], axis=1)
@@ -54,14 +53,14 @@ class Levels:
 
 
 def _decibels(power, least: float) -> np.ndarray:
-    """Decibels of powers, no less than `least`; silence, which has no level, is 300 dB below full scale."""
+    """Convert powers to decibels, at least `least`; silence, which has no level, is 300 dB below full scale."""
     return np.maximum(10 * np.log10(np.maximum(power, 1e-30)), least)
 
 
-# Least prominence of a peak, decibels.
+# Minimum prominence of a peak, decibels.
 _PROMINENT = 6.0
-# Numbers of bands of the mean spectrum, and of those that are followed in time; frames after the loudest by which the
-# decay is measured.
+# Number of bands of the mean spectrum; number of bands that are followed in time; number of frames after the loudest
+# one over which the decay is measured.
 _COLOURS, _FEW, _AFTER = 16, 4, 8
 _MODULATIONS = 8
 
@@ -69,23 +68,27 @@ _MODULATIONS = 8
 def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
     """Compute features (W, k) of windows, with the same k for any number of microphones.
 
-    Of loudness in decibels (mean, greatest, spread, how long it stays near its greatest, its peaks and their intervals,
-    rise and decay, modulation up to 16 Hz); of the spectrogram (mean spectrum in 16 bands, centroid, width, flatness,
-    flux, decay in 4 bands); of the microphones (share of the loudest, evenness, whether they rise and fall together,
-    whether their distribution moves).
+    Features of loudness, in decibels: mean, maximum, spread, duration near the maximum, peaks and their intervals, rise
+    and decay, and modulation up to 16 Hz. Features of the spectrogram: mean spectrum in 16 bands, centroid, width,
+    flatness, flux, and decay in 4 bands. Features of the microphones: share of the loudest, evenness, correlation
+    between their levels, and change of their distribution over time.
     """
     if not len(images):
-        return np.zeros((0, len(_time(np.zeros((1, FRAMES)))[0]) + _COLOURS + 2 * _FEW + 8 + 8))
+        return np.zeros((0, len(_loudness_features(np.zeros((1, FRAMES)))[0]) + _COLOURS + 2 * _FEW + 8 + 8))
     loud = _level(images.intensity.sum(axis=1))
-    parts = [_time(loud), _colour(images.spectrum.astype(float), loud), _microphones(images.intensity.astype(float))]
+    parts = [
+        _loudness_features(loud),
+        _spectral_features(images.spectrum.astype(float), loud),
+        _microphone_features(images.intensity.astype(float)),
+    ]
     return np.concatenate(parts, axis=1)
 
 
 def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
     """Compute the `sound_features`, and statistics of the level in each of the 64 bands.
 
-    Levels are in decibels relative to the loudest of the window: mean, greatest and spread over the window; the mean
-    over the loudest frame and the two after it, and over the next five.
+    The statistics of the level, in decibels relative to the loudest of the window, are its mean, maximum and spread
+    over the window, and its means over the loudest frame and the two after it, and over the next five.
     """
     level = _level(images.spectrum.astype(float))
     level -= level.max(axis=(1, 2), keepdims=True, initial=-np.inf)
@@ -97,12 +100,12 @@ def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
 
 
 def _level(power: np.ndarray) -> np.ndarray:
-    """Levels in decibels (W, …), clipped at 60 below the greatest of each window."""
+    """Convert powers to levels in decibels (W, …), clipped at 60 dB below the maximum of each window."""
     level = 10 * np.log10(np.maximum(power, 1e-30))
     return np.maximum(level, level.max(axis=tuple(range(1, level.ndim)), keepdims=True) - _RANGE)
 
 
-def _time(loud: Float[np.ndarray, "W 41"]) -> np.ndarray:
+def _loudness_features(loud: Float[np.ndarray, "W 41"]) -> np.ndarray:
     top = loud.max(axis=1)
     below = top[:, None] - loud
     at = loud.argmax(axis=1)
@@ -144,17 +147,18 @@ def _time(loud: Float[np.ndarray, "W 41"]) -> np.ndarray:
 def _peaks(loud: np.ndarray) -> np.ndarray:
     """Find the frames (W, 41) that are peaks.
 
-    A peak is the loudest of five frames, and 6 dB above the quietest of the ten before and after.
+    A peak is the loudest of five frames, and at least 6 dB above the minimum of the ten frames before it, and of the
+    ten after it.
     """
     padded = np.pad(loud, ((0, 0), (10, 10)), mode="edge")
     near = np.lib.stride_tricks.sliding_window_view(padded, 21, axis=1)
     top = near[..., 8:13].max(axis=-1)
     low = np.maximum(near[..., :11].min(axis=-1), near[..., 10:].min(axis=-1))
-    # Of equal frames, the first.
+    # If consecutive frames are equally loud, only the first is a peak.
     return (loud >= top) & (loud > np.pad(loud, ((0, 0), (1, 0)), mode="constant")[:, :-1]) & (loud - low >= _PROMINENT)
 
 
-def _colour(spectrum: Float[np.ndarray, "W 64 41"], loud: np.ndarray) -> np.ndarray:
+def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], loud: np.ndarray) -> np.ndarray:
     rows = np.arange(len(spectrum))
     power = spectrum.mean(axis=2) + 1e-30
     share = power / power.sum(axis=1, keepdims=True)
@@ -178,7 +182,7 @@ def _colour(spectrum: Float[np.ndarray, "W 64 41"], loud: np.ndarray) -> np.ndar
     return np.column_stack([colours, *numbers, later - top, few.std(axis=2)])
 
 
-def _microphones(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
+def _microphone_features(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
     mean = intensity.mean(axis=2) + 1e-30
     share = mean / mean.sum(axis=1, keepdims=True)
     ordered = np.sort(share, axis=1)[:, ::-1]

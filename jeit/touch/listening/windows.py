@@ -1,6 +1,7 @@
-"""Windows of clips, with labels and folds of held-out groups.
+"""Windows of labelled clips, and cross-validation folds of their groups.
 
-A long recording, such as many taps one after the other, counts as many clips: it is cut into pieces where it is quiet.
+A long recording, such as of many taps one after the other, is cut into pieces where it is quiet; each piece counts as a
+clip.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from jeit.touch.listening.learners import Lesson
 
 
 def held_out_folds(right: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], most: int) -> Int[np.ndarray, " N"]:
-    """Assign each of N clips to the fold (N,) in which it is held out, together with all of its group.
+    """Assign each of N clips to the fold (N,) in which it is held out, together with all clips of its group.
 
-    The fold is -1 for clips that are always in the training set, since their class has no other group. Groups are
-    assigned in turn, class by class, the largest first, to at most `most` folds, so that every class is in the training
-    set of each.
+    `right`, `groups`: class and group of each clip. The fold is -1 for clips that are always in the training set, since
+    their class has no other group. Groups are assigned to at most `most` folds in turn, class by class, the largest
+    first, so that every training set contains all classes.
     """
     fold = np.full(len(right), -1)
     of_group: dict[int, int] = {}
@@ -39,7 +40,7 @@ def held_out_folds(right: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], 
                 counts[of_group[group]] += int((groups == group).sum())
     for group, number in of_group.items():
         fold[groups == group] = number
-    # A class all of whose groups are in one fold would be tested where it was never learnt.
+    # If all groups of a class were in one fold, the class would be tested without having been learnt.
     for one in np.unique(right):
         own = right == one
         if len(np.unique(fold[own])) < 2:
@@ -49,12 +50,13 @@ def held_out_folds(right: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], 
 
 
 LOUD = 0.01
-"""Least loudness of a window that is used, as a share of the power of the recording's loudest frame."""
-# The greatest number of training windows of one piece, spread evenly: more of one sound add little.
+"""Minimum loudness of a window that is used, relative to the power of the recording's loudest frame."""
+# Maximum number of training windows of one piece, evenly spaced: more windows of one sound add little.
 _OF_A_PIECE = 40
-# Seconds: clips longer than this are cut into pieces; the length of a piece of a sound that does not end.
+# Duration beyond which a clip is cut into pieces; duration of the pieces of an uninterrupted sound; seconds.
 _LONG, _PIECE = 4.0, 2.0
-# The greatest number of pieces of one clip, and of parts of a class's only clip that are held out by themselves.
+# Maximum number of pieces of one clip; maximum number of groups of pieces that are held out in turn, if a class has
+# clips of one group only.
 _PIECES, _PARTS = 60, 6
 
 
@@ -62,8 +64,9 @@ _PIECES, _PARTS = 60, 6
 class Windows:
     """Windows of a training set.
 
-    `images`: the windows; `clip` (W,): the clip, or piece of a longer one, that each is from; `right` (W,): its class,
-    an index of `names`; `right_of_clip` and `group_of_clip`: the class and the group of each clip; `notes` on them.
+    `images`: the windows; `clip` (W,): index of the clip, or piece of a longer clip, of each window; `right` (W,): its
+    class, an index of `names`; `right_of_clip` and `group_of_clip`: class and group of each clip; `notes`: remarks on
+    the clips.
     """
 
     images: SoundImages
@@ -76,7 +79,7 @@ class Windows:
 
     @classmethod
     def of(cls, clips: LabelledClips, report: Callable[[str], None]) -> "Windows":
-        """Take the windows near the loudest of each clip. Raises `ValueError` for clips without numbers."""
+        """Select the loud windows of each clip. Raises `ValueError` for clips without finite samples."""
         names, right = np.unique(clips.labels, return_inverse=True)
         group = np.unique(clips.groups, return_inverse=True)[1]
         alone = {one for one in range(len(names)) if len(np.unique(group[right == one])) < 2}
@@ -111,7 +114,7 @@ class Windows:
 
     @property
     def levelled(self) -> "Windows":
-        """The same windows, all of them equally loud."""
+        """The same windows, scaled to equal loudness."""
         return replace(self, images=self.images.levelled)
 
     @property
@@ -120,12 +123,12 @@ class Windows:
         return len(self.names)
 
     def lesson(self, rows: np.ndarray, key: Array, batches: int, checkpoint: Path | None, report) -> Lesson:
-        """Create a training set from some of the windows (W,)."""
+        """Create a training set from the selected windows, `rows` (W,)."""
         groups = self.group_of_clip[self.clip[rows]]
         return Lesson(self.images[rows], self.right[rows], groups, self.classes, key, batches, checkpoint, report)
 
     def named(self, odds: Float[np.ndarray, "W C"]) -> tuple[np.ndarray, np.ndarray]:
-        """The predicted class of every held-out clip as a whole, and its true class."""
+        """Predict the class of every held-out clip from the log-odds of its windows; also returns its true class."""
         out = np.isfinite(odds).all(axis=1)
         share = odds[out] - np.logaddexp.reduce(odds[out], axis=1, keepdims=True)
         clips, own = np.unique(self.clip[out], return_inverse=True)
@@ -134,7 +137,7 @@ class Windows:
         return total.argmax(axis=1), self.right_of_clip[clips]
 
     def errors(self, odds: Float[np.ndarray, "W C"]) -> tuple[float, float]:
-        """Error rates of held-out clips, and of held-out windows."""
+        """Compute the error rate of held-out clips, and that of held-out windows."""
         out = np.isfinite(odds).all(axis=1)
         if not out.any():
             return 0.0, 0.0
@@ -145,8 +148,8 @@ class Windows:
 def _pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
     """Split the loud windows, at `times`, into pieces that share no samples.
 
-    Windows without a gap of a window's length between them are one sound, which is cut every 2 s; windows that extend
-    over a cut are left out.
+    Windows belong to one sound if no gap between them exceeds the length of a window. A longer sound is cut every 2 s;
+    windows that extend over a cut are left out.
     """
     pieces, every = [], _PIECE + LENGTH
     for sound in np.split(np.arange(len(times)), np.flatnonzero(np.diff(times) > LENGTH) + 1):

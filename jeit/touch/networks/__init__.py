@@ -1,8 +1,8 @@
-"""Networks that estimate a map of indentation depth from a skin's voltages, learnt from simulated touches.
+"""Neural networks that estimate a map of indentation depth from a skin's voltages, trained on simulated touches.
 
-`learn_images` simulates the touches of a described skin, trains a network, and stores it; `read_network` reads it, and
-`ImageNetwork.depth` images frames. There are two designs: "three-stages", that of Park et al. 2022, and "unrolled",
-which is trained through the skin's forward model.
+`learn_images` simulates the touches of a described skin, trains a network, and stores it in a file; `read_network`
+reads it, and `ImageNetwork.depth` images frames. There are two designs: "three-stages", that of Park et al. 2022, and
+"unrolled", which is trained with the skin's forward model.
 """
 
 from __future__ import annotations

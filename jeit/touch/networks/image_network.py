@@ -1,4 +1,5 @@
-"""`ImageNetwork`: a trained network that estimates maps of indentation depth from a skin's voltages; and its file."""
+"""`ImageNetwork`: a trained network that estimates maps of indentation depth from a skin's voltages; its file
+format."""
 
 from __future__ import annotations
 
@@ -31,18 +32,18 @@ from jeit.touch.training import check_same, read_model, write_model
 
 DESIGNS = ("unrolled", "three-stages")
 _KIND, _VERSION = "a jeit image network", 1
-# The greatest number of steps of an unrolled network.
+# Maximum number of steps of an unrolled network.
 _MOST_STEPS = 100
 FILE = "network.jeit"
-# The greatest number of frames that are imaged at once: more exceed the cache. JAX compiles for every such number that
-# is 2ⁿ.
+# Maximum number of frames that are imaged at once: more would exceed the cache. JAX compiles a program for each power
+# of two up to this number.
 _AT_ONCE = 64
-# Maps are unreliable where they bulge more than they are indented, by so many times the noise floor, and so large a
-# share of the squared change, which exceeds so many times the noise, is explained by no touch; and where they are
-# deeper than so many times the skin's thickness. An unexplained share alone is no evidence: a network that has learnt
-# little misses many touches.
+# Thresholds for unreliable maps: fraction of the squared change that the map does not explain; size of the change that
+# is tested, as a multiple of the noise; depth, divided by the skin's thickness; outward bulge, as a multiple of the
+# noise floor. An unexplained fraction alone is no evidence, since a network that has learnt little misses many touches:
+# the map must bulge more than it is indented as well.
 _UNEXPLAINED, _LOUD, _TOO_DEEP, _BULGE = 0.6, 3.0, 1.2, 3.0
-# Relative changes beyond this are not due to touch.
+# Maximum relative change; larger ones are not caused by touch.
 _GREATEST = 100.0
 
 
@@ -50,9 +51,10 @@ _GREATEST = 100.0
 class ImageNetwork:
     """A network that images touches of one skin.
 
-    **Fields**: the `network` and its `design`; `thickness` of the skin, metres; the `shape` (rows, columns) of its maps
-    and their `extent` (x_min, x_max, y_min, y_max), metres, row 0 at the least y; the relative `noise` of a channel
-    that it was trained with; `made_for`, what it can be used for: skin, electrodes and protocol, as plain values.
+    **Fields**: `network`: the network; `design`: its design, one of `DESIGNS`; `thickness`: thickness of the skin,
+    metres; `shape`: (rows, columns) of its maps; `extent`: (x_min, x_max, y_min, y_max) of its maps, metres, with row 0
+    at y_min; `noise`: relative noise of a channel in training; `made_for`: description of the skin, electrodes and
+    protocol that it can be used for, as plain values.
     """
 
     network: ThreeStages | Unrolled
@@ -65,7 +67,7 @@ class ImageNetwork:
 
     @classmethod
     def of_skin(cls, network: ThreeStages | Unrolled, skin: Skin, noise: float, shape: tuple[int, int]):
-        """Create a network that was trained on this skin."""
+        """Create an `ImageNetwork` from a network that was trained for this skin."""
         design = "unrolled" if isinstance(network, Unrolled) else "three-stages"
         low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
         extent = low_x, high_x, low_y, high_y
@@ -73,25 +75,26 @@ class ImageNetwork:
         return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Fields without the compiled programs, which are not pickled, but compiled again."""
+        """Fields without the compiled programs, which are not pickled but compiled again."""
         return {one.name: getattr(self, one.name) for one in fields(self)}
 
     def depth(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "*n rows columns"]:
         """Estimate the indentation depth, metres, from frames (M,) or (n, M), volts.
 
-        `reference` (M,): a frame of the untouched skin. Channels without a reading are NaN; the "unrolled" design
-        replaces them by their expected value given the others. Maps are the network's output for any input: `doubts`
-        states which of them are unreliable. Raises `ValueError` for other numbers of channels, and as `changes` does.
+        `reference` (M,): frame of the untouched skin, volts. Channels without a reading are NaN; the "unrolled" design
+        replaces them by their expected values given the other channels. The network returns a map for any input:
+        `doubts` states which maps are unreliable. Raises `ValueError` for other numbers of channels, and as `changes`
+        does.
         """
         change = self.changes(voltages, reference)
         maps = self.thickness * self.share(change)
         return maps if np.ndim(voltages) == 2 else maps[0]
 
     def changes(self, voltages: ArrayLike, reference: ArrayLike) -> Float[np.ndarray, "n M"]:
-        """Relative changes (n, M) of frames and a reference, with missing channels filled in.
+        """Compute relative changes (n, M) of frames from a reference, with missing channels filled in.
 
-        Raises `ValueError` where they are infinite or 100 times the reference, and where too many channels are missing:
-        half of them, any for the design "three-stages".
+        Raises `ValueError` if voltages are infinite or change by more than 100 times the reference, and if too many
+        channels are missing: more than half of them, or any for the design "three-stages".
         """
         channels = self.made_for["channels"]
         frames = real_array("voltages", voltages, f"frames ({channels},) or (n, {channels}), volts")
@@ -118,10 +121,11 @@ class ImageNetwork:
         return filled(change, self._covariance, self.noise) if lost.any() else change
 
     def doubts(self, change: Float[np.ndarray, "n M"], share: Float[np.ndarray, "n rows columns"]) -> list[str]:
-        """State why each map of `share(change)` is unreliable; "" where there is no evidence against it.
+        """State why each map of `share(change)` is unreliable; an empty string if there is no evidence against the map.
 
-        Nothing presses deeper than the skin is thick; and where a map bulges, the part that is pressed in has to
-        explain the change by the forward model, which only "unrolled" has.
+        A map is unreliable if it is much deeper than the skin is thick. It is also unreliable if it bulges outwards
+        more than it is indented, and its indentation does not explain the change by the forward model, which only the
+        design "unrolled" has.
         """
         found = ["" for _ in share]
         size = np.linalg.norm(change, axis=1)
@@ -145,7 +149,7 @@ class ImageNetwork:
 
     @functools.cached_property
     def floor(self) -> float:
-        """Noise floor of depth, metres: the greatest of 64 maps of an untouched skin with the noise of the training."""
+        """Noise floor of depth, metres: maximum of 64 maps of an untouched skin with the noise of the training."""
         random = np.random.default_rng(0)
         return self.thickness * float(
             self.share(self.noise * random.normal(size=(64, self.made_for["channels"]))).max()
@@ -163,7 +167,10 @@ class ImageNetwork:
         return jax.jit(lambda maps: network.predicted_changes(jnp.asarray(maps, jnp.float32)))
 
     def share(self, change: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n rows columns"]:
-        """Depths over the thickness, from `change` relative to a reference (`jeit.touch.simulate.relative_changes`)."""
+        """Compute depths divided by the skin's thickness, from relative changes (n, M).
+
+        `change` is relative to a reference, as computed by `jeit.touch.simulate.relative_changes`.
+        """
         number = len(change)
         if not number:
             return np.zeros((0, *self.shape), np.float32)
@@ -173,7 +180,7 @@ class ImageNetwork:
         if len(given) == size:
             return np.asarray(self._compiled(given))[:number]
         starts, compiled = range(0, len(given), size), self._compiled
-        # One program leaves cores idle between its convolutions: two at once take three quarters of the time.
+        # A program leaves cores idle between its convolutions: running two at once takes three quarters of the time.
         with ThreadPoolExecutor(min(len(starts), os.cpu_count() or 1)) as pool:
             parts = list(pool.map(lambda one: np.asarray(compiled(given[one : one + size])), starts))
         return np.concatenate(parts)[:number]
@@ -185,15 +192,16 @@ class ImageNetwork:
         return lambda change: called(arrays, jnp.asarray(change))
 
     def check_protocol(self, protocol: Protocol, name: str = "the data") -> None:
-        """Raise `ValueError`, with the difference, where frames of another protocol are to be imaged; currents may
+        """Raise `ValueError`, with the difference, if the network was trained for another protocol; currents may
         differ."""
         check_same(name, self.made_for, _channels_of(protocol))
 
 
 def described(protocol: Protocol, centres: ArrayLike, extent: tuple[float, ...]) -> dict[str, Any]:
-    """Describe what a network is made for, as plain values that JSON takes.
+    """Describe the skin that a network is made for, as plain values that JSON can store.
 
-    Of a protocol, electrodes at `centres` (L, 2) and a skin in a box `extent`, metres.
+    `protocol`: its protocol; `centres` (L, 2): centres of its electrodes, metres; `extent`: (x_min, x_max, y_min,
+    y_max) of its bounding box, metres.
     """
     places = np.round(1e3 * np.asarray(centres), 3).tolist()
     skin = np.round(1e3 * np.asarray(extent), 3).tolist()
@@ -201,8 +209,11 @@ def described(protocol: Protocol, centres: ArrayLike, extent: tuple[float, ...])
 
 
 def write_network(network: ImageNetwork, path: str | Path) -> None:
-    """Write a network to one file, numbers with a JSON header. Raises `ValueError` for what is none, and for a folder;
-    `OSError` where it cannot be written."""
+    """Write a network to one file: arrays with a JSON header.
+
+    Raises `ValueError` for anything but an `ImageNetwork`, and if `path` is a folder; `OSError` if it cannot be
+    written.
+    """
     check_kind("network", network, ImageNetwork, "an ImageNetwork, as of learn_images")
     head = {
         "design": network.design,
@@ -218,10 +229,10 @@ def write_network(network: ImageNetwork, path: str | Path) -> None:
 
 
 def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
-    """Read a network from a file that `write_network` made, or from the folder of `learn_images`.
+    """Read a network from a file that `write_network` wrote, or from the folder of `learn_images`.
 
-    Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for another file, and where it was
-    trained for another `skin` than is given, with the difference.
+    Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for a file of another kind, and, with
+    the difference, if the network was trained for a skin other than the given `skin`.
     """
     path = Path(path)
     path = path / FILE if path.is_dir() else path
@@ -260,7 +271,8 @@ def _untrained(head: dict[str, Any]) -> ThreeStages | Unrolled:
 
 
 def _channels_of(protocol: Protocol) -> dict[str, Any]:
-    """Numbers of channels and electrodes of a protocol, and its drive and measurement patterns, for any current."""
+    """Numbers of channels and electrodes of a protocol, and a hash of its drive and measurement patterns, for any
+    current."""
     drive, measured = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
     patterns = np.round(np.concatenate([drive / np.abs(drive).max(), measured / np.abs(measured).max()]), 6) + 0.0
     return {

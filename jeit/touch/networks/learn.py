@@ -1,4 +1,4 @@
-"""Learn an image network, in three steps: touches, training, validation."""
+"""Learn an image network in three steps: simulation of touches, training, evaluation."""
 
 from __future__ import annotations
 
@@ -29,39 +29,45 @@ from jeit.touch.simulate import Indent, IndentSet, ball, relative_changes, simul
 from jeit.touch.simulate.contact.indent_sets import image_places
 from jeit.touch.training import ArrayRows, MappedRows, Objective, Plan, Rows, Trained, fit
 
-# The greatest number of touches that are in memory, and mixed, at once: 120 MB of 94 channels and 48 × 48 maps.
+# Maximum number of touches that are in memory, and shuffled, at once: 120 MB for 94 channels and 48 × 48 maps.
 _AT_ONCE = 12_000
 
 
 class Touches(Protocol):
-    """Relative changes "change" (n, M) without noise, and maps "depth" (n, rows, columns) over the thickness."""
+    """Simulated touches: relative changes "change" (n, M) without noise, and depth maps "depth" (n, rows, columns).
+
+    Depths are divided by the thickness of the skin.
+    """
 
     def rows(self, *names: str) -> Rows:
-        """The arrays of these names, float32, in this order; an array by itself where one is requested."""
+        """Return the arrays of these names, float32, in this order; for a single name, the array itself."""
         ...
 
 
 class Examples(NamedTuple):
-    """Touches in memory: relative changes (n, M) without noise, and depth maps (n, rows, columns) over the
-    thickness."""
+    """Touches in memory.
+
+    **Fields**: `change` (n, M): relative changes without noise; `depth` (n, rows, columns): depth maps, divided by the
+    thickness of the skin.
+    """
 
     change: Float[np.ndarray, "n M"]
     depth: Float[np.ndarray, "n r c"]
 
     def rows(self, *names: str) -> ArrayRows:
-        """As of `Touches`."""
+        """See `Touches.rows`."""
         arrays = tuple(np.asarray(getattr(self, name), np.float32) for name in names)
         return ArrayRows(arrays[0] if len(arrays) == 1 else arrays)
 
 
 class StoredTouches:
-    """The touches of a finished set of `simulate_presses`, read from its store on access.
+    """Touches of a finished set of `simulate_presses`, read from its store on access.
 
-    As many of its chunks are read at once as make `at_once` touches, or fewer.
+    Chunks of the store are read together in larger chunks of about `at_once` touches, or fewer.
     """
 
     def __init__(self, indents: IndentSet, path: str | Path, at_once: int = _AT_ONCE):
-        """Raises `ValueError` for a store that is not finished, and as `Store` does."""
+        """Open the store. Raises `ValueError` if it is not finished, and as `Store` does."""
         store, chunks = Store(indents.contents(), path, create=False), indents.chunks
         checksums = store.finished()
         if len(checksums) < len(chunks):
@@ -70,13 +76,13 @@ class StoredTouches:
             )
         self.fingerprint = hashlib.sha256(repr(sorted(checksums.items())).encode()).hexdigest()
         self._arrays = store.open_dataset()
-        # As evenly as possible: none is to be smaller than a batch.
+        # The chunks are of similar size, so that none is smaller than a batch.
         number = min(-(-indents.number // at_once), len(chunks))
         parts = np.array_split(np.arange(len(chunks)), number)
         self.spans = [range(chunks[part[0]].start, chunks[part[-1]].stop) for part in parts]
 
     def rows(self, *names: str) -> "StoredRows":
-        """The arrays of `Touches`, chunk by chunk."""
+        """Return the arrays of these names, which are read chunk by chunk; see `Touches`."""
         return StoredRows(self, names)
 
     def in_memory(self) -> Examples:
@@ -84,13 +90,13 @@ class StoredTouches:
         return Examples(self._arrays["change"].to_numpy(), self._arrays["depth"].to_numpy())
 
     def read(self, name: str, number: int) -> Float[np.ndarray, "n *shape"]:
-        """Read an array of one chunk, float32."""
+        """Read the array `name` of one chunk, float32."""
         span = self.spans[number]
         return self._arrays[name][span.start : span.stop].to_numpy().astype(np.float32, copy=False)
 
 
 class StoredRows:
-    """Arrays of `StoredTouches` by their names, as `Rows`."""
+    """Arrays of `StoredTouches` with these names, with the interface of `Rows`."""
 
     def __init__(self, touches: StoredTouches, names: tuple[str, ...]):
         self._touches, self._names = touches, names
@@ -102,33 +108,39 @@ class StoredRows:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the touches, of their chunks, and of which arrays are read."""
+        """Fingerprint of the touches, the names of the arrays, and the sizes of the chunks."""
         return f"{self._touches.fingerprint} {' '.join(self._names)} {self.sizes}"
 
     def chunk(self, number: int):
-        """Read the arrays of one chunk; an array by itself where there is one name."""
+        """Read the arrays of one chunk; for a single name, the array itself."""
         arrays = tuple(self._touches.read(name, number) for name in self._names)
         return arrays[0] if len(arrays) == 1 else arrays
 
 
-# Of the unrolled network: weights of the maps of its first steps, and of the misfit relative to the last map; the
-# model's own error, relative to the changes; the greatest deviations of logarithms of contact impedances that drift;
-# and the greatest multiple of the noise that it is trained with.
+# Training of the unrolled network: weight of the maps of all steps but the last; weight of the voltage misfit; both are
+# relative to the weight of the last map. Model error, relative to the changes; maximum standard deviation of the drift
+# of log contact impedances; maximum noise, as a multiple of the given noise.
 _EARLY, _MISFIT, _MODEL_ERROR, _DRIFT, _LOUDER = 0.3, 0.05, 0.1, 0.1, 6.0
-# Scale of the squares of depths, so that losses are about one before training.
+# Scale of squared depths, chosen so that losses are about one before training.
 _SCALE = 0.002
 
 
 class Learnt(NamedTuple):
-    """A network that images, and the courses of its trainings by name."""
+    """A trained network.
+
+    **Fields**: `network`: the network; `courses`: results of its trainings, with their histories, by name.
+    """
 
     network: ThreeStages | Unrolled
     courses: dict[str, Trained]
 
 
 class Runs(NamedTuple):
-    """Settings of consecutive trainings: their `plan`, `key`, the `folder` of their checkpoints, and `progress`, which
-    is called with a description of the progress."""
+    """Settings of consecutive trainings.
+
+    **Fields**: `plan`: plan of every training; `key`: random key; `folder`: folder of the checkpoints, or None;
+    `progress`: function that is called with a description of the progress, or None.
+    """
 
     plan: Plan
     key: Array
@@ -136,7 +148,7 @@ class Runs(NamedTuple):
     progress: Callable[[str], None] | None = None
 
     def run(self, name: str, network, objective: Objective, training, validation) -> Trained:
-        """Run one training, with a key of its own by its name."""
+        """Run one training, with a random key that depends on its name."""
         key = jax.random.fold_in(self.key, int.from_bytes(name.encode()[:4], "little"))
         kept = None if self.folder is None else self.folder / f"{name}.training"
         report = self.progress
@@ -145,7 +157,7 @@ class Runs(NamedTuple):
 
 
 def train_three_stages(training: Touches, validation: Examples, noise: float, runs: Runs) -> Learnt:
-    """Train the paper's design: an autoencoder of the changes, one of the maps, and a projection between them.
+    """Train the design of Park et al. 2022: autoencoders of the changes and of the maps, and a projection between them.
 
     Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of relative changes.
     """
@@ -199,7 +211,7 @@ def train_three_stages(training: Touches, validation: Examples, noise: float, ru
         noisy = change + noise * jax.random.normal(key, change.shape, change.dtype)
         return jnp.mean((network(noisy) - wanted) ** 2) / _SCALE, network
 
-    rows = training.rows("change", "depth"), _noisy(validation, noise)
+    rows = training.rows("change", "depth"), _add_noise(validation, noise)
     found["projection"] = runs.run("projection", start, Objective(projected, _map_errors, trained), *rows)
     return Learnt(found["projection"].network, found)
 
@@ -207,16 +219,17 @@ def train_three_stages(training: Touches, validation: Examples, noise: float, ru
 def train_unrolled(
     start: Unrolled, sensed: Sensed, training: Touches, validation: Examples, noise: float, runs: Runs
 ) -> Learnt:
-    """Train the network `start`, which is of a skin already, on the error of its maps and of their voltages.
+    """Train the network `start`, which is already adapted to a skin, on the errors of its maps and of their voltages.
 
-    The voltages are those of the skin's forward model for the maps, with `noise` and drifting contacts.
+    The voltages of maps are computed by the skin's forward model. Changes are trained with the relative `noise` and
+    with drifting contact impedances.
     """
     contacts = jnp.asarray(sensed.contacts, jnp.float32)
 
     def loss(network, batch, key):
         change, wanted = batch
         keys = jax.random.split(key, 4)
-        # Squares of uniform shares: most are near the usual values.
+        # Squares of uniform random numbers: most amounts of drift and noise are near the usual ones.
         much, loud = (jax.random.uniform(one, (len(change), 1), change.dtype) ** 2 for one in keys[2:])
         drift = _DRIFT * much * jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
         own = noise * _LOUDER**loud
@@ -227,16 +240,17 @@ def train_unrolled(
             value = value + _EARLY * jnp.mean((one - wanted) ** 2)
         off = own[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
         missed = jnp.mean((network.predicted_changes(last) - change) ** 2, axis=1) / off
-        # The logarithm of the misfit: otherwise touches on electrodes, which the model explains least, would dominate.
+        # The logarithm of the misfit is used, since touches on electrodes, which the model explains least, would
+        # otherwise dominate.
         return value / _SCALE + _MISFIT * jnp.mean(jnp.log1p(missed)), network
 
-    rows = training.rows("change", "depth"), _noisy(validation, noise)
+    rows = training.rows("change", "depth"), _add_noise(validation, noise)
     found = runs.run("unrolled", start, Objective(loss, _map_errors, start.trained), *rows)
     return Learnt(found.network, {"unrolled": found})
 
 
 def shuffled(examples: Examples, seed: int = 0) -> Examples:
-    """The same changes and maps, in random pairs: only the distribution of maps can be learnt from them."""
+    """Pair the changes and maps at random: only the distribution of maps can be learnt from the result."""
     order = np.random.default_rng(seed).permutation(len(examples.change))
     return examples._replace(depth=examples.depth[order])
 
@@ -247,38 +261,39 @@ def _map_errors(network, batch):
 
 
 def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
-    """Mean and deviation of each column of rows that are arrays (n, M), over all their chunks."""
+    """Mean and standard deviation of each column of rows that are arrays (n, M), over all their chunks."""
     number, mean, squares = 0, np.zeros(()), np.zeros(())
     for chunk, size in enumerate(rows.sizes):
         own = np.asarray(rows.chunk(chunk), float)
         middle = own.mean(axis=0)
-        # Squares about the mean of both parts together (Chan, Golub and LeVeque 1983).
+        # Sum of squares about the mean of both parts together (Chan, Golub and LeVeque 1983).
         off, number = middle - mean, number + size
         squares = squares + ((own - middle) ** 2).sum(axis=0) + off**2 * (number - size) * size / number
         mean = mean + off * size / number
     return mean, np.sqrt(squares / number)
 
 
-def _noisy(examples: Examples, noise: float) -> tuple[Float[np.ndarray, "n M"], Float[np.ndarray, "n r c"]]:
-    """Changes with noise, and maps; the noise is fixed, so that held-out data are the same in every evaluation."""
+def _add_noise(examples: Examples, noise: float) -> tuple[Float[np.ndarray, "n M"], Float[np.ndarray, "n r c"]]:
+    """Return changes with noise, and maps; the noise is fixed, so that held-out data are the same in every
+    evaluation."""
     random = np.random.default_rng(0).normal(size=examples.change.shape)
     return np.asarray(examples.change + noise * random, np.float32), examples.depth
 
 
 SHAPE = (48, 48)
-# The number of touches of a chunk; seeds of the training set, the held-out set, and the test set, which no choice
-# depends on.
+# Number of touches of a chunk; seeds of the training set, the held-out set, and the test set, on which no choice
+# depends.
 _CHUNK, _SEEDS = 250, (0, 1, 2)
-# Of the evaluation: the diameter of a ball, metres, its depth, as a share of the skin's thickness, and the number of
-# places a side.
+# Evaluation: diameter of a ball, metres; its depth, divided by the skin's thickness; number of places along a side.
 _BALL, _DEPTH, _PLACES = 0.015, 0.75, 15
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Size of a training: `number` of touches, `held_out` ones besides, and the `plan` of every training.
+    """Size of a training.
 
-    `three_stages`: the plan of that design, where it is another.
+    **Fields**: `number`: number of training touches; `held_out`: number of held-out touches, and of test touches;
+    `plan`: plan of every training; `three_stages`: plan for the design "three-stages" if it is another, otherwise None.
     """
 
     number: int
@@ -287,7 +302,7 @@ class Preset:
     three_stages: Plan | None = None
 
     def plan_of(self, design: str) -> Plan:
-        """The plan of a design."""
+        """Return the training plan for a design."""
         return self.three_stages if design == "three-stages" and self.three_stages is not None else self.plan
 
 
@@ -304,11 +319,12 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class ImageStanding:
-    """Accuracy of a network on touches of a test set.
+    """Accuracy of a network on the touches of a test set.
 
-    **Fields**: `explained`, the share of the squares of depths that its maps get right, at most 1; `place`, errors of
-    the centroid of a single ball, metres, over a grid of places (mean, sd, rms), and `deepest`, the median ratio of its
-    estimated to its true depth; `right` and `estimated`, some maps, (k, rows, columns) over the thickness.
+    **Fields**: `explained`: fraction of the squared depth that its maps explain, at most 1; `place`: mean, standard
+    deviation (sd) and root mean square (rms) of the error of a ball's centroid over a grid of places, metres;
+    `deepest`: median ratio of the ball's estimated depth to its true depth; `right`, `estimated` (k, rows, columns):
+    true and estimated maps of some touches, divided by the thickness of the skin.
     """
 
     explained: float
@@ -320,8 +336,11 @@ class ImageStanding:
 
 @dataclass(frozen=True)
 class LearntImages:
-    """A `network`, the `courses` of its trainings by name, its `standing`, and the `seconds` of each part of the
-    work."""
+    """A trained image network and its accuracy.
+
+    **Fields**: `network`: the network; `courses`: results of its trainings, with their histories, by name; `standing`:
+    its accuracy; `seconds`: duration of each part of the work, seconds.
+    """
 
     network: ImageNetwork
     courses: dict[str, Trained]
@@ -342,12 +361,12 @@ def learn_images(
 ) -> LearntImages:
     """Simulate touches of a skin, train a network on them, and write it to `folder`, as `network.jeit`.
 
-    Interrupted at any moment, the same call resumes: touches are stored in chunks in the folder `work`, and trainings
-    in checkpoints. `preset`: "quick", under two minutes, "full", or a `Preset`; `design`: "unrolled", a network with
-    the skin's forward model, or "three-stages", that of Park et al. 2022. `touches`: the number of training touches, as
-    many as fit on the disk; the preset's unless given. `client`: of a dask cluster, which then simulates. `progress` is
-    called with a description of the progress. Raises `ValueError` for curved skins, names that there are not, no
-    number, and a folder of another skin's work; `ImportError` without the extras `learn` and `cluster`.
+    If it is interrupted, the same call resumes: touches are stored in chunks in the folder `work`, and trainings in
+    checkpoints. `preset`: "quick", under two minutes, "full", or a `Preset`; `design`: "unrolled", a network with the
+    skin's forward model, or "three-stages", that of Park et al. 2022; `touches`: number of training touches, by default
+    that of the preset, limited only by the disk; `client`: client of a dask cluster for the simulation. `progress` is
+    called with a description of the progress. Raises `ValueError` for curved skins, unknown names, an invalid number of
+    touches, and a folder with work on another skin; `ImportError` without the extras `learn` and `cluster`.
     """
     need_extra("learn", "a network that images touches")
     need_extra("cluster", "a store of simulated touches")
@@ -412,7 +431,7 @@ def learn_images(
 
 
 def stand(network: ImageNetwork, skin: Skin, examples: Examples, seed: int = 0) -> ImageStanding:
-    """Evaluate a network on touches, with the noise that it was trained with."""
+    """Evaluate a network on touches, with the noise of its training."""
     random = np.random.default_rng(seed)
 
     def answered(change):

@@ -1,4 +1,4 @@
-"""Image measured frames by a network, each as soon as it has come."""
+"""Image measured frames by a network, each as soon as it arrives."""
 
 from __future__ import annotations
 
@@ -14,13 +14,17 @@ from jeit.data import Measurement
 from jeit.touch.networks.image_network import ImageNetwork
 from jeit.touch.networks.missing import MOST_MISSING
 
-# The greatest distance, metres, of electrodes from those that a network was trained for.
+# Maximum difference, metres, of electrode positions and of the skin's size from those that a network was trained for.
 _OFF = 1e-3
 
 
 class FrameDepth(NamedTuple):
-    """One frame of a stream: its `number`, from 0, its map of `depth` (rows, columns), metres, None where it is refused
-    for the `reason`, and the `latency`, seconds from the frame to the map."""
+    """Depth map of one frame of a stream.
+
+    **Fields**: `number`: number of the frame, from 0; `depth` (rows, columns): map of depth, metres, None if the frame
+    is refused; `reason`: reason for refusing it, otherwise an empty string; `latency`: time from the frame to the map,
+    seconds.
+    """
 
     number: int
     depth: Float[np.ndarray, "rows columns"] | None
@@ -29,8 +33,10 @@ class FrameDepth(NamedTuple):
 
 
 def resting_frame(frames: Float[np.ndarray, "r M"], name: str = "reference") -> Float[np.ndarray, " M"]:
-    """The mean (M,) of frames (r, M) of a skin that nobody touches, volts, NaN where no frame has a reading. Raises
-    `ValueError` where most channels have none."""
+    """Mean (M,) of frames (r, M) of the untouched skin, volts; NaN for channels without a reading.
+
+    Raises `ValueError` if more than half of the channels have no reading.
+    """
     known = np.isfinite(frames)
     number = known.sum(axis=0)
     if np.mean(number == 0) > MOST_MISSING:
@@ -39,8 +45,11 @@ def resting_frame(frames: Float[np.ndarray, "r M"], name: str = "reference") -> 
 
 
 def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
-    """Raise `ValueError` for what is no measurement, and one of another protocol, or of electrodes at other places,
-    than the network was trained for."""
+    """Check that a measurement is of the skin that a network was trained for.
+
+    Raises `ValueError` for anything but a measurement, for complex voltages, and for another protocol, other positions
+    of electrodes, or another size of the skin.
+    """
     check_kind("measurement", measurement, Measurement, "a Measurement, as of jeit.data.read")
     network.check_protocol(measurement.protocol, measurement.name)
     if np.iscomplexobj(measurement.voltages):
@@ -72,11 +81,11 @@ def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
 
 
 def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarray, " M"]) -> Iterator[FrameDepth]:
-    """Image frames (M,), volts, one after the other, relative to the frame `rest` (M,) of the untouched skin.
+    """Image frames (M,), volts, one after the other, relative to the frame `rest` (M,), volts, of the untouched skin.
 
-    Everything is compiled before the first frame is requested. A frame is refused, and the stream continues, when it
-    has another number of channels, too many of them are missing, or its map is unreliable (`ImageNetwork.doubts`).
-    Raises `ValueError` for what are no frames.
+    The network is compiled before the first frame is requested. A frame is refused, and the stream continues, if it has
+    another number of channels, if too many of its channels are missing, or if its map is unreliable (see
+    `ImageNetwork.doubts`). Raises `ValueError` if `frames` is not iterable.
     """
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
     network.doubts(np.ones((1, len(rest))), network.share(np.zeros((1, len(rest)))))

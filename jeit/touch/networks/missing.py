@@ -1,21 +1,21 @@
-"""Estimate the channels that a frame has no reading of from those that it has."""
+"""Estimate the missing channels of a frame from its channels that have a reading."""
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
 
-# The greatest share of missing channels with which a frame is still used.
+# Maximum fraction of missing channels with which a frame is still used.
 MOST_MISSING = 0.5
 
 
 def filled(
     changes: Float[np.ndarray, "n M"], covariance: Float[np.ndarray, "M M"], noise: float
 ) -> Float[np.ndarray, "n M"]:
-    """Replace missing channels, NaN, by their expected value given the others, C₂₁ (C₁₁ + noise² 1)⁻¹ y₁.
+    """Replace missing channels, NaN, by their expected values given the others, C₂₁ (C₁₁ + noise² 1)⁻¹ y₁.
 
-    Touches give channels the `covariance` C, and the known changes are y₁; `noise`: standard deviation of Gaussian
-    noise.
+    C is the `covariance` of the changes that touches cause; index 1 stands for known channels, 2 for missing ones; y₁
+    are the known changes. `noise`: standard deviation of the Gaussian noise of each channel.
     """
     found = np.array(changes, float)
     known = np.isfinite(found)

@@ -1,4 +1,4 @@
-"""Touches that networks are trained on: their depth maps, places and voltage changes."""
+"""Random touches for training networks, positions in depth maps, and a linear model of a skin's channels."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ from jeit.touch.simulate.contact.indenters import AbstractIndenter
 from jeit.touch.simulate.contact.indents import relative_changes, relative_to
 from jeit.touch.simulate.contact.samples import lattice
 
-# Share of a map's greatest depth below which a pixel is not part of a touch.
+# Fraction of a map's maximum depth below which a pixel is not part of a touch.
 _PART = 0.5
 
 
 def peaks(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
-    """Places (n, 2) of the deepest pixels, metres; `places` of the pixels."""
+    """Positions (n, 2) of the deepest pixels of maps, metres; `places` (r, c, 2): positions of the pixels, metres."""
     deepest = maps.reshape(len(maps), -1).argmax(axis=1)
     return places.reshape(-1, 2)[deepest]
 
 
 def centroids_of(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
-    """Centroids (n, 2) of the pixels deeper than half of the deepest, weighted by depth, metres."""
+    """Centroids (n, 2) of the pixels deeper than half of the maximum depth, weighted by depth, metres."""
     flat = maps.reshape(len(maps), -1)
     most = flat.max(axis=1, keepdims=True)
     weight = np.where(flat > _PART * most, np.maximum(flat, 0), 0)
-    # For a map without any depth: the middle of the skin.
+    # A map without any depth gives the middle of the skin.
     weight = np.where(most > 0, weight, 1.0)
     return weight @ places.reshape(-1, 2) / weight.sum(axis=1, keepdims=True)
 
 
 def errors(found: Float[np.ndarray, "n 2"], right: Float[np.ndarray, "n 2"]) -> dict[str, float]:
-    """Mean, standard deviation and root mean square of the distance of estimated from true places, metres."""
+    """Mean, standard deviation and root mean square of the distance between estimated and true places, metres."""
     off = np.linalg.norm(found - right, axis=1)
     return {"mean": float(off.mean()), "sd": float(off.std()), "rms": float(np.sqrt(np.mean(off**2)))}
 
 
-# Least and greatest depth of a touch, as shares of the skin's thickness; in Park et al., 1 and 8 mm of 10 mm.
+# Minimum and maximum depth of a touch, divided by the skin's thickness; in Park et al., 1 and 8 mm of 10 mm.
 DEPTHS = (0.1, 0.8)
-# The greatest number of bodies that touch at once.
+# Maximum number of bodies that touch at once.
 _AT_ONCE = 3
-# The paper's limit of detection, of a ball 15 mm across, in deviations of the noise; the number of places along a side
-# at which its reading is computed.
+# Limit of detection of Park et al., newtons, for a ball of 15 mm diameter; the change at this limit, in standard
+# deviations of the noise; number of places along a side at which the change is computed.
 _LIMIT, _DEVIATIONS, _PLACES = 0.7, 3.0, 15
-# Least distance of a touch's centre from the skin's edge, as a share of its shorter side.
+# Minimum distance of a touch's centre from the skin's edge, divided by the skin's shorter side.
 _MARGIN = 0.04
 
 
@@ -62,7 +62,7 @@ def wrench() -> Joined:
 
 
 def bodies() -> list[AbstractIndenter]:
-    """Bodies that are pressed in: bells, balls, discs, bars, and a wrench."""
+    """Bodies that touch the skin: bells, balls, discs, bars, and a wrench."""
     return [
         *(Revolved(Bell(0.02, deviation)) for deviation in (5e-3, 7.5e-3, 10e-3)),
         *(ball(diameter) for diameter in (0.015, 0.020, 0.030)),
@@ -73,7 +73,7 @@ def bodies() -> list[AbstractIndenter]:
 
 
 def touch_draws(skin: Skin) -> IndentDraws:
-    """Touches of one to three of these bodies, anywhere on a skin, turned by any angle."""
+    """Random touches by one to three of the `bodies`, anywhere on a skin and turned by any angle."""
     thickness = float(skin.thickness)
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     depth = (DEPTHS[0] * thickness, DEPTHS[1] * thickness)
@@ -82,30 +82,31 @@ def touch_draws(skin: Skin) -> IndentDraws:
 
 
 def detection_noise(skin: Skin, limit: float = _LIMIT) -> float:
-    """Relative noise of a channel with which a ball 15 mm across under `limit` newtons is just detected.
+    """Relative noise of a channel with which a ball of 15 mm diameter under `limit` newtons is just detected.
 
-    It is a third of the greatest relative change of any channel, in the median of places all over the skin. Park et al.
-    2022 detect 0.7 N; a hydrogel of 100 kPa is then indented by 1.7 mm.
+    It is one third of the maximum relative change of all channels, in the median over places all over the skin. Park et
+    al. 2022 detect 0.7 N; this load indents a hydrogel of 100 kPa by 1.7 mm.
     """
     tip = ball(0.015)
     depth = material("hydrogel").support.pressure(tip, limit).approach
     grid = touches_away_from_the_edge(skin.flat_outline, 0.0075, _PLACES, _PLACES)
     change = relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places])
-    # Rounded to four digits, which do not depend on the order of sums.
+    # Rounded to four digits, which do not depend on the order of summation.
     return float(f"{np.median(np.abs(change).max(axis=1)) / _DEVIATIONS:.4g}")
 
 
-# Points in each cell, along a side: pixels are smaller than cells.
+# Number of points along a side of each cell; there are several, since pixels are smaller than cells.
 _LATTICE = 6
-# Greater depths continue the function linearly.
+# Maximum depth for the nonlinear formula; larger depths continue it linearly.
 _DEEPEST = 0.9
 
 
 class Sensed(NamedTuple):
-    """A linear model of a skin's channels.
+    """Linear model of a skin's channels.
 
-    **Fields**: `operator` (M, P), relative changes of the channels by each of P pixels' `strength`; `contacts` (L, M),
-    relative changes by the logarithm of each electrode's contact impedance; `shape` (rows, columns).
+    **Fields**: `operator` (M, P): relative changes of the channels per unit of `strength` of each of P pixels;
+    `contacts` (L, M): relative changes per unit of the logarithm of each electrode's contact impedance; `shape`: (rows,
+    columns) of the pixels.
     """
 
     operator: Float[np.ndarray, "M P"]
@@ -114,7 +115,7 @@ class Sensed(NamedTuple):
 
     @classmethod
     def of(cls, skin: Skin, shape: tuple[int, int] = (48, 48)) -> "Sensed":
-        """Compute the model of a skin, with its pixels on a grid of this shape over its box."""
+        """Compute the model of a skin, with its pixels on a grid of this shape over its bounding box."""
         rows, columns = shape
         model, conductivity = skin.model, np.asarray(skin.model_conductivity)
         rest, jacobian = (np.asarray(one) for one in model.voltages_and_jacobian(conductivity))
@@ -122,9 +123,9 @@ class Sensed(NamedTuple):
         each = relative_to(rest, rest - jacobian.T * np.broadcast_to(conductivity, jacobian.shape[1])[:, None])
         tree = KDTree(image_places(skin, columns, rows).reshape(-1, 2))
         pixel = np.asarray(tree.query(points[..., :2].reshape(-1, 2))[1])
-        # At the share b of the thickness from the face, depths δ take all where δ > b: the line through 0 nearest to
-        # that, over the depths that are drawn, uniform in log δ, is δ ∫ [δ' > b] dδ' / ∫ δ' dδ'. A sheet has no b, and
-        # loses δ.
+        # A point at depth b, divided by the skin's thickness, loses all conductivity under indentations δ > b. The line
+        # through 0 that fits this best, for depths drawn uniformly in log δ, is δ ∫ [δ' > b] dδ' / ∫ δ' dδ'. In a
+        # sheet, which has no depth b, every point loses δ.
         share = np.ones(points.shape[:2])
         if skin.num_layers:
             below = (points[..., 2].max() - points[..., 2]) / float(skin.thickness)
@@ -133,42 +134,42 @@ class Sensed(NamedTuple):
         operator = np.zeros((rows * columns, len(rest)))
         for place, number in enumerate(pixel.reshape(points.shape[:2]).T):
             np.add.at(operator, number, each * share[:, place, None] / points.shape[1])
-        return cls(rounded(operator.T), rounded(_of_contacts(skin, rest, conductivity)), shape)
+        return cls(rounded(operator.T), rounded(_contact_changes(skin, rest, conductivity)), shape)
 
     def halved(self) -> Float[np.ndarray, "M p"]:
-        """The operator for pixels twice as wide and high."""
+        """Operator for pixels twice as wide and high."""
         rows, columns = self.shape
         parts = self.operator.reshape(len(self.operator), rows // 2, 2, columns // 2, 2)
         return parts.sum(axis=(2, 4)).reshape(len(parts), -1)
 
 
 def rounded(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Round values to a millionth of their greatest, or less, to remove effects of the order of sums.
+    """Round values to a millionth of their maximum, or finer, to remove effects of the order of summation.
 
-    The same key then gives the same training wherever NumPy's arrays lie in memory.
+    The same random key then gives the same training wherever NumPy's arrays are in memory.
     """
     unit = 2.0 ** (np.floor(np.log2(max(float(np.abs(values).max()), 1e-300))) - 20)
     return np.round(values / unit) * unit
 
 
 def strength(depth):
-    """Strength δ / √(1 − δ) of depths δ over the thickness, to which changes of voltages are proportional.
+    """Strength δ / √(1 − δ) of depths δ, divided by the skin's thickness; changes of voltages are proportional to it.
 
-    A patch that conducts less has a greater effect than its change of conductivity, since current flows around it. In
-    two dimensions, patches of e^s and e^−s times the conductivity change voltages oppositely, to first order in their
-    size (Keller's duality), which 2 sinh(s / 2) does, and log(1 − δ) = −s.
+    A patch of lower conductivity has a larger effect than in proportion to its change, since current flows around it.
+    In two dimensions, patches with e^s and e^−s times the conductivity change voltages oppositely, to first order in
+    their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s, has this property.
     """
     clipped = jnp.clip(depth, 0.0, _DEEPEST)
     return clipped / jnp.sqrt(1 - clipped) + (depth - clipped)
 
 
 def depth_of(strength):
-    """Depths of strengths, the inverse of `strength`; strengths below zero give depths below zero."""
+    """Depths that have the given strengths, the inverse of `strength`; negative strengths give negative depths."""
     above = jnp.maximum(strength, 0.0)
     return (jnp.sqrt(above**2 + 4) - above) * above / 2 + jnp.minimum(strength, 0.0)
 
 
-def _of_contacts(skin: Skin, rest, conductivity) -> Float[np.ndarray, "L M"]:
+def _contact_changes(skin: Skin, rest, conductivity) -> Float[np.ndarray, "L M"]:
     model = skin.model
     fields, impedance = (np.asarray(one) for one in model.fields(conductivity))
     slope = ContactSensitivity(model.mesh, model.electrodes)(fields, impedance, model.electrodes.contact_impedance)

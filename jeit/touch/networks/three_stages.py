@@ -1,7 +1,7 @@
-"""A network of three stages, after Park et al., and its layers.
+"""A network of three stages, after Park et al. 2022, and its layers.
 
-What the paper does not print is chosen: hidden layers of 256 between 94 channels and 84 latent values, convolutions of
-16, 32 and 64 channels.
+The paper does not state all sizes. Those chosen here are hidden layers of 256 values between 94 channels and 84 latent
+values, and convolutions of 16, 32 and 64 channels.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from jaxtyping import Array, Float
 
 
 class Dense(eqx.Module):
-    """x W + b, of x (b, i)."""
+    """Dense layer x W + b for a batch x (b, i)."""
 
     weight: Float[Array, "i o"]
     bias: Float[Array, " o"]
 
     def __init__(self, inputs: int, outputs: int, *, key: Array):
-        """Weights of He et al. 2015, as of every layer here; no bias."""
+        """Create the layer with random weights after He et al. 2015, as in all layers here, and a bias of zero."""
         self.weight = _start(key, (inputs, outputs), inputs)
         self.bias = jnp.zeros(outputs, jnp.float32)
 
@@ -33,7 +33,7 @@ class Dense(eqx.Module):
 
 
 class Convolution(eqx.Module):
-    """3 × 3, padded with zeros, of every `stride`-th pixel."""
+    """3 × 3 convolution of images padded with zeros, at every `stride`-th pixel."""
 
     weight: Float[Array, "3 3 i o"]
     bias: Float[Array, " o"]
@@ -52,15 +52,17 @@ class Convolution(eqx.Module):
         return jax.lax.conv_general_dilated(image, self.weight, steps, "SAME", dimension_numbers=layout) + self.bias
 
     def of_doubled(self, image: Float[Array, "b r c i"]) -> Float[Array, "b s d o"]:
-        """Apply the layer to the image `doubled`, in four ninths of the products.
+        """Apply the layer to the image enlarged by `doubled`, with four ninths of the multiplications.
 
-        Of the three rows, and columns, that a pixel weighs, two are equal, and their weights are added first.
+        Of the three rows, and columns, that contribute to a pixel, two are equal, so that their weights are added
+        first.
         """
         number, rows, columns, _ = image.shape
         tall = jnp.stack([self.weight.at[1].add(self.weight[2])[:2], self.weight.at[1].add(self.weight[0])[1:]])
         wide = [tall.at[:, :, 1].add(tall[:, :, 2])[:, :, :2], tall.at[:, :, 1].add(tall[:, :, 0])[:, :, 1:]]
         both = jnp.moveaxis(jnp.stack(wide, axis=1), (0, 1), (3, 4)).reshape(2, 2, image.shape[-1], -1)
-        # Padded in advance: XLA takes twenty times as long for the derivatives of a padded convolution of even size.
+        # The image is padded in advance: for a padded convolution of even size, XLA takes twenty times as long to
+        # compute derivatives.
         framed = jnp.pad(image, ((0, 0), (1, 1), (1, 1), (0, 0)))
         layout = ("NHWC", "HWIO", "NHWC")
         parts = jax.lax.conv_general_dilated(framed, both, (1, 1), "VALID", dimension_numbers=layout)
@@ -71,20 +73,22 @@ class Convolution(eqx.Module):
 
 
 class Chain(eqx.Module):
-    """Layers one after the other, exponential linear units between them; dropout of a share before each but the first
-    where a key is given."""
+    """Layers in sequence, with exponential linear units between them.
+
+    If a key is given, a fraction `dropout` of the values is dropped before each layer but the first.
+    """
 
     layers: tuple[eqx.Module, ...]
     dropout: float = eqx.field(static=True)
 
     @classmethod
     def dense(cls, widths: Sequence[int], *, key: Array, dropout: float = 0.0) -> "Chain":
-        """Dense layers from each of the `widths` to the next."""
+        """Create dense layers in sequence, from each of the `widths` to the next."""
         keys = jax.random.split(key, len(widths) - 1)
         return cls(tuple(Dense(i, o, key=one) for (i, o), one in zip(pairwise(widths), keys, strict=True)), dropout)
 
     def __call__(self, values: Array, key: Array | None = None) -> Array:
-        """Apply the layers to a batch; there is no unit after the last."""
+        """Apply the layers to a batch; the output of the last layer has no activation function."""
         for number, layer in enumerate(self.layers):
             if number:
                 values = jax.nn.elu(values)
@@ -96,14 +100,14 @@ class Chain(eqx.Module):
 
 
 def doubled(image: Float[Array, "b r c i"]) -> Float[Array, "b s d i"]:
-    """Every pixel as 2 × 2."""
+    """Repeat every pixel as 2 × 2 pixels."""
     number, rows, columns, channels = image.shape
     wide = jnp.broadcast_to(image[:, :, None, :, None], (number, rows, 2, columns, 2, channels))
     return wide.reshape(number, 2 * rows, 2 * columns, channels)
 
 
 def unfolded(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:
-    """Four channels of each pixel as 2 × 2 of one."""
+    """Arrange the four channels of each pixel as 2 × 2 pixels of one channel."""
     number, rows, columns, _ = image.shape
     parts = image.reshape(number, rows, columns, 2, 2)
     return jnp.moveaxis(parts, 3, 2).reshape(number, 2 * rows, 2 * columns)
@@ -115,36 +119,36 @@ def _start(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
 
 _HIDDEN, _LATENT, _DROPOUT = 256, 84, 0.03
 _CHANNELS, _CODE = (16, 32, 64), 128
-# Noise of depths over the thickness, in the input of the autoencoder of depth maps.
+# Standard deviation of the noise added to the input of the autoencoder of depth maps, divided by the thickness.
 _NOISE = 0.02
 
 
 class VoltageAutoencoder(eqx.Module):
-    """Standardised changes (b, M) to 84 latent values, and back."""
+    """Autoencoder of standardised changes (b, M) with 84 latent values."""
 
     encoder: Chain
     decoder: Chain
 
     def __init__(self, channels: int, *, key: Array):
-        """Create an untrained autoencoder of `channels` channels."""
+        """Create an untrained autoencoder for `channels` channels."""
         inwards, outwards = jax.random.split(key)
         self.encoder = Chain.dense((channels, _HIDDEN, _LATENT), key=inwards, dropout=_DROPOUT)
         self.decoder = Chain.dense((_LATENT, _HIDDEN, channels), key=outwards, dropout=_DROPOUT)
 
     def __call__(self, changes: Float[Array, "b M"], key: Array | None = None) -> Float[Array, "b M"]:
-        """Reconstruct changes without noise; with dropout where a key is given."""
+        """Reconstruct changes without noise; dropout is applied if a key is given."""
         first, second = (None, None) if key is None else jax.random.split(key)
         return self.decoder(jax.nn.elu(self.encoder(changes, first)), second)
 
 
 class DepthEncoder(eqx.Module):
-    """Depth maps (b, rows, columns) to 128 values."""
+    """Encoder of depth maps (b, rows, columns) to 128 values."""
 
     layers: tuple[Convolution, ...]
     last: Dense
 
     def __init__(self, shape: tuple[int, int], *, key: Array):
-        """Of maps of this shape, multiples of 8."""
+        """Create an untrained network for maps of this shape; rows and columns are multiples of 8."""
         *keys, last = jax.random.split(key, len(_CHANNELS) + 1)
         widths = (1, *_CHANNELS)
         self.layers = tuple(Convolution(i, o, 2, key=one) for (i, o), one in zip(pairwise(widths), keys, strict=True))
@@ -159,14 +163,14 @@ class DepthEncoder(eqx.Module):
 
 
 class DepthDecoder(eqx.Module):
-    """128 values to depth maps (b, rows, columns)."""
+    """Decoder of 128 values to depth maps (b, rows, columns)."""
 
     first: Dense
     layers: tuple[Convolution, ...]
     shape: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, shape: tuple[int, int], *, key: Array):
-        """Of maps of this shape, multiples of 8."""
+        """Create an untrained network for maps of this shape; rows and columns are multiples of 8."""
         first, *keys = jax.random.split(key, len(_CHANNELS) + 1)
         widths = (*_CHANNELS[::-1], 1)
         self.shape = (shape[0] // 8, shape[1] // 8)
@@ -182,26 +186,29 @@ class DepthDecoder(eqx.Module):
 
 
 class DepthAutoencoder(eqx.Module):
-    """Depth maps to 128 values, and back."""
+    """Autoencoder of depth maps with a code of 128 values."""
 
     encoder: DepthEncoder
     decoder: DepthDecoder
 
     def __init__(self, shape: tuple[int, int], *, key: Array):
-        """Of maps of this shape, multiples of 8."""
+        """Create an untrained network for maps of this shape; rows and columns are multiples of 8."""
         inwards, outwards = jax.random.split(key)
         self.encoder, self.decoder = DepthEncoder(shape, key=inwards), DepthDecoder(shape, key=outwards)
 
     def __call__(self, maps: Float[Array, "b r c"], key: Array | None = None) -> Float[Array, "b r c"]:
-        """Reconstruct maps; with noise on the input where a key is given."""
+        """Reconstruct maps; noise is added to the input if a key is given."""
         if key is not None:
             maps = maps + _NOISE * jax.random.normal(key, maps.shape, maps.dtype)
         return self.decoder(jax.nn.elu(self.encoder(maps)))
 
 
 class ThreeStages(eqx.Module):
-    """Relative changes (b, M) → 84 latent values → 128 → depth maps (b, rows, columns); `mean` and `deviation` (M,) of
-    the changes that it was trained on."""
+    """Network of three stages: relative changes (b, M) → 84 latent values → 128 values → depth maps (b, rows, columns).
+
+    **Fields**: `mean`, `deviation` (M,): mean and standard deviation of the changes in the training set, with noise;
+    `encoder`, `projection`, `decoder`: the three stages.
+    """
 
     mean: Float[Array, " M"]
     deviation: Float[Array, " M"]
@@ -210,7 +217,7 @@ class ThreeStages(eqx.Module):
     decoder: DepthDecoder
 
     def __init__(self, channels: int, shape: tuple[int, int], *, key: Array):
-        """Untrained."""
+        """Create an untrained network for `channels` channels and maps of this shape."""
         voltages, depth, between = jax.random.split(key, 3)
         self.mean, self.deviation = jnp.zeros(channels, jnp.float32), jnp.ones(channels, jnp.float32)
         self.encoder = VoltageAutoencoder(channels, key=voltages).encoder
@@ -222,6 +229,6 @@ class ThreeStages(eqx.Module):
         return (changes - self.mean) / self.deviation
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
-        """Depth maps, over the thickness of the skin."""
+        """Compute depth maps, divided by the thickness of the skin."""
         latent = jax.nn.elu(self.encoder(self.standard(changes)))
         return self.decoder(jax.nn.elu(self.projection(latent)))

@@ -1,8 +1,9 @@
 """An unrolled network with the skin's forward model: linear images of the residual, refined by convolutions.
 
-Every step images the residual changes by matrices of the forward model (one Gauss-Newton step with a Gaussian prior,
-with the noise alone and also with drifting contacts), and a small convolutional network, the same all over the skin,
-adds to the map. Training includes the misfit of the voltages that the model gives its maps.
+Every step computes linear images of the residual changes by matrices of the forward model: one Gauss-Newton step with a
+Gaussian prior, for the noise alone and also for drifting contacts. A small convolutional network, the same all over the
+skin, then computes a correction of the map. Training includes the misfit of the voltages that the forward model
+predicts for the maps.
 """
 
 from __future__ import annotations
@@ -17,21 +18,22 @@ from jeit.touch.networks.sensed import Sensed, depth_of, rounded, strength
 from jeit.touch.networks.three_stages import Convolution, doubled, unfolded
 
 _WIDE, _NARROW = 24, 16
-# The prior: deviation of a pixel's strength, and length of its correlation over the skin's longer side; the multiples
-# of the noise for each of the images without drift, the first of which is the initial map; and the drift of logarithms
-# of contacts in one more image.
+# Prior: standard deviation of a pixel's strength; its correlation length, divided by the skin's longer side. Linear
+# images: multiples of the noise for the images without drift, of which the first is the initial map; standard deviation
+# of the drift of log contact impedances, for one more image.
 _DEVIATION, _LENGTH, _TIMES, _DRIFT = 0.15, 0.04, (8.0, 1.5), 0.05
 
 
 class Refinement(eqx.Module):
-    """A convolutional U-net from images (b, rows, columns, i) to changes of a map of twice as many rows and columns."""
+    """Convolutional U-net that computes, from images (b, rows, columns, i), corrections of maps with twice the rows and
+    columns."""
 
     inwards: tuple[Convolution, ...]
     outwards: tuple[Convolution, ...]
     last: Convolution
 
     def __init__(self, channels: int, *, key: Array):
-        """Create an untrained net for images with `channels` channels."""
+        """Create an untrained network for images with `channels` channels."""
         keys = jax.random.split(key, 9)
         self.inwards = (
             Convolution(channels, _NARROW, key=keys[0]),
@@ -46,11 +48,11 @@ class Refinement(eqx.Module):
             Convolution(_NARROW, _NARROW, key=keys[7]),
         )
         last = Convolution(_NARROW, 4, key=keys[8])
-        # Almost nothing is added at first: an untrained net leaves linear images as they are.
+        # The initial weights are small, so that an untrained network hardly changes the linear images.
         self.last = eqx.tree_at(lambda one: one.weight, last, 0.01 * last.weight)
 
     def __call__(self, images: Float[Array, "b r c i"]) -> Float[Array, "b s d"]:
-        """Apply the net to a batch."""
+        """Apply the network to a batch."""
         elu = jax.nn.elu
         first = elu(self.inwards[0](images))
         second = elu(self.inwards[2](elu(self.inwards[1](first))))
@@ -61,11 +63,12 @@ class Refinement(eqx.Module):
 
 
 class Unrolled(eqx.Module):
-    """A network from relative changes (b, M) to depth maps (b, rows, columns) over the skin's thickness.
+    """Network from relative changes (b, M) to depth maps (b, rows, columns), divided by the skin's thickness.
 
-    **Fields**: `operator` (M, P), the response to pixels; `imagers` (M, p, k), transposed matrices of linear images on
-    pixels twice as wide; `still` (rows / 2, columns / 2, s), constant images of the skin; `scale`, of changes in the
-    images; the `steps`. All but these are properties of the skin, and not trained.
+    **Fields**: `operator` (M, P): response of the channels to the pixels; `imagers` (M, p, k): transposed matrices of
+    the linear images, on pixels twice as wide; `still` (rows / 2, columns / 2, s): constant images that describe the
+    skin; `steps`: networks that correct the map; `shape`: (rows, columns) of the maps. Only `steps` are trained; the
+    others depend on the skin.
     """
 
     operator: Float[Array, "M P"]
@@ -75,7 +78,7 @@ class Unrolled(eqx.Module):
     shape: tuple[int, int] = eqx.field(static=True)
 
     def __init__(self, channels: int, shape: tuple[int, int], num_steps: int = 1, *, key: Array):
-        """Create an untrained network for so many channels, and maps of this shape, without a skin."""
+        """Create an untrained network for `channels` channels and maps of this shape, not yet adapted to a skin."""
         rows, columns = shape[0] // 2, shape[1] // 2
         images = len(_TIMES) + 1
         self.operator = jnp.zeros((channels, shape[0] * shape[1]), jnp.float32)
@@ -86,10 +89,10 @@ class Unrolled(eqx.Module):
         self.shape = shape
 
     def of_skin(self, sensed: Sensed, places: Float[np.ndarray, "r c 2"], centres, noise: float) -> "Unrolled":
-        """Return the network for a skin.
+        """Return the network adapted to a skin.
 
-        `sensed`: the linear model of its channels; `places` of its pixels and `centres` (L, 2) of its electrodes,
-        metres; `noise`: the relative noise of its channels.
+        `sensed`: linear model of the skin's channels; `places` (r, c, 2): positions of its pixels, metres; `centres`
+        (L, 2): positions of its electrodes, metres; `noise`: relative noise of its channels.
         """
         operator = sensed.halved()
         covariance = _covariance(places[::2, ::2].reshape(-1, 2))
@@ -108,23 +111,24 @@ class Unrolled(eqx.Module):
 
     @property
     def trained(self) -> "Unrolled":
-        """A tree of truth values: which leaves are trained."""
+        """Tree of booleans: whether each leaf is trained."""
         nothing = jax.tree.map(lambda _: False, self)
         return eqx.tree_at(lambda one: one.steps, nothing, jax.tree.map(eqx.is_inexact_array, self.steps))
 
     def covariance(self, places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
-        """Covariance of the changes of channels, for pixels at these places with strengths of the prior."""
+        """Covariance (M, M) of the changes of channels for strengths of the prior, with pixels at `places` (r, c, 2),
+        metres."""
         rows, columns = self.shape[0] // 2, self.shape[1] // 2
         operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
         operator = operator.reshape(len(operator), -1)
         return operator @ _covariance(places[::2, ::2].reshape(-1, 2)) @ operator.T
 
     def predicted_changes(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
-        """Relative changes that the forward model predicts for maps."""
+        """Relative changes (b, M) that the forward model predicts for maps."""
         return strength(maps).reshape(len(maps), -1) @ self.operator.T
 
     def each(self, changes: Float[Array, "b M"]) -> list[Float[Array, "b r c"]]:
-        """Maps after each of the steps."""
+        """Compute the maps after each step."""
         number, (rows, columns) = len(changes), (self.shape[0] // 2, self.shape[1] // 2)
         still = jnp.broadcast_to(self.still, (number, *self.still.shape))
         found = []
@@ -142,12 +146,12 @@ class Unrolled(eqx.Module):
         return found
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
-        """Map after the last step."""
+        """Compute the maps after the last step."""
         return self.each(changes)[-1]
 
 
 def _covariance(places: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
-    """Gaussian covariance of strengths as a function of distance."""
+    """Gaussian covariance of the strengths of pixels at `places`, as a function of their distance."""
     length = _LENGTH * np.ptp(places, axis=0).max()
     squared = ((places[:, None] - places) ** 2).sum(axis=-1)
     return _DEVIATION**2 * np.exp(-squared / (2 * length**2))

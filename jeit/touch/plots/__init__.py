@@ -1,4 +1,4 @@
-"""Plot touches, and how well models of them were learnt."""
+"""Plots of touches, contacts, gestures and damage of skins, and of the errors of learnt models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw contacts on an image, and the stages by which they are detected."""
+"""Plots of contacts on an image, and of the stages of their detection."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def plot_contacts(
 ) -> Axes:
     """Draw an image (m,) with the outline of every contact, a cross at its centroid, and the centroid in millimetres.
 
-    Arguments as in `plot_image`. Raises `ValueError` as it does, and for what are no contacts.
+    Arguments as in `plot_image`. Raises `ValueError` as `plot_image`, and for elements that are not contacts.
     """
     check_contacts(contacts)
     ax = plot_image(mesh, image, electrodes, scale=scale, title=title, ax=ax)
@@ -40,8 +40,8 @@ def plot_contacts(
 
 
 def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axes:
-    """Draw outlines, centroids and coordinates of contacts, on axes in metres. Raises `ValueError` for what are no
-    contacts."""
+    """Draw outlines, centroids and coordinates of contacts, on axes in metres. Raises `ValueError` for elements that
+    are not contacts."""
     check_contacts(contacts)
     ax = axes_or_new(ax)
     for contact in contacts:
@@ -65,14 +65,14 @@ def draw_contacts(contacts: Sequence[Contact], *, ax: Axes | None = None) -> Axe
 
 
 def check_contacts(contacts) -> None:
-    """Check that these are contacts. Raises `ValueError` for what are no contacts."""
+    """Check that `contacts` is a list of contacts. Raises `ValueError` otherwise."""
     check_kind("contacts", contacts, (list, tuple), "a list of contacts, as of find_contacts(finder, image)")
     for number, contact in enumerate(contacts):
         check_kind(f"contacts[{number}]", contact, Contact, "a Contact")
 
 
 def largest(values: np.ndarray) -> float:
-    """The greatest magnitude of the finite values; 0 if there are none."""
+    """Maximum magnitude of the finite values; 0 if there are none."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
@@ -82,9 +82,9 @@ _TITLES = ("region of interest", "grey", "adaptive threshold", "opened", "contou
 def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarray | None = None) -> np.ndarray:
     """Draw the result of every step of `RasterFinder` on six axes.
 
-    They are the region of interest with its unit, grey levels, threshold, opened mask, contours, and centroids in
-    millimetres over the region. `stages`: `finder.stages(image, noise)`; `unit`: the unit of the image; `axes` (6,) to
-    draw on, those of a new figure unless given. Raises `ValueError` for what are no stages, and another number of axes.
+    The steps are the region of interest, grey levels, threshold, opened mask, contours, and centroids in millimetres.
+    `stages`: result of `finder.stages(image, noise)`; `unit`: unit of the image; `axes`: (6,) axes to draw on, default:
+    those of a new figure. Raises `ValueError` for stages of another type and another number of axes.
     """
     check_kind("stages", stages, RasterStages, "what finder.stages(image, noise) of a RasterFinder gives")
     axes = _six() if axes is None else np.asarray(axes, object).ravel()
@@ -95,7 +95,7 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     strongest = factor * largest(stages.region) or 1.0
     keywords = {"cmap": "RdBu_r", "vmin": -strongest, "vmax": strongest}
     region = _drawn(axes[0], factor * stages.region, stages, keywords)
-    # No taller than its image, however tall the axes are that the six images share.
+    # The colour bar is as tall as its image, whatever the height of the axes.
     bar = axes[0].inset_axes((1.02, 0.1, 0.035, 0.8))
     draw_colour_bar(axes[0], region, f"Change ({with_prefix})", signed=True, place=bar)
     black = {"cmap": "gray", "vmin": 0, "vmax": 255}

@@ -1,4 +1,4 @@
-"""Draw damage of a skin on its sheet, and its course in time."""
+"""Plots of the damage of a skin on its sheet, and over time."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ def plot_health(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a skin with its cuts and failed electrodes, over an `image` (m,) of it, if one is given.
+    """Draw a skin with its cuts and failed electrodes, over an `image` (m,) of the skin, if one is given.
 
-    Each cut is labelled with its length, the standard deviation of the length, and when it was made; mended cuts are
-    dashed. A cross marks every electrode that has failed. `scale` as in `plot_image`. Raises `ValueError` for a skin
-    without a model, and as `plot_image` does.
+    Each cut is labelled with its length, the standard deviation of the length, and the time when it occurred; mended
+    cuts are dashed. A cross marks every failed electrode. `scale` as in `plot_image`. Raises `ValueError` for a skin
+    without a model, and as `plot_image`.
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(frames, model=model, …)")
     if health.skin is None:
@@ -96,17 +96,18 @@ def _draw_cut(ax: Axes, event: HealthEvent) -> None:
     )
 
 
-# The greatest number of events that are labelled; and the least height of the axes, as a multiple of the limit.
+# Maximum number of events with labels; minimum upper end of the y axis, as a multiple of the limit.
 _WRITTEN, _LEAST = 12, 1.5
 
 
 def plot_health_course(
     health: SkinHealth, times: ArrayLike, frames: ArrayLike, *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the change of frames (F, M) at `times` (F,) from the healthy skin, and a line at the time of every event.
+    """Draw the change of frames (F, M) at `times` (F,) relative to the healthy skin, and a line at the time of every
+    event.
 
-    The change is in multiples of the limit that a lasting change exceeds. Touches stand out as far as damage may, but
-    come back; damage stays. Raises `ValueError` for shapes that disagree.
+    The change is given in multiples of the limit above which a lasting change counts as damage. Touches may cause
+    changes as large as damage, but only for a time. Raises `ValueError` for shapes that do not match.
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of watch(health, frames)")
     when, read = np.asarray(times, float), np.asarray(frames, float)

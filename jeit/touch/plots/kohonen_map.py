@@ -1,4 +1,4 @@
-"""Plot a self-organising map: its net of neurons, and a value for each of them."""
+"""Plot of a self-organising map: its net of neurons, and a value of each neuron."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jeit.arguments import check_kind, real_array
 from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar, extent_of
 from jeit.touch.kohonen import MapTouch
 
-# Area of a neuron's mark, points², in a map with as many neurons as one of 32 by 32.
+# Area of the mark of a neuron in points², in a map with 1024 neurons.
 _MARK, _NEURONS = 26.0, 1024
 
 
@@ -27,13 +27,14 @@ def plot_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the net of a map's neurons at `places` (R, C, 2), neighbours joined; neurons whose place is NaN are left
-    out.
+    """Draw the neurons of a map and lines between neighbours; neurons whose place is NaN are left out.
 
-    `places`: in metres, as of `PlacedMap.places`; or in any unit (`on_skin=False`, without a scale bar), as of
-    `drawn_map`. `values` (R, C) of neurons, such as the activity of a frame, are drawn in colour and named `label`.
-    `touches`: a cross for each. Raises `ValueError` for arrays of other shapes, and a map none of whose neurons has a
-    place.
+    - `places`: (R, C, 2), in metres, such as `PlacedMap.places`, or, with `on_skin=False` and without a scale bar, in
+      any unit, such as from `drawn_map`.
+    - `values`: (R, C), values of the neurons, such as the activity in a frame, drawn in colour; `label`: their name.
+    - `touches`: touches, each drawn as a cross.
+
+    Raises `ValueError` for arrays of other shapes, and if no neuron has a place.
     """
     places = real_array("places", places, "places (R, C, 2) of neurons")
     if places.ndim != 3 or places.shape[2] != 2:

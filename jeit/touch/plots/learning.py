@@ -1,4 +1,4 @@
-"""Plot the errors of a learnt skin on held-out presses: of places, forces, labels and keys."""
+"""Plots of the errors of a learnt skin on held-out presses: places, forces, labels and keys."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from jeit.plot.axes import (
 )
 from jeit.touch import Standing
 
-# The greatest number of labels that are written beside a confusion matrix.
+# Maximum number of labels for which a confusion matrix has tick labels.
 _MOST_WRITTEN = 24
 
 
 def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the errors of the places estimated for held-out presses, at the true places, in millimetres.
 
-    `place`: the standing of that name of a `LearntSkin`.
+    `place`: the standing `place` of a `LearntSkin`.
     """
     ax = axes_or_new(ax)
     off = 1e3 * np.linalg.norm(place.held_out - place.right, axis=1)
@@ -97,7 +97,7 @@ def plot_key_errors(keys: Standing, *, title: str | None = None, ax: Axes | None
 
 
 def plot_tried(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the accuracy on held-out presses of each method that was tried, in per cent, the best on top."""
+    """Draw the accuracy of each method that was tried, on held-out presses, in per cent; the best is at the top."""
     ax = axes_or_new(ax)
     names, right = [one for one, _ in label.tried], [100 * (1 - error) for _, error in label.tried]
     colours = [SERIES_COLOURS[0] if one == label.method else "#c9d3de" for one in names]

@@ -1,4 +1,4 @@
-"""Draw what happens over time: names of touches, and labels of sounds."""
+"""Plots over time: changes, named touches and labels of sounds; and paths of touches."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from jeit.touch.gestures.touch_watch import NamedTouch
 from jeit.touch.listening import SoundLabels
 from jeit.touch.listening.feature_images import EVERY
 
-# A curve is interrupted where no frame came for this multiple of the usual interval; the greatest number of points of a
-# curve; the shortest bar, as a share of the whole time; the greatest number of touches that are numbered.
+# Gap between frames, as a multiple of the median interval, at which a curve is interrupted; maximum number of points of
+# a curve; minimum length of a bar, as a share of the whole time; maximum number of touches with numbers.
 _UNSEEN, _POINTS, _SHORTEST, _NUMBERED = 10.0, 3000, 0.003, 60
 _UNLIKE = "#b9bdc4"
 
@@ -45,9 +45,10 @@ def plot_changes(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the greatest change (F,) of frames at `seconds` (F,), and the level that a touch exceeds, both in `unit`.
+    """Draw the maximum change `peaks` (F,) of frames at times `seconds` (F,), and the `level` that touches exceed, both
+    in `unit`.
 
-    Refused frames, which are NaN, leave gaps. Raises `ValueError` for shapes that disagree.
+    Refused frames, which are NaN, leave gaps. Raises `ValueError` for shapes that do not match.
     """
     when, values = np.asarray(seconds, float), np.asarray(peaks, float)
     if when.shape != values.shape or when.ndim != 1:
@@ -70,8 +71,8 @@ def plot_timeline(
 ) -> Axes:
     """Draw named touches from onset to end, each in the lane of its predicted gesture.
 
-    The less probable the gesture, the fainter the bar; touches unlike any in the training set have a lane of their own.
-    `names` (C,) of the gestures. Raises `ValueError` for what are no named touches.
+    Bars are fainter for less probable gestures; touches unlike any in the training set have their own lane. `names`:
+    (C,), names of the gestures. Raises `ValueError` for elements that are not named touches.
     """
     check_named(touches)
     ax = axes_or_new(ax, (9.0, 2.6))
@@ -118,7 +119,7 @@ def plot_touch_paths(
 ) -> Axes:
     """Draw the skin and the paths of touches, each a line from a dot at its start, in the colour of its gesture.
 
-    The number of each touch is written beside it. Raises `ValueError` for what are no named touches.
+    The number of each touch is written beside it. Raises `ValueError` for elements that are not named touches.
     """
     check_named(touches)
     ax = axes_or_new(ax)
@@ -150,7 +151,7 @@ def gesture_colour(one: NamedTouch, names: Sequence[str]) -> str:
 
 
 def check_named(touches) -> None:
-    """Check that these are named touches. Raises `ValueError` for what are no named touches."""
+    """Check that `touches` is a list of named touches. Raises `ValueError` otherwise."""
     check_kind("touches", touches, (list, tuple), "a list of named touches, as TouchWatch.follow gives them")
     for number, one in enumerate(touches):
         check_kind(f"touches[{number}]", one, NamedTouch, "a NamedTouch")
@@ -161,14 +162,14 @@ def _alpha(one: NamedTouch) -> float:
 
 
 def _broken(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Insert NaN wherever no frame came for long."""
+    """Insert NaN into a curve at long gaps between frames, so that it is interrupted."""
     passed = np.diff(when)
     gaps = 1 + np.flatnonzero(passed > _UNSEEN * np.median(passed)) if passed.size else np.zeros(0, int)
     return np.insert(when, gaps, when[gaps]), np.insert(values, gaps, np.nan)
 
 
 def _thinned(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Reduce a curve to no more points than can be seen, keeping its extremes."""
+    """Reduce a curve to about `_POINTS` points, keeping its extremes."""
     if len(when) <= _POINTS:
         return when, values
     parts = np.array_split(np.arange(len(when)), _POINTS // 2)
@@ -178,7 +179,8 @@ def _thinned(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the probabilities of all names over time, a row each, with a bar under the chosen name; quiet is blank."""
+    """Draw the probability of every name over time, one row per name, with a bar below the chosen name during each
+    sound; quiet windows are blank."""
     ax = axes_or_new(ax, (8.0, 3.2))
     names, times = labels.names, labels.times
     shown = np.where((labels.named != "")[:, None], labels.probabilities, np.nan).T

@@ -1,4 +1,4 @@
-"""Draw touches: their paths over a skin, and maps of depth."""
+"""Plots of predicted touches, maps of depth, and losses of training."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from jeit.plot.axes import (
 from jeit.touch import Touches
 from jeit.touch.training import Trained
 
-# The greatest number of ellipses that are drawn: more would hide each other.
+# Maximum number of ellipses, so that they do not hide each other.
 _MOST = 400
 
 
 def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the estimated places of frames, the later the brighter, with ellipses of one standard deviation.
+    """Draw the estimated places in frames, later ones brighter, with ellipses of one standard deviation.
 
-    Raises `ValueError` for touches of a skin that did not learn places.
+    Raises `ValueError` if the skin did not learn places.
     """
     if touches.position is None:
         raise ValueError("touches have no places: the skin did not learn any.")
@@ -110,10 +110,10 @@ def plot_depth_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a map of indentation depth (rows, columns), metres, row 0 at the least y, as `ImageNetwork` estimates.
+    """Draw a map of indentation depth (rows, columns) in metres, row 0 at the minimum y, such as from `ImageNetwork`.
 
-    `extent`: (x_min, x_max, y_min, y_max), metres; `most`: the depth at the end of the colour scale. Raises
-    `ValueError` for what is no map.
+    `extent`: (x_min, x_max, y_min, y_max), metres; `most`: depth at the end of the colour scale, metres, default: the
+    maximum of the map. Raises `ValueError` for an array of another shape.
     """
     depth = real_array("depth", depth, "a map (rows, columns) of depths in metres")
     if depth.ndim != 2:
@@ -133,9 +133,9 @@ def plot_depth_map(
 
 
 def plot_losses(courses: Mapping[str, Trained], *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the held-out losses of trainings by name, relative to the first evaluation, and mark the best of each.
+    """Draw the loss on held-out touches during each training, relative to the first evaluation, and mark its minimum.
 
-    `courses`: as from `jeit.touch.training.fit`. Raises `ValueError` for what are none.
+    `courses`: results of `jeit.touch.training.fit` by name. Raises `ValueError` for anything else.
     """
     check_kind("courses", courses, Mapping, "trainings by name, such as learnt.courses")
     ax = axes_or_new(ax)

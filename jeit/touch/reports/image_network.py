@@ -23,14 +23,14 @@ from jeit.touch.simulate.contact.indent_sets import pixel_places
 LEARNT_FILES = ("network.jeit", "report.json", "learning.png")
 DEPTH_FILES = ("frames.csv", "depth.npz", "depth.png", "report.json")
 _PACKAGES = ("jeit", "jax", "equinox", "optax", "numpy")
-# The greatest number of maps drawn.
+# Maximum number of maps drawn.
 _DRAWN = 6
-# The greatest number of refused frames that a report lists.
+# Maximum number of refused frames that a report lists.
 _LISTED = 1000
 
 
 def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
-    """Write `report.json` and the picture `learning.png`, beside the network that `learn_images` wrote.
+    """Write `report.json` and the picture `learning.png` next to the network that `learn_images` wrote.
 
     Raises `ValueError` if `folder` cannot be a folder.
     """
@@ -40,7 +40,7 @@ def write_learnt_images(learnt: LearntImages, folder: str | Path) -> None:
 
 
 def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
-    """Report how well a network learnt to image, as plain numbers, strings, lists and dictionaries."""
+    """Report the accuracy and the trainings of a network as plain numbers, strings, lists and dictionaries."""
     network = learnt.network
     trainings = {
         name: {
@@ -70,7 +70,7 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
 
 
 def draw_learnt_images(learnt: LearntImages):
-    """Draw the losses, and maps of held-out touches: true maps above, estimated maps below.
+    """Draw the training losses, and maps of test touches: true maps above, estimated maps below.
 
     Returns a matplotlib `Figure` that needs no display.
     """
@@ -94,9 +94,10 @@ def draw_learnt_images(learnt: LearntImages):
 
 
 class DeepestFrame(NamedTuple):
-    """The deepest frame: its number in the file, its greatest depth in metres, and the centroid of the indentation.
+    """The deepest frame of a recording.
 
-    The centroid is (2,) metres, NaN where no depth exceeds the noise floor.
+    **Fields**: `number`: its number in the file; `depth`: its maximum depth, metres; `middle` (2,): centroid of the
+    indentation, metres, NaN if no depth exceeds the noise floor.
     """
 
     number: int
@@ -108,8 +109,8 @@ class DeepestFrame(NamedTuple):
 class WrittenDepths:
     """Summary of what `write_depths` has written.
 
-    `number`: the number of frames; `imaged`: how many were imaged; `deepest`: the deepest frame; `latency` (K,):
-    seconds taken by each imaged frame, of many frames an evenly spaced sample.
+    **Fields**: `number`: number of frames; `imaged`: number of frames that were imaged; `deepest`: the deepest frame;
+    `latency` (K,): time taken by each imaged frame, seconds; for many frames, an evenly spaced sample of them.
     """
 
     number: int
@@ -130,21 +131,21 @@ def write_depths(
     """Write the depth maps that a network estimated from the frames `name`.
 
     `frames.csv` has a line for each frame as it comes: `x_m`, `y_m`, the centroid of the indentation, and `depth_m`,
-    its greatest depth. At the end, `depth.npz` with all maps, `depth.png` and `report.json` are written. There may be
-    any number of frames: their maps are kept on disk, not in memory.
+    its maximum depth. At the end, `depth.npz` with all maps, `depth.png` and `report.json` are written. The number of
+    frames is not limited: their maps are kept on disk, not in memory.
 
-    `found`: the frames that `stream_depths` yields. Maps of refused frames are NaN; where no depth exceeds the noise
-    floor, there is no centroid. `progress` is called with every frame, and `drawing` as by `write_stream`. Each file is
-    written whole, or not at all. Raises `ValueError` if `folder` cannot be a folder, and, leaving no file, if no frame
-    was imaged; `OSError` on a full disk.
+    `found`: the frames that `stream_depths` yields. Maps of refused frames are NaN; if no depth exceeds the noise
+    floor, the centroid is left empty. `progress` is called with every frame, and `drawing` as by `write_stream`. Each
+    file is written completely or not at all. Raises `ValueError` if `folder` cannot be a folder, and if no frame was
+    imaged, in which case no file remains; `OSError` on a full disk.
     """
     where = results_folder(folder, DEPTH_FILES)
     for earlier in DEPTH_FILES[1:]:
-        (where / earlier).unlink(missing_ok=True)  # would not belong to these frames
+        (where / earlier).unlink(missing_ok=True)  # files of earlier frames
     clear_unfinished(where)
     report = drawing or (lambda said: None)
     with GrowingRows(where, network.shape) as rows:
-        imaged = _Imaged(network)
+        imaged = _FrameStatistics(network)
         with GrowingTable(where / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
             for one in found:
                 line, depth = imaged.take(one)
@@ -173,7 +174,7 @@ def write_depths(
         return WrittenDepths(rows.number, imaged.imaged, imaged.deepest, imaged.latency.values())
 
 
-class _Imaged:
+class _FrameStatistics:
     """Statistics of the frames that a network imaged, in memory that does not grow with their number."""
 
     def __init__(self, network: ImageNetwork):
@@ -185,7 +186,7 @@ class _Imaged:
         self.deepest = DeepestFrame(-1, -np.inf, np.full(2, np.nan))
 
     def take(self, one: FrameDepth) -> tuple[list[object], Float[np.ndarray, "rows columns"]]:
-        """Return the line of a frame in the table, and its map."""
+        """Return the line of the table, and the map, for a frame."""
         if one.depth is None:
             self.number_refused += 1
             self.first_reason = self.first_reason or one.reason

@@ -16,7 +16,7 @@ _PACKAGES = ("jeit", "numpy", "scikit-learn", "skops")
 
 
 def write_learnt_skin(skin: LearntSkin, folder: str | Path) -> None:
-    """Write `skin.skops`, `report.json` and the picture `learning.png` into `folder`, which is made if need be.
+    """Write `skin.skops`, `report.json` and the picture `learning.png` into `folder`, which is created if needed.
 
     Raises `ValueError` if `folder` cannot be a folder.
     """
@@ -29,10 +29,10 @@ def write_learnt_skin(skin: LearntSkin, folder: str | Path) -> None:
 def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str) -> None:
     """Write `touches.csv`, `report.json` and the picture `touches.png` of a `skin`'s predictions for the frames `name`.
 
-    The table has a line for each frame, numbered from 0: `x_m`, `y_m` (`z_m`), their standard deviations, `force_N`,
-    `std_force_N`, `label`, `probability`, `key_0` … (1 where pressed) with `probability_0` …, as far as they were
-    learnt; `unlike` is 1 for frames unlike any in the training set, for which nothing is predicted. Raises `ValueError`
-    if `folder` cannot be a folder.
+    The table has a line for each frame, numbered from 0, with columns for the quantities that the skin has learnt:
+    `x_m`, `y_m` (`z_m`), their standard deviations, `force_N`, `std_force_N`, `label`, `probability`, `key_0` … (1
+    where pressed) with `probability_0` …. The column `unlike` is 1 for frames unlike all frames of the training set,
+    for which nothing is predicted. Raises `ValueError` if `folder` cannot be a folder.
     """
     columns = _columns(touches)
     dead = np.flatnonzero(~touches.alive.any(axis=0))
@@ -56,7 +56,7 @@ def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str)
 
 
 def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
-    """Report how well a skin learnt, as plain numbers, strings, lists and dictionaries."""
+    """Report how well a skin has learnt, as plain numbers, strings, lists and dictionaries."""
     return plain(
         {
             "presses": skin.name,
@@ -120,7 +120,7 @@ def draw_touches(touches: Touches):
 
 
 def _report(name: str, standing: Standing) -> dict[str, Any]:
-    """Error statistics of held-out presses."""
+    """Compute error statistics of held-out presses."""
     said: dict[str, Any] = {"method": standing.method, "presses": len(standing.right)}
     if name in ("place", "force"):
         unit = "m" if name == "place" else "N"

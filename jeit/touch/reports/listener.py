@@ -17,7 +17,7 @@ _PACKAGES = ("jeit", "jax", "numpy", "scipy", "scikit-learn")
 
 
 def write_listener(listener: Listener, folder: str | Path) -> None:
-    """Write `listener.jeit`, `report.json` and the picture `learning.png` into `folder`, which is made if need be.
+    """Write `listener.jeit`, `report.json` and the picture `learning.png` into `folder`, which is created if needed.
 
     Raises `ValueError` if `folder` cannot be a folder.
     """
@@ -28,13 +28,13 @@ def write_listener(listener: Listener, folder: str | Path) -> None:
 
 
 def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -> None:
-    """Write `events.csv`, `report.json` and the picture `timeline.png` of the sounds that the listener `model`
-    classified.
+    """Write `events.csv`, `report.json` and the picture `timeline.png` of sounds classified by the listener `model`.
 
-    `folder` is made if need be. The table has a line for each window, every 0.1 s: `time_s`, the window's middle;
-    `heard`, its likeliest name, empty where it is quiet; the `probability` of that name, and those of all names, `p_…`;
-    the loudest `microphone`, numbered from 0; and, where places were estimated, `x_m`, `y_m` (`z_m`) and `std_x_m` …,
-    empty where there is none. Raises `ValueError` if `folder` cannot be a folder.
+    `folder` is created if it does not exist. The table has a line for each window, every 0.1 s: `time_s`, the middle of
+    the window; `heard`, the most probable name, empty if the window is quiet; `probability`, the probability of this
+    name, and `p_…`, those of all names; `microphone`, the number, from 0, of the loudest microphone; and, if positions
+    were estimated, `x_m`, `y_m` (`z_m`) and `std_x_m` …, empty for windows without a position. Raises `ValueError` if
+    `folder` cannot be a folder.
     """
     columns = _columns(labels)
     with results(folder, SOUND_LABEL_FILES) as made:
@@ -44,7 +44,7 @@ def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -
 
 
 def report_listener(listener: Listener) -> dict[str, Any]:
-    """Report how well a listener learnt, as plain numbers, strings, lists and dictionaries."""
+    """Report how well a listener has learnt, as plain numbers, strings, lists and dictionaries."""
     standing, held_out = listener.standing, None
     if standing is not None:
         right = standing.held_out == standing.right
@@ -71,7 +71,7 @@ def report_listener(listener: Listener) -> dict[str, Any]:
 
 
 def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
-    """Report the classified sounds as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    """Report the classified sounds as plain numbers, strings, lists and dictionaries; unknown values are None."""
     whole, probability = labels.whole
     names, counts = np.unique(labels.named, return_counts=True)
     events = [
@@ -102,7 +102,7 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
 
 
 def summary(listener: Listener) -> str:
-    """Summarise in one line how well a listener learnt."""
+    """Summarise in one line how well a listener has learnt."""
     standing = listener.standing
     if standing is None:
         return "not known: nothing could be held out"

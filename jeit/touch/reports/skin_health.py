@@ -32,9 +32,9 @@ def write_health(
 ) -> None:
     """Write `events.csv`, `report.json` and the picture `health.png` of the events that `watch` detected.
 
-    `frames` (F, M) were recorded at `times` (F,); `timed`: whether these are in seconds, or are numbers of frames;
-    `notes`: reasons to doubt the result. A path is written as points x y in metres, separated by semicolons; electrodes
-    are numbered from 1. Raises `ValueError` if `folder` cannot be a folder.
+    `frames` (F, M) were recorded at `times` (F,); `timed`: True if times are in seconds, False if they are numbers of
+    frames; `notes`: reasons to doubt the result. In the table, a path is a list of points x y in metres, separated by
+    semicolons; electrodes are numbered from 1. Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, HEALTH_FILES) as made:
         write_rows(made / "events.csv", _EVENTS, (_row(one) for one in health.events))
@@ -43,7 +43,7 @@ def write_health(
 
 
 def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
-    """Report the detected events as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    """Report the detected events as plain numbers, strings, lists and dictionaries; unknown values are None."""
     held = health.held
     return plain(
         {

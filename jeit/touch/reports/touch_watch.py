@@ -1,4 +1,4 @@
-"""Reports of gestures: learnt ones, and those of a watched stream."""
+"""Write a trained gesture classifier, and the touches classified in a stream, to folders."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _LEARNING_PACKAGES = ("jeit", "numpy", "scikit-learn", "skops")
 
 
 def write_gestures(learnt: LearntGestures, folder: str | Path, *, name: str = "recordings") -> None:
-    """Write `gestures.skops`, `report.json` and the picture `gestures.png` into `folder`, which is made if need be.
+    """Write `gestures.skops`, `report.json` and the picture `gestures.png` into `folder`, which is created if needed.
 
-    `name`: the name of the recordings. Raises `ValueError` if `folder` cannot be a folder.
+    `name`: name of the recordings. Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, GESTURE_FILES) as made:
         learnt.model.write(made / GESTURE_FILE)
@@ -85,10 +85,9 @@ _PATHS = ("touch", "time_s", "x_m", "y_m", "peak_S")
 class WrittenWatch:
     """Summary of what `write_watch` has written.
 
-    `touches`: the detected touches; `seconds` and `peaks` (F,): the time and the greatest change of every frame;
-    `latency` (K,): seconds from a frame to its result, for frames in which a touch was named; `counts`: the number of
-    frames by status; `first_reason`: why the first refused frame was refused, empty if there is none; `notes`: the
-    notes of frames.
+    **Fields**: `touches`: detected touches; `seconds`, `peaks` (F,): time and maximum change of every frame; `latency`
+    (K,): seconds from a frame to its result, for frames at which a touch was classified; `counts`: number of frames by
+    status; `first_reason`: why the first refused frame was refused, empty if none was; `notes`: notes of the frames.
     """
 
     touches: tuple[NamedTouch, ...]
@@ -110,16 +109,17 @@ def write_watch(
 ) -> WrittenWatch:
     """Write the detected touches to `events.csv` and `paths.csv`, then `report.json` and `timeline.png`, into `folder`.
 
-    `events.csv` has a line for every touch, written as it ends, and `paths.csv` its place in each of its frames. A
-    touch unlike any in the training set has no gesture.
+    `events.csv` has a line for every touch, written as it ends; `paths.csv` has its position in each of its frames. A
+    touch unlike all touches of the training set has no gesture.
 
-    `watched`: what `watch.follow(frames)` gives. Places are in metres, changes in S; `named_s` is the time in the
-    stream at which a touch was named, `latency_ms` the delay after that frame. `progress` is called with every frame.
-    Raises `ValueError`, with the `name` of the stream, if no frame came, and if `folder` cannot be a folder.
+    `watched`: the results that `watch.follow(frames)` yields. Positions are in metres, changes in S; `named_s` is the
+    time in the stream at which a touch was classified, `latency_ms` the delay after that frame. `progress` is called
+    with every result. Raises `ValueError`, with the `name` of the stream, if there was no frame, and if `folder` cannot
+    be a folder.
     """
     folder = results_folder(folder, WATCH_FILES)
     for earlier in WATCH_FILES[2:]:
-        (folder / earlier).unlink(missing_ok=True)  # would not belong to these touches
+        (folder / earlier).unlink(missing_ok=True)  # files of earlier touches
     touches: list[NamedTouch] = []
     seconds, peaks, latency, counts, reason, notes = [], [], [], {}, "", []
     with GrowingTable(folder / "events.csv", _EVENTS) as events, GrowingTable(folder / "paths.csv", _PATHS) as paths:
@@ -156,7 +156,7 @@ def write_watch(
 
 
 def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[str, Any]:
-    """Report the detected touches as plain numbers, strings, lists and dictionaries; what is not known is None."""
+    """Report the detected touches as plain numbers, strings, lists and dictionaries; unknown values are None."""
     names, number = np.unique([one.gesture for one in written.touches if not one.unlike], return_counts=True)
     quick = written.latency
     return plain(

@@ -1,4 +1,4 @@
-"""Simulate skins that are pressed, damaged and touched by people."""
+"""Simulation of tactile skins: presses, damage, and gestures of people."""
 
 from __future__ import annotations
 

@@ -14,9 +14,10 @@ from jeit.arguments import describe
 
 
 class Rows(Protocol):
-    """Rows of training data: `sizes`, how many each chunk has, `chunk`, those of one, and a `fingerprint`.
+    """Rows of training data in chunks; data sets larger than memory implement a class with this interface.
 
-    The fingerprint changes with any of them. Sets larger than memory implement a class of their own.
+    `sizes`: number of rows of each chunk; `chunk`: returns the rows of one chunk; `fingerprint`: a text that changes
+    with any of the rows.
     """
 
     @property
@@ -26,19 +27,25 @@ class Rows(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of all that the rows hold, the same in another process."""
+        """Fingerprint of the content of all rows, the same in every process."""
         ...
 
     def chunk(self, number: int) -> Any:
-        """Arrays (rows, …), in tuples, dictionaries or modules, alike in all chunks but for their number of rows."""
+        """Return the arrays (rows, …) of a chunk, in tuples, dictionaries or modules.
+
+        Chunks may differ only in their number of rows.
+        """
         ...
 
 
 class ArrayRows:
-    """Rows in memory, one chunk: `arrays`, any tree of them, each (n, …)."""
+    """Rows in memory, as one chunk.
+
+    `arrays`: any tree of arrays, each (n, …).
+    """
 
     def __init__(self, arrays: Any, name: str = "training"):
-        """Raises `ValueError`, about the argument `name`, for no arrays, and for numbers of rows that differ."""
+        """Raises `ValueError`, about the argument `name`, if there are no arrays, or their numbers of rows differ."""
         lengths = {len(leaf) if np.ndim(leaf) else -1 for leaf in jax.tree.leaves(arrays)}
         if len(lengths) != 1 or min(lengths) < 1:
             raise ValueError(
@@ -59,14 +66,14 @@ class ArrayRows:
         return digest.hexdigest()
 
     def chunk(self, number: int) -> Any:
-        """All rows."""
+        """Return all rows."""
         return self.arrays
 
 
 class MappedRows:
-    """Rows derived from others by a `function` of each chunk, which keeps their number.
+    """Rows computed from other rows by a `function` of each chunk, which must keep the number of rows.
 
-    `name` describes the function, and all that it depends on except the rows.
+    `name` describes the function, and everything that it depends on except the rows.
     """
 
     def __init__(self, rows: Rows, function: Callable[[Any], Any], name: str):
@@ -79,17 +86,20 @@ class MappedRows:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the rows, with the name."""
+        """Fingerprint of the other rows, followed by the name."""
         return f"{self.rows.fingerprint}, {self.name}"
 
     def chunk(self, number: int) -> Any:
-        """The function of a chunk of the rows."""
+        """Apply the function to a chunk of the other rows."""
         return self.function(self.rows.chunk(number))
 
 
 class Leg(NamedTuple):
-    """Consecutive batches of one chunk: its number, which `rows` (b, batch) they take, and the number of the first of
-    them in the whole training."""
+    """Consecutive batches of one chunk.
+
+    `chunk`: index of the chunk; `rows` (b, batch): indices of the rows of each batch; `first`: index of the first of
+    these batches in the whole training.
+    """
 
     chunk: int
     rows: Int[np.ndarray, "b batch"]
@@ -99,8 +109,8 @@ class Leg(NamedTuple):
 class Order:
     """The order of rows in batches.
 
-    In every epoch all chunks are in another order, and the rows within each too; rows that fill no batch are left out,
-    others each time. The order depends on `seed` only, so that a position in the data is one number, that of the batch.
+    In every epoch, the chunks and the rows within each are shuffled anew; rows that do not fill a batch are left out,
+    others each time. The order depends only on `seed`, so that the index of a batch determines its rows.
     """
 
     def __init__(self, sizes: tuple[int, ...], batch: int, seed: list[int]):
@@ -110,11 +120,14 @@ class Order:
 
     @property
     def an_epoch(self) -> int:
-        """Number of batches of an epoch."""
+        """Number of batches in an epoch."""
         return sum(self.batches)
 
     def legs(self, first: int, last: int, most: int) -> Iterator[Leg]:
-        """Batches from `first` to `last`, exclusive, in legs of `most` at most, each within one chunk."""
+        """Yield the batches from `first` to `last`, exclusive, in legs within one chunk.
+
+        `most`: maximum number of batches in a leg.
+        """
         while first < last:
             epoch, place = divmod(first, self.an_epoch)
             chunks = self._shuffled(len(self.sizes), epoch)

@@ -20,18 +20,17 @@ from jeit.arguments.extras import need_extra
 from jeit.touch.training.batches import ArrayRows, Order
 from jeit.touch.training.model_file import Checkpoint, Course, State
 
-# The number of batches between two chances to write a checkpoint; the greatest number of held-out rows that are
-# evaluated at once.
+# Number of batches after which a checkpoint may be written; maximum number of held-out rows evaluated at once.
 _LEG, _AT_ONCE = 32, 256
 
 
 class Objective(NamedTuple):
     """The objective of a training; both functions are compiled.
 
-    **Fields**: `loss(network, batch, key)` returns the loss of a batch of rows, to be minimised, and the network, of
-    which it may have changed leaves that are not trained, such as running means; `held_out(network, batch)` the loss
-    (b,) of each held-out row; `trained`, which leaves are trained: a function of a leaf, or a tree of truth values like
-    the network, as of `equinox.filter`.
+    **Fields**: `loss(network, batch, key)`: returns the loss of a batch of rows, which is minimised, and the network,
+    in which leaves that are not trained, such as running means, may have changed; `held_out(network, batch)`: returns
+    the loss (b,) of each held-out row; `trained`: which leaves are trained, a function of a leaf or a tree of booleans
+    like the network, as in `equinox.filter`.
     """
 
     loss: Callable[[Any, Any, Array], tuple[Float[Array, ""], Any]]
@@ -43,10 +42,11 @@ class Objective(NamedTuple):
 class Plan:
     """Settings of a training.
 
-    Adam with this `rate`, which is multiplied by `decay` after every `decay_epochs`, in batches of `batch` rows for
-    `epochs` at most. Held-out rows are evaluated after every `look_every` batches, an epoch unless given; training
-    stops at the `patience`-th consecutive evaluation that was no better than the best. A checkpoint is written after so
-    many `seconds`, some dozen batches later at most.
+    **Fields**: `rate`: learning rate of Adam, which is multiplied by `decay` after every `decay_epochs` epochs;
+    `batch`: number of rows in a batch; `epochs`: maximum number of epochs; `look_every`: number of batches between
+    evaluations of the held-out rows, by default an epoch; `patience`: number of consecutive evaluations without
+    improvement after which training stops; `seconds`: time between checkpoints, which may be exceeded by some dozen
+    batches.
     """
 
     rate: float = 1e-3
@@ -59,7 +59,7 @@ class Plan:
     seconds: float = 10.0
 
     def __post_init__(self):
-        """Raises `ValueError` for what is no rate and no number."""
+        """Raises `ValueError` for settings that are not valid numbers."""
         for name in ("rate", "decay"):
             given = getattr(self, name)
             if not (is_number(given) and given > 0):
@@ -74,8 +74,11 @@ class Plan:
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained `network`, the one with the least loss of held-out rows, its `course`, and the `reason` why it
-    ended."""
+    """Result of a training.
+
+    `network`: the trained network, with the lowest loss on held-out rows; `course`: the training history; `reason`: why
+    the training ended.
+    """
 
     network: Any
     course: Course
@@ -95,12 +98,12 @@ def fit(
 ) -> Trained:
     """Train a `network`, any tree of arrays and functions, on rows.
 
-    `training` and `validation`: arrays (n, …), in any tree, such as (inputs, targets), or `training` may be `Rows` of
-    many chunks. The same `key` gives the same bits, on one machine. `checkpoint`: a file; killed at any moment, the
-    same call goes on from it, and ends with the bits of one that was never killed; it stays there, finished. `progress`
-    is called with how far it is, after every look at the rows held out. Raises `ValueError` for arguments that do not
-    fit, a checkpoint of another training, and losses that are not finite from the first look on; `ImportError` without
-    the extra `learn`.
+    `training` and `validation`: arrays (n, …) in any tree, such as (inputs, targets); `training` may also be `Rows` of
+    many chunks. The same `key` gives identical results on the same machine. `checkpoint`: a file; if the training is
+    killed at any moment, the same call resumes from it, with results identical to those of an uninterrupted training;
+    the file remains after the training. `progress`: is called with a description of the progress after every evaluation
+    of the held-out rows. Raises `ValueError` for arguments that do not fit together, a checkpoint of another training,
+    and losses that are not finite from the first evaluation on; `ImportError` without the extra `learn`.
     """
     need_extra("learn", "training")
     check_key(key)
@@ -125,11 +128,11 @@ def fit(
     state = run.start() if kept is None else kept.read(run.start())
     look_every = plan.look_every or order.an_epoch
     last, saved, loaded = plan.epochs * order.an_epoch, time.monotonic(), (-1, None)
-    while (reason := _ended(state, plan, last)) is None:
+    while (reason := _end_reason(state, plan, last)) is None:
         upto = min(last, (state.step // look_every + 1) * look_every)
         for leg in order.legs(state.step, upto, _LEG):
             if loaded[0] != leg.chunk:
-                loaded = -1, None  # never two chunks in memory
+                loaded = -1, None  # so that two chunks are never in memory
                 loaded = leg.chunk, jax.tree.map(jnp.asarray, rows.chunk(leg.chunk))
             state = run.leg(state, loaded[1], leg.rows)
             if state.step < upto and kept is not None and time.monotonic() - saved >= plan.seconds:
@@ -137,15 +140,15 @@ def fit(
                 saved = time.monotonic()
         state = run.look(state, looked_at, upto - (upto - 1) // look_every * look_every)
         if progress is not None:
-            progress(_said(state, plan, order.an_epoch))
-        if kept is not None and (time.monotonic() - saved >= plan.seconds or _ended(state, plan, last)):
+            progress(_describe_progress(state, plan, order.an_epoch))
+        if kept is not None and (time.monotonic() - saved >= plan.seconds or _end_reason(state, plan, last)):
             kept.write(state)
             saved = time.monotonic()
     return Trained(run.whole(state.best), state.course, reason)
 
 
 class _Run:
-    """The compiled parts of a training, and how they change its state."""
+    """The compiled functions of a training, and the methods that advance its state by them."""
 
     def __init__(self, network, objective: Objective, plan: Plan, order: Order, key: Array):
         import optax
@@ -168,7 +171,7 @@ class _Run:
             moving = eqx.apply_updates(moving, updates)
             return eqx.combine(eqx.filter(moving, eqx.is_array), still_after), state, value
 
-        # One call a step: on CPUs, XLA's convolutions take a hundred times as long within loops that it compiles.
+        # Each step is one call: on CPUs, XLA's convolutions take a hundred times as long within compiled loops.
         def step(arrays, state, total, data, rows, number):
             batch = jax.tree.map(lambda one: one[rows], data)
             arrays, state, value = moved(arrays, state, batch, jax.random.fold_in(key, number))
@@ -181,24 +184,24 @@ class _Run:
         self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
 
     def whole(self, arrays) -> Any:
-        """The network with these arrays."""
+        """Combine the network's fixed parts with these arrays."""
         return eqx.combine(arrays, self.fixed)
 
     def start(self) -> State:
-        """The state before the first batch."""
+        """Return the state before the first batch."""
         return State(0, Course([], [], []), self.arrays, self.optimiser, self.arrays, jnp.zeros(()))
 
     def leg(self, state: State, data, rows: Int[np.ndarray, "b batch"]) -> State:
-        """The state after batches of these rows."""
+        """Train on batches of these rows; returns the new state."""
         arrays, optimiser, total = state.moving, state.optimiser, state.total
         for place, batch in enumerate(rows):
             arrays, optimiser, total = self._step(arrays, optimiser, total, data, batch, state.step + place)
         return State(state.step + len(rows), state.course, arrays, optimiser, state.best, total)
 
     def look(self, state: State, data, since: int) -> State:
-        """The state after an evaluation of the held-out rows, `since` batches after the last.
+        """Evaluate the held-out rows, `since` batches after the last evaluation; returns the new state.
 
-        Raises `ValueError` if neither that loss nor any before was finite.
+        Raises `ValueError` if neither this loss nor any before was finite.
         """
         number = len(jax.tree.leaves(data)[0])
         size = min(number, _AT_ONCE)
@@ -218,15 +221,15 @@ class _Run:
         return State(state.step, course, state.moving, state.optimiser, best, jnp.zeros(()))
 
 
-def _ended(state: State, plan: Plan, last: int) -> str | None:
-    """Why a training has ended; None while it has not."""
+def _end_reason(state: State, plan: Plan, last: int) -> str | None:
+    """Return the reason why the training has ended, or None if it has not."""
     looks = len(state.course.validation)
     if looks and looks - 1 - state.course.best >= plan.patience:
         return f"no better at {plan.patience} looks in a row"
     return f"{plan.epochs} epochs done" if state.step >= last else None
 
 
-def _said(state: State, plan: Plan, an_epoch: int) -> str:
+def _describe_progress(state: State, plan: Plan, an_epoch: int) -> str:
     own = state.course
     return (
         f"epoch {state.step / an_epoch:.3g} of {plan.epochs}: {own.training[-1]:.4g}, held out "

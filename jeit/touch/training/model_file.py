@@ -1,4 +1,4 @@
-"""Files of trained networks, and checkpoints of their training."""
+"""Read and write files of trained networks, and checkpoints of a training."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ import numpy as np
 from jeit.arguments import describe
 from jeit.files import reason, written_whole
 
-# The first bytes of a file; the greatest size in bytes of the header, and of all arrays together.
+# First bytes of a file; maximum size of the header, and of all arrays together, bytes.
 _MAGIC, _LONGEST_HEAD, _LARGEST = b"jeit model\n", 2**20, 2**31
 
 
 def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any], model: Any) -> None:
-    """Write the arrays of a `model`, any tree of them, to one file, whole or not at all.
+    """Write the arrays of a `model`, any tree of arrays, to a file, which is replaced only when all is written.
 
-    `kind` and `version`: what it is, such as "a jeit network of images", which `read_model` asks for again; `head`:
-    all else that makes the model anew, and says what it is for, as JSON takes it. Raises `ValueError` for a folder, and
-    heads or models that are too large; `OSError` where it cannot be written.
+    `kind` and `version`: type of the file, such as "a jeit network of images", which `read_model` checks; `head`: all
+    other data that are needed to create the model again and to know its purpose, as JSON values. Raises `ValueError` if
+    `path` is a folder, or the head or the model is too large; `OSError` if the file cannot be written.
     """
     path = Path(path)
     if path.is_dir():
@@ -44,23 +44,26 @@ def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any],
 
 
 def read_head(path: str | Path, kind: str, version: int) -> dict[str, Any]:
-    """The head of a file that `write_model` made; its arrays are not looked at. Raises `FileNotFoundError`, and
-    `ValueError` for files of another kind or version, and what is none of ours."""
-    with _opened(Path(path), kind) as file:
+    """Read the head of a file that `write_model` wrote, but not its arrays.
+
+    Raises `FileNotFoundError`, and `ValueError` for files of another kind or version, and files that jeit did not
+    write.
+    """
+    with _open_file(Path(path), kind) as file:
         return _head(file, kind, version)
 
 
 def read_model(
     path: str | Path, kind: str, version: int, make: Callable[[dict[str, Any]], Any]
 ) -> tuple[dict[str, Any], Any]:
-    """The head and the model of a file that `write_model` made.
+    """Read the head and the model of a file that `write_model` wrote.
 
-    `make(head)`: a model of that architecture; it is asked for shapes alone, so that no head makes it take memory.
-    Nothing in the file is executed: every array has to have the shape and dtype that the architecture says before it is
-    read. Raises `FileNotFoundError`, and `ValueError` for files of another kind or version, cut short, too long, or of
-    arrays of another architecture.
+    `make(head)`: returns a model of the same architecture; only its shapes are evaluated, so that no head can make it
+    use memory. Nothing in the file is executed: before an array is read, its shape and dtype must be those of the
+    architecture. Raises `FileNotFoundError`, and `ValueError` for files of another kind or version, that are cut short
+    or too long, or with arrays of another architecture.
     """
-    with _opened(Path(path), kind) as file:
+    with _open_file(Path(path), kind) as file:
         head = _head(file, kind, version)
         try:
             like = eqx.filter_eval_shape(make, head)
@@ -79,19 +82,22 @@ def read_model(
 
 
 def check_same(path: str | Path, made_for: dict[str, Any], here: dict[str, Any]) -> None:
-    """Raise `ValueError`, which names the first difference, where a model was made for something else than is here: of
-    dictionaries that JSON takes, such as of a skin and its protocol; numbers may differ by a millionth."""
+    """Check that a model is used for what it was trained for.
+
+    `made_for`, `here`: descriptions, such as of a skin and its protocol, as dictionaries of JSON values, in which
+    numbers may differ by a millionth. Raises `ValueError`, which states the first difference.
+    """
     for name in here:
-        if not _alike(made_for.get(name), here[name]):
+        if not _are_equal(made_for.get(name), here[name]):
             raise ValueError(
-                f"'{path}' was trained for another skin or protocol: its {name} is {_said(made_for.get(name))}, and "
-                f"here it is {_said(here[name])}; train one for this."
+                f"'{path}' was trained for another skin or protocol: its {name} is {_shorten(made_for.get(name))}, and "
+                f"here it is {_shorten(here[name])}; train one for this."
             )
 
 
 @contextmanager
-def _opened(path: Path, kind: str) -> Iterator[BinaryIO]:
-    """Open a file to read; errors are raised with its name."""
+def _open_file(path: Path, kind: str) -> Iterator[BinaryIO]:
+    """Open a file for reading; any error is raised as `ValueError` with the name of the file."""
     if path.is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, {kind}.")
     if not path.is_file():
@@ -99,7 +105,7 @@ def _opened(path: Path, kind: str) -> Iterator[BinaryIO]:
     try:
         with path.open("rb") as file:
             yield file
-    except Exception as error:  # of any kind: what the header describes is made before it can be checked
+    except Exception as error:  # any exception: what the header describes is created before it can be checked
         raise ValueError(f"'{path}' is not {kind} that can be read: {reason(error)}.") from None
 
 
@@ -126,7 +132,7 @@ def _size(arrays) -> int:
 
 
 def _read_array(file: BinaryIO, leaf: Any) -> Any:
-    """Read one array; leaves that are no arrays are taken from the architecture."""
+    """Read an array with the shape and dtype of `leaf`; leaves that are no arrays are returned unchanged."""
     if not isinstance(leaf, jax.ShapeDtypeStruct):
         return leaf
     version = np.lib.format.read_magic(file)
@@ -144,15 +150,15 @@ def _read_array(file: BinaryIO, leaf: Any) -> Any:
     return jax.numpy.asarray(values)
 
 
-def _alike(one: Any, other: Any) -> bool:
+def _are_equal(one: Any, other: Any) -> bool:
     if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        return len(one) == len(other) and all(map(_alike, one, other))
+        return len(one) == len(other) and all(map(_are_equal, one, other))
     if isinstance(one, int | float) and isinstance(other, int | float):
         return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-12)
     return one == other
 
 
-def _said(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = "not given" if value is None else str(value)
     return text if len(text) <= 60 else f"{text[:59]}…"
 
@@ -161,10 +167,10 @@ _KIND, _VERSION = "a jeit training under way", 1
 
 
 class Course(NamedTuple):
-    """Losses at each evaluation.
+    """History of a training: losses at each evaluation.
 
-    `steps`: the number of batches done; `training`: the mean loss of the batches since the last evaluation;
-    `validation`: the loss of the held-out rows.
+    `steps`: number of batches processed; `training`: mean loss of the batches since the last evaluation; `validation`:
+    loss of the held-out rows.
     """
 
     steps: list[int]
@@ -173,15 +179,16 @@ class Course(NamedTuple):
 
     @property
     def best(self) -> int:
-        """Number of the evaluation with the least loss of the held-out rows; 0 if there was none."""
+        """Index of the evaluation with the lowest loss of the held-out rows; 0 if there was none."""
         return min(range(len(self.validation)), key=self.validation.__getitem__, default=0)
 
 
 class State(NamedTuple):
     """The whole state of a training.
 
-    `step`, batches done, and its `course`; the network that is `moving`, all of it, the state of its optimiser, the
-    `best` network so far, and the `total` of the losses since the last evaluation.
+    `step`: number of batches processed; `course`: the training history; `moving`: arrays of the network, trained and
+    others; `optimiser`: state of the optimiser; `best`: arrays of the best network so far; `total`: sum of the losses
+    since the last evaluation.
     """
 
     step: int
@@ -199,14 +206,14 @@ class Checkpoint:
         self.path, self.fingerprint = Path(path), fingerprint
 
     def write(self, state: State) -> None:
-        """Write the state, whole or not at all."""
+        """Write the state; the file is replaced only when all is written."""
         head = {"training": self.fingerprint, "step": state.step, "course": list(state.course)}
         write_model(self.path, _KIND, _VERSION, head, state[2:])
 
     def read(self, like: State) -> State:
-        """Read the state; `like`, the state before the first batch, if there is no file.
+        """Read the state; if there is no file, return `like`, the state before the first batch.
 
-        Raises `ValueError` for a file of another training, with the first difference.
+        Raises `ValueError`, which states the first difference, for a file of another training.
         """
         if not self.path.exists():
             return like

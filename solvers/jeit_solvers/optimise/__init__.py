@@ -1,1 +1,1 @@
-"""Minimisation: descent along quadratic models, many small problems at once, and problems between bounds."""
+"""Minimisation: descent along quadratic models, many small problems at once, and problems with bounds."""

@@ -1,13 +1,11 @@
-"""Minimisation by descent, free or between bounds, and how it ended.
+"""Minimisation by descent, without or with bounds, and the status with which a minimisation ends.
 
-Minimisation between bounds, and how a minimisation ended.
+`Descent` steps to the minima of local quadratic models, with a line search, behind the interface of optimistix. A
+Gauss-Newton or Levenberg-Marquardt step is the minimum of a quadratic model of the cost. The cheapest way to find it
+depends on the structure of the problem, which the caller knows and a general least-squares solver does not.
 
-jaxopt is not developed further. It is imported here and nowhere else, so that what replaces it has one place to go.
-
-Descent along minima of local quadratic models, with a line search, behind optimistix's interface.
-
-A Gauss-Newton or Levenberg-Marquardt step is the minimum of a quadratic model of the cost; what that minimum costs to
-find depends on the problem's structure, which the caller knows and a general least-squares solver does not.
+jaxopt, which is used for problems with bounds, is no longer developed. It is imported only in this module, so that it
+can be replaced in one place.
 """
 
 from __future__ import annotations
@@ -30,28 +28,29 @@ from jeit_solvers.engines import has_values, namespace, replace_at
 
 
 class Status(StrEnum):
-    """How a minimisation ended. Each is equal to its word, so `status == "converged"` may be written; details such as
-    the number of steps belong in a sentence beside it."""
+    """Status with which a minimisation ended. Each member equals its word, so `status == "converged"` works; details
+    such as the number of steps are reported in a separate sentence."""
 
     CONVERGED = "converged"
-    """The next step would change nothing that matters."""
+    """The next step would change the result by less than the tolerance."""
     STEP_LIMIT = "step limit"
-    """It took all the steps that it was given."""
+    """The maximum number of steps was reached."""
     STALLED = "stalled"
-    """No shorter step lowered the objective."""
+    """The objective did not decrease, however short the step."""
     FAILED = "failed"
-    """What came out is not finite, or the solver broke down."""
+    """The result is not finite, or the solver broke down."""
     INFEASIBLE = "infeasible"
-    """Nothing that was found satisfies the constraints."""
+    """No point was found that satisfies the constraints."""
 
     @property
     def number(self) -> int:
-        """Index of the status, which stands for it in compiled code, where there are no words."""
+        """Index of the status, which represents it in compiled code, where strings are not available."""
         return list(Status).index(self)
 
     @classmethod
     def of_number(cls, number: Any) -> "Status":
-        """The one in that place. Raises `ValueError` inside `jax.jit`, where that is not known yet, and for a batch."""
+        """The status with the given index. Raises `ValueError` inside `jax.jit`, where the index is not known yet, and
+        for a batch."""
         if not has_values(number) or np.shape(number) != ():
             raise ValueError(
                 "status: how a minimisation inside jax.jit or jax.vmap ends is known outside only, one by one; look at "
@@ -61,12 +60,12 @@ class Status(StrEnum):
 
 
 def ended(result: optx.RESULTS) -> Status:
-    """The status that a result of optimistix stands for; seen outside `jax.jit`, where it has a value."""
+    """Status of a result of optimistix; outside `jax.jit` only, where its value is known."""
     return Status.of_number(ended_number(result))
 
 
 def ended_number(result: optx.RESULTS) -> Int[Array, ""]:
-    """`Status.number` of what a result of optimistix stands for, inside `jax.jit` too."""
+    """`Status.number` of a result of optimistix, also inside `jax.jit`."""
     limit = result == optx.RESULTS.nonlinear_max_steps_reached
     other = jnp.where(limit, Status.STEP_LIMIT.number, Status.STALLED.number)
     return jnp.where(result == optx.RESULTS.successful, Status.CONVERGED.number, other)
@@ -76,8 +75,8 @@ Objective = Callable[[Float[Array, " n"]], Float[Array, ""]]
 
 
 class BoundedMinimum(eqx.Module):
-    """Result of a minimisation between bounds: `x` (n,), the number of `steps`, and whether it `converged`: a step
-    along the projected gradient would have changed no coordinate by more than the tolerance."""
+    """Result of a minimisation with bounds. **Fields**: `x`: (n,) the minimum; `steps`: number of steps; `converged`:
+    whether a step along the projected gradient would change no coordinate by more than the tolerance."""
 
     x: Float[Array, " n"]
     steps: Int[Array, ""]
@@ -85,7 +84,7 @@ class BoundedMinimum(eqx.Module):
 
 
 def _jaxopt() -> Any:
-    """jaxopt, imported when it is needed: it warns on import that it is not developed further."""
+    """The module jaxopt, imported only when needed, with its deprecation warning suppressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         import jaxopt
@@ -101,7 +100,7 @@ def lbfgsb(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """The least value between two bounds (n,) by L-BFGS-B, inside `jax.jit`; coordinates should be of one size."""
+    """Minimise with bounds (n,) by L-BFGS-B, inside `jax.jit`; coordinates should be of similar magnitude."""
     solver = _jaxopt().LBFGSB(objective, maxiter=max_steps, tol=tolerance, history_size=20)
     solution = solver.run(start, bounds=(lower, upper))
     return BoundedMinimum(solution.params, solution.state.iter_num, solution.state.error <= tolerance)
@@ -116,7 +115,7 @@ def projected_gradient(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """The least value between two bounds (n,) by accelerated projected gradients: more steps, each of them cheaper."""
+    """Minimise with bounds (n,) by accelerated projected gradients, with more but cheaper steps than `lbfgsb`."""
     jaxopt = _jaxopt()
     solver = jaxopt.ProjectedGradient(
         objective, jaxopt.projection.projection_box, maxiter=max_steps, tol=tolerance, acceleration=True
@@ -135,11 +134,10 @@ def scipy_lbfgsb(
     max_steps: int = 500,
     callback: Callable[[Array], None] | None = None,
 ) -> tuple[Float[np.ndarray, "*shape"], float, Status]:
-    """The least value between two bounds by SciPy's L-BFGS-B: where, the value there, and how it ended.
+    """Minimise with bounds by SciPy's L-BFGS-B; returns the minimum, the value there, and the status.
 
-    `value_and_gradient`: compiled by the caller, of an array of `start`'s shape. `callback`: is given every accepted
-    point.
-    Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16 (1995) 1190-1208.
+    `value_and_gradient`: function of an array of the shape of `start`, compiled by the caller. `callback`: called with
+    every accepted point. Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16 (1995) 1190-1208.
     """
     shape = np.shape(start)
     ends = [np.broadcast_to(np.asarray(end, float), shape).ravel() for end in (lower, upper)]
@@ -167,7 +165,7 @@ _SUFFICIENT = 1e-4
 
 
 class DescentState(eqx.Module):
-    """State of a `Descent`: the next trial point, on a line from the last one accepted."""
+    """State of a `Descent`: the next trial point, on a line from the last accepted point."""
 
     trial: Float[Array, " n"]
     direction: Float[Array, " n"]
@@ -184,18 +182,19 @@ class DescentState(eqx.Module):
 
 
 class Descent(optx.AbstractLeastSquaresSolver):
-    """Gauss-Newton with a backtracking line search, or Levenberg-Marquardt, on quadratic models that the caller makes.
+    """Gauss-Newton with a backtracking line search, or Levenberg-Marquardt, on quadratic models that the caller
+    provides.
 
-    For `optimistix.least_squares(residual, Descent(), c, arguments, options={"expand": expand})`, where
-    `expand(c, arguments)` is the pair of the cost at c and a function `step(damping)`. That gives the direction to the
-    minimum of the model there, and the model's slope and curvature along it: cost(c + s·direction) ≈ cost + s·slope +
-    s²·curvature / 2. With 1 + `damping` the model's penalty is weighted, see `ridge_step`.
+    For `optimistix.least_squares(residual, Descent(), c, arguments, options={"expand": expand})`, where `expand(c,
+    arguments)` returns the cost at c and a function `step(damping)`. This function returns the direction to the minimum
+    of the model at c, and the slope and curvature of the model along it: cost(c + s·direction) ≈ cost + s·slope +
+    s²·curvature / 2. The penalty of the model is weighted with 1 + `damping`, see `ridge_step`.
 
     **Arguments:**
 
-    - `rtol`, `atol`: stop when the next step promises to lower the cost by less than rtol·cost + atol.
-    - `damping`: 0 for Gauss-Newton; above, the first damping of Levenberg-Marquardt.
-    - `history`: how many costs to keep, one for every accepted point; the rest of the array is NaN.
+    - `rtol`, `atol`: stop when the predicted decrease of the cost in the next step is less than rtol·cost + atol.
+    - `damping`: 0 for Gauss-Newton; a positive value is the initial damping of Levenberg-Marquardt.
+    - `history`: number of costs to store, one for every accepted point; unused entries are NaN.
     """
 
     rtol: float = 1e-6
@@ -205,7 +204,7 @@ class Descent(optx.AbstractLeastSquaresSolver):
     norm: Callable[..., Any] = optx.two_norm
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """The first point to try is the start. Raises `ValueError` if the options lack `expand`."""
+        """The initial state, whose first trial point is the start. Raises `ValueError` if the options lack `expand`."""
         if "expand" not in options:
             raise ValueError("Descent needs options={'expand': function}; see its documentation.")
         xp = namespace(y)
@@ -226,7 +225,7 @@ class Descent(optx.AbstractLeastSquaresSolver):
         )
 
     def step(self, fn, y, args, options, state, tags):
-        """Evaluate the trial point; go on from it if it is good enough, else try a shorter step."""
+        """Evaluate the trial point. If its cost is low enough, continue from it; otherwise try a shorter step."""
         xp = namespace(y)
         cost, step = options["expand"](state.trial, args)
         predicted = -(state.scale * state.slope + 0.5 * state.scale**2 * state.curvature)
@@ -258,7 +257,7 @@ class Descent(optx.AbstractLeastSquaresSolver):
                 state,
                 (y + scale * state.direction, scale, 4 * state.damping, state.num_steps + 1, scale < _LEAST_SCALE),
             )
-            # A start that cannot be evaluated has no line to go back on.
+            # If the cost at the start is not finite, no shorter step is possible.
             return eqx.tree_at(lambda s: s.stuck, shorter, shorter.stuck | ~xp.isfinite(state.cost))
 
         if xp is np:
@@ -269,9 +268,10 @@ class Descent(optx.AbstractLeastSquaresSolver):
     def at_once(
         self, expand: Callable[..., Any], start: Float[np.ndarray, " n"], arguments: Any, max_steps: int
     ) -> tuple[Any, DescentState]:
-        """The same steps in NumPy, as `optimistix.least_squares` takes them in a compiled program: where it ended."""
+        """Take in NumPy the same steps that `optimistix.least_squares` takes in a compiled program. Returns the final
+        point and state."""
         options, point = {"expand": expand}, start
-        nothing: Any = None  # what optimistix hands over besides, and these steps do not look at
+        nothing: Any = None  # further arguments from optimistix, which are not used
         state = self.init(nothing, point, arguments, options, nothing, nothing, nothing)
         with np.errstate(all="ignore"):
             while state.num_steps < max_steps and not (state.converged or state.stuck):
@@ -279,10 +279,10 @@ class Descent(optx.AbstractLeastSquaresSolver):
         return point, state
 
     def terminate(self, fn, y, args, options, state, tags):
-        """Converged, or stuck where no shorter step helps."""
+        """Whether the descent has converged, or is stuck because no shorter step lowers the cost."""
         failed = optx.RESULTS.where(state.stuck, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful)
         return state.converged | state.stuck, failed
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Nothing to do."""
+        """Return the solution unchanged."""
         return y, aux, {}

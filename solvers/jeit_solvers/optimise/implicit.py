@@ -1,12 +1,12 @@
-"""Derivatives of a minimum with respect to the problem, by the implicit function theorem, whichever solver found it.
+"""Derivatives of a minimum with respect to the problem, by the implicit function theorem, independent of the solver.
 
-At a minimum x̂(p) of a cost with gradient g(x, p) the gradient stays zero whatever the problem p does, so that
+At a minimum x̂(p) of a cost with gradient g(x, p), the gradient stays zero when the problem p changes, so that
 
     H dx̂ = -∂g/∂p dp,   H = ∂g/∂x,
 
-with the full Hessian H, not Gauss-Newton's. The system is solved by conjugate gradients, of products with H alone, and
-a model of it, such as Gauss-Newton's, for a preconditioner. Krantz and Parks, The Implicit Function Theorem (2002);
-Blondel et al., NeurIPS 35 (2022) 5230-5242.
+with the full Hessian H, not its Gauss-Newton approximation. The system is solved by conjugate gradients, which need
+only products with H, preconditioned by a model of H such as the Gauss-Newton approximation. Krantz and Parks, The
+Implicit Function Theorem (2002); Blondel et al., NeurIPS 35 (2022) 5230-5242.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from jaxtyping import Array, Float
 
 from jeit_solvers.engines import undifferentiated
 
-# Relative tolerance of the linear system, and its greatest number of steps: with a good model of the Hessian a dozen
-# are taken.
+# Relative tolerance of the linear system, and maximum number of conjugate-gradient steps; with a good model of the
+# Hessian about a dozen steps are taken.
 _TOLERANCE, _MOST_STEPS = 1e-11, 500
-# The length of a step of Newton's method to the minimum, in the root of what it lowers the cost by, that needs no other
-# after it, for what is left is its square; and the most of them.
+# Length below which a Newton step to the minimum is the last one, because the remaining error is of the order of its
+# square; measured as the square root of the decrease of the cost. And the maximum number of Newton steps.
 _AT_THE_MINIMUM, _MOST_NEWTON_STEPS = 1e-6, 8
 
 Gradient = Callable[[Float[Array, " n"], Any], Float[Array, " n"]]
@@ -36,13 +36,15 @@ Preconditioner = Callable[[Float[Array, " n"], Any], Linear]
 def as_minimum(
     found: Float[Array, " n"], problem: Any, gradient: Gradient, precondition: Preconditioner
 ) -> Float[Array, " n"]:
-    """`found` (n,) itself, with the derivatives that the minimum near it has in the arrays of the pytree `problem`.
+    """`found` (n,) unchanged, with the derivatives that the nearby minimum has with respect to the arrays in the pytree
+    `problem`.
 
-    `gradient(x, problem)`: of the cost, (n,), zero at the minimum, with a symmetric derivative in x that is positive
-    definite there. `precondition(x, problem)`: a function of a vector that applies the inverse of a model of it. No
-    derivative goes through how the point was found. They are taken at the minimum itself, a few steps of Newton's
-    method from `found`, so they are as exact as the gradient is however early the solver stopped; where those steps
-    lead nowhere, at `found`. Differentiable any number of times, in both modes, and under `jax.vmap`.
+    `gradient(x, problem)`: gradient (n,) of the cost, zero at the minimum; its derivative with respect to x must be
+    symmetric and positive definite there. `precondition(x, problem)`: a function of a vector that applies the inverse
+    of a model of this derivative. The computation of `found` is not differentiated. Derivatives are evaluated at the
+    minimum itself, found by a few Newton steps from `found`, so they are as accurate as the gradient even if the solver
+    stopped early; if the Newton steps fail, they are evaluated at `found`. Differentiable any number of times, in
+    forward and reverse mode, and under `jax.vmap`.
     """
     return _minimum(jax.lax.stop_gradient(found), problem, gradient, precondition)
 
@@ -59,17 +61,17 @@ def _minimum_jvp(primals, tangents):
     along = tangents[1]
     if not jax.tree.leaves(along):
         return point, jnp.zeros_like(point)
-    # Constants: no derivative goes through the way to the minimum, only through the minimum.
+    # Treated as constants: only the minimum is differentiated, not the steps that lead to it.
     start, constant = undifferentiated((found, problem))
     model = precondition(start, constant)
-    at = point + jax.lax.stop_gradient(_polished(start, constant, gradient, model) - start)
+    at = point + jax.lax.stop_gradient(_refine(start, constant, gradient, model) - start)
     _, slope = eqx.filter_jvp(lambda problem: gradient(at, problem), (problem,), (along,))
     _, hessian = jax.linearize(lambda x: gradient(x, problem), at)
     return point, _solve(hessian, -slope, model)
 
 
 def _solve(hessian: Linear, right: Float[Array, " n"], model: Linear) -> Float[Array, " n"]:
-    """H⁻¹ right."""
+    """Solution of H x = `right`."""
 
     def solve(multiply, vector):
         return _conjugate_gradients(multiply, vector, model)
@@ -78,7 +80,7 @@ def _solve(hessian: Linear, right: Float[Array, " n"], model: Linear) -> Float[A
 
 
 def _conjugate_gradients(multiply: Linear, right: Float[Array, " n"], model: Linear) -> Float[Array, " n"]:
-    """Preconditioned conjugate gradients from zero; Golub and Van Loan, Matrix Computations (2013), 11.5."""
+    """Preconditioned conjugate gradients, started at zero; Golub and Van Loan, Matrix Computations (2013), 11.5."""
 
     def go_on(state):
         _, _, _, left, number = state
@@ -99,8 +101,9 @@ def _conjugate_gradients(multiply: Linear, right: Float[Array, " n"], model: Lin
     return jax.lax.while_loop(go_on, step, (jnp.zeros_like(right), right, first, size, 0))[0]
 
 
-def _polished(point: Float[Array, " n"], problem: Any, gradient: Gradient, model: Linear) -> Float[Array, " n"]:
-    """The minimum, by Newton's method from nearby: as long as steps get shorter, in the Hessian's norm."""
+def _refine(point: Float[Array, " n"], problem: Any, gradient: Gradient, model: Linear) -> Float[Array, " n"]:
+    """The minimum, by Newton's method from a nearby point, which goes on as long as steps become shorter in the norm of
+    the Hessian."""
 
     def step(state):
         at, before, length, number, _ = state

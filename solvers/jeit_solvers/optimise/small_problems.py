@@ -1,7 +1,7 @@
-"""Many small minimisations at once: functions of a few unknowns, damped Newton steps between bounds.
+"""Many small minimisation problems at once: functions of a few unknowns, by damped Newton steps with bounds.
 
-The batch is the last axis of every array, so that each operation runs along it; with two to six unknowns the linear
-systems are solved by formulas written out.
+The batch is the last axis of every array, so that each operation runs along it. With two to six unknowns the linear
+systems are solved by explicit formulas.
 """
 
 from __future__ import annotations
@@ -19,21 +19,22 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jeit_solvers.engines import complex_slope, host, namespace, set_at, slopes, while_loop
 
-# Signature of a function that returns at x (n, F), with data whose last axis is F, its value (F,), gradient (n, F), and
-# a positive definite model of its Hessian (n, n, F), the Gauss-Newton or Fisher matrix for instance.
+# Signature of a function of x (n, F), and of data whose last axis is F, that returns the value (F,), the gradient (n,
+# F), and a positive definite model (n, n, F) of the Hessian, for instance the Gauss-Newton or Fisher matrix.
 Expansion = Callable[[Array, Any], tuple[Array, Array, Array]]
 
 _MOST_DAMPING = 1e12
-# Smallest number of functions that is worth gathering.
+# Minimum number of functions for which gathering is worthwhile.
 _LEAST_PART = 32
-# Steps that the whole batch takes before what is left of it is gathered.
+# Number of steps that the whole batch takes before the unfinished functions are gathered.
 _WHOLE_STEPS = 8
-# Between points whose slopes make a Hessian.
+# Distance between points for finite differences of slopes in a Hessian.
 _APART = 1e-6
 
 
 class Minimum(eqx.Module):
-    """Result of the batch: `x` (n, F), `value` (F,), `converged` (F,), and the `steps` that the slowest took."""
+    """Result of the batch. **Fields**: `x`: (n, F) minima; `value`: (F,); `converged`: (F,); `steps`: maximum number of
+    steps of any function."""
 
     x: Float[Array, "n F"]
     value: Float[Array, " F"]
@@ -42,7 +43,7 @@ class Minimum(eqx.Module):
 
 
 def solve_small(matrix: Float[Array, "n n F"], right: Float[Array, "n F"]) -> Float[Array, "n F"]:
-    """Solve F symmetric positive definite systems of n unknowns by Cholesky's method, written out."""
+    """Solve F symmetric positive definite systems of n unknowns by Cholesky's method in explicit formulas."""
     number, lower = matrix.shape[0], _cholesky(matrix)
     forward: list[Array] = []
     for i in range(number):
@@ -56,16 +57,17 @@ def solve_small(matrix: Float[Array, "n n F"], right: Float[Array, "n F"]) -> Fl
 
 
 def gradient_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n F"]:
-    """The gradients at x of F functions, each of its own column: `value` (n, F) -> (F,), analytic."""
+    """Gradients at x of F functions, one per column. `value`: maps (n, F) to (F,), analytic."""
     if isinstance(x, np.ndarray):
         return host.stack(slopes(value, x)[1])
     return jax.grad(lambda at: jnp.sum(value(at)))(x)
 
 
 def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n n F"]:
-    """The Hessians at x of F functions, each of its own column: `value` (n, F) -> (F,), analytic.
+    """Hessians at x of F functions, one per column. `value`: maps (n, F) to (F,), analytic.
 
-    In NumPy central differences of complex steps: good to some eight digits, for steps that need no more."""
+    NumPy uses central differences of complex steps, which are accurate to about eight digits.
+    """
     if isinstance(x, np.ndarray):
         apart = _APART * np.eye(len(x))[:, :, None]
 
@@ -95,7 +97,7 @@ def _cholesky(matrix: Float[Array, "n n F"]) -> dict[tuple[int, int], Array]:
 
 
 def symmetric_small(rows: Sequence[Sequence[Array]]) -> Float[Array, "n n F"]:
-    """The symmetric matrices of which `rows` are the lower triangles, entries (F,)."""
+    """Symmetric matrices with the lower triangles `rows`, whose entries have shape (F,)."""
     number, xp = len(rows), namespace(rows)
     return xp.stack([xp.stack([rows[max(i, j)][min(i, j)] for j in range(number)]) for i in range(number)])
 
@@ -108,7 +110,7 @@ def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
 
 
 class _State(eqx.Module):
-    """State of each function of a batch."""
+    """State of each function in a batch."""
 
     x: Array
     value: Array
@@ -121,7 +123,7 @@ class _State(eqx.Module):
 
 
 class _Limits(NamedTuple):
-    """Limits of the steps."""
+    """Bounds of the unknowns, and limits of the steps."""
 
     lower: Array
     upper: Array
@@ -143,16 +145,17 @@ def minimise_small(
     tolerance: float = 1e-10,
     skip: Bool[Array, " F"] | None = None,
 ) -> Minimum:
-    """Minimise F functions of n unknowns between bounds by projected, damped Newton steps (Bertsekas 1982).
+    """Minimise F functions of n unknowns with bounds by projected, damped Newton steps (Bertsekas 1982).
 
-    `expand(x, data)`: see `Expansion`; `data`: arrays whose last axis is F. An unknown at its bound whose gradient
-    pushes outwards is held; the others step. Damping as in Levenberg and Marquardt, by the diagonal. Converged: the
-    next step promises to lower the value by less than `tolerance` · (1 + |value|). Functions that are not finite at
-    their start stay there, not converged, their value infinite; so do those to `skip`.
+    `expand(x, data)`: see `Expansion`; `data`: arrays whose last axis is F. An unknown at a bound is held there if its
+    gradient points outwards; the others take a step. Damping is that of Levenberg and Marquardt, scaled by the
+    diagonal. A function has converged when the predicted decrease of its value in the next step is less than
+    `tolerance` · (1 + |value|). Functions that are not finite at their start stay there, not converged, with an
+    infinite value; the same holds for functions marked in `skip`.
 
-    All take eight steps together; those that need more, mostly few, are then gathered and go on, with the expansion
-    `finish` if there is one: a dearer one with the exact Hessian, say. A compiled program, whose arrays cannot shrink,
-    gathers a quarter of the batch at a time.
+    All functions take eight steps together. The unfinished ones, usually few, are then gathered and continue, with the
+    expansion `finish` if it is given, for example a costlier one with the exact Hessian. In a compiled program, whose
+    arrays have fixed sizes, a quarter of the batch is gathered at a time.
     """
     limits = _Limits(lower, upper, largest_step, max_steps, tolerance)
     xp = namespace(start, data, lower, upper)
@@ -188,14 +191,14 @@ def minimise_small(
 
 
 def _first_true(which: Bool[Array, " F"], most: int) -> Int[Array, " i"]:
-    """Indices of the first that are true: so many or fewer in NumPy; else so many, F where there are no more."""
+    """Indices of the first true entries: in NumPy at most `most` of them; in JAX exactly `most`, filled up with F."""
     if isinstance(which, np.ndarray):
         return host.flatnonzero(which)[:most]
     return jnp.nonzero(which, size=most, fill_value=which.size)[0]
 
 
 def _step_from(state: _State, limits: _Limits) -> tuple[Array, Array]:
-    """End point of the next step, and the predicted decrease of the value, to first order."""
+    """End point of the next step, and the first-order prediction of the decrease of the value."""
     x, gradient, matrix, xp = state.x, state.gradient, state.matrix, namespace(state)
     held = ((x <= limits.lower) & (gradient > 0)) | ((x >= limits.upper) & (gradient < 0))
     diagonal = xp.eye(x.shape[0], dtype=bool)[:, :, None]
@@ -209,21 +212,21 @@ def _step_from(state: _State, limits: _Limits) -> tuple[Array, Array]:
 
 
 def _advance(state: _State, data, steps: int, expand: Expansion, limits: _Limits) -> _State:
-    """Take this many steps of all functions, or fewer if all are done."""
+    """Take up to `steps` steps of all functions, fewer if all are done."""
     xp = namespace(state, data)
 
     def body(loop):
         count, state = loop
-        # The first turn only looks at the start: no step leads away from there yet.
+        # The first iteration only evaluates the start, from which no step has been computed yet.
         fresh = xp.isinf(state.value)
         trial, promised = _step_from(state, limits)
         value, gradient, matrix = expand(trial, data)
         better = (value <= state.value) & ~state.done
-        # Cut off at a bound, a step may lead uphill: then a more damped one, closer to the gradient, is tried.
+        # A step that is cut off at a bound may lead uphill; then a more damped one, closer to the gradient, is tried.
         settled = (promised >= 0) & (promised <= limits.tolerance * (1 + xp.abs(state.value))) & ~fresh
         damping = xp.where(better, xp.maximum(state.damping / 10, 1e-12), 8 * xp.maximum(state.damping, 1e-4))
         taken = state.taken + ~(state.done | fresh)
-        # A step too small to distinguish better from worse ends the search as well.
+        # The search also ends when steps become too small to change the value.
         converged = state.converged | (~state.done & (settled | (damping > _MOST_DAMPING)))
         broken = fresh & ~xp.isfinite(value)
         return count + 1, _State(

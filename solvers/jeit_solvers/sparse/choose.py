@@ -1,4 +1,4 @@
-"""The choice of a solver for a sparse system: direct, or conjugate gradients."""
+"""Solvers of sparse systems for lineax, direct and by conjugate gradients, and the choice between them."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ from jeit_solvers.sparse.plan import FactorisationPlan, elimination_tree, plan_o
 class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
     """Conjugate gradients, preconditioned with the diagonal, for `SparseSymmetric` operators.
 
-    Stops when |M^-1 (b - A x)| <= `tolerance` |M^-1 b|, M being the diagonal: where loads enter by large entries, as
-    through good contacts, a residual that is small beside them is large elsewhere. `max_steps` defaults to ten steps
-    for each unknown, at most 10,000.
-    Reports `RESULTS.max_steps_reached` if it runs out of steps, `RESULTS.breakdown` if it meets a direction p with
-    p^T A p <= 0, which a positive definite matrix does not have. Complex symmetric systems are solved by the conjugate
-    orthogonal variant, with p^T in place of p^* (van der Vorst and Melissen, IEEE Trans. Magn. 26, 1990).
+    Iteration stops when |M^-1 (b - A x)| <= `tolerance` |M^-1 b|, where M is the diagonal. The criterion is scaled by M
+    because the right-hand side may be dominated by rows with large entries, such as those of good contacts, and a
+    residual that is small relative to these may be large elsewhere. `max_steps` defaults to ten steps per unknown, with
+    a maximum of 10,000. The result is `RESULTS.max_steps_reached` after the last step, and `RESULTS.breakdown` for a
+    direction p with p^T A p <= 0, which does not exist for a positive definite matrix. Complex symmetric systems are
+    solved by the conjugate orthogonal variant, with p^T in place of p^* (van der Vorst and Melissen, IEEE Trans. Magn.
+    26, 1990).
 
-    Raises `ValueError` for a tolerance that is not between 0 and 1, and for less than one step.
+    Raises `ValueError` for a tolerance that is not between 0 and 1, and for a maximum of less than one step.
     """
 
     tolerance: float = 1e-10
@@ -44,14 +45,14 @@ class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
             raise ValueError(f"ConjugateGradient: `max_steps` must be positive; got {self.max_steps}.")
 
     def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> SparseSymmetric:
-        """The matrix itself: there is nothing to prepare."""
+        """Return the matrix itself; no preparation is needed."""
         del options
         return require_sparse_symmetric(operator, "ConjugateGradient")
 
     def compute(
         self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]
     ) -> tuple[Inexact[Array, " n"], lineax.RESULTS, dict[str, Any]]:
-        """Iterate to the tolerance. The number of steps is returned as `stats["num_steps"]`."""
+        """Iterate until the tolerance is reached. The number of steps is returned as `stats["num_steps"]`."""
         del options
         max_steps = self.max_steps or min(10 * state.pattern.size, 10_000)
         last = conjugate_gradient(state, vector, self.tolerance, max_steps)
@@ -70,12 +71,13 @@ class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
         return SparseSymmetric(state.values.conj(), state.pattern), options
 
     def assume_full_rank(self) -> bool:
-        """Yes: a positive definite matrix has full rank."""
+        """Always true, because a positive definite matrix has full rank."""
         return True
 
 
 class Iterate(NamedTuple):
-    """State of conjugate gradients: r = b - A x, search direction p, and r^T M^-1 r."""
+    """State of conjugate gradients. **Fields**: `solution`: x; `residual`: r = b - A x; `direction`: search direction
+    p; `weight`: r^T M^-1 r; `step`: number of steps; `converged`, `broken_down`: why the iteration ends."""
 
     solution: Inexact[Array, " n"]
     residual: Inexact[Array, " n"]
@@ -89,7 +91,7 @@ class Iterate(NamedTuple):
 def conjugate_gradient(
     operator: SparseSymmetric, vector: Inexact[Array, " n"], tolerance: float, max_steps: int
 ) -> Iterate:
-    """The last iterate of conjugate gradients from x = 0, preconditioned with the matrix's diagonal M."""
+    """The last iterate of conjugate gradients that start at x = 0, preconditioned with the diagonal M of the matrix."""
     inverse_diagonal = 1 / operator.pattern.diagonal(operator.values)
     direction = inverse_diagonal * vector
     target = tolerance * jnp.linalg.norm(direction)
@@ -127,17 +129,17 @@ def conjugate_gradient(
 
 
 class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
-    """Direct solver for `SparseSymmetric` operators, by the plan that `analyse` made for their pattern.
+    """Direct solver for `SparseSymmetric` operators, with the plan that `analyse` makes for their pattern.
 
-    `init` factorises, `compute` solves; the same factor serves the adjoint, so that `lineax.linear_solve` is
-    differentiated without factorising again. A matrix that is not positive definite gives `RESULTS.singular`.
+    `init` factorises the matrix and `compute` solves. The same factor serves the adjoint, so `lineax.linear_solve` is
+    differentiated without another factorisation. A matrix that is not positive definite gives `RESULTS.singular`.
     """
 
     plan: FactorisationPlan
     reason: str = eqx.field(static=True, default="chosen by the user")
 
     def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> Factor:
-        """Factorise the operator's matrix. Raises `ValueError` if its pattern is not the plan's."""
+        """Factorise the operator's matrix. Raises `ValueError` if its pattern is not that of the plan."""
         del options
         operator = require_sparse_symmetric(operator, "SparseCholesky")
         if (operator.pattern.size, operator.pattern.num_entries) != (self.plan.size, self.plan.num_entries):
@@ -151,7 +153,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
     def compute(
         self, state: Factor, vector: Inexact[Array, " n"], options: dict[str, Any]
     ) -> tuple[Inexact[Array, " n"], lineax.RESULTS, dict[str, Any]]:
-        """Solve with the factor. A failed factor is NaN, which `lineax.linear_solve` reports as singular."""
+        """Solve with the factor. A failed factorisation yields NaN, which `lineax.linear_solve` reports as singular."""
         del options
         return solve(self.plan, state, vector), lineax.RESULTS.successful, {}
 
@@ -164,7 +166,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
         return jax.tree.map(lambda block: block.conj(), state), options
 
     def assume_full_rank(self) -> bool:
-        """Yes: a positive definite matrix has full rank."""
+        """Always true, because a positive definite matrix has full rank."""
         return True
 
 
@@ -176,19 +178,20 @@ def choose_solver(
     operations_limit: float = 1e11,
     tolerance: float = 1e-10,
 ) -> SparseCholesky | ConjugateGradient:
-    """The direct solver where its factor is affordable, conjugate gradients elsewhere; `solver.reason` says why.
+    """Choose the direct solver if its factor is affordable, else conjugate gradients; `solver.reason` states why.
 
     **Arguments:**
 
-    - `pattern`: the sparsity pattern of the matrices to solve with.
-    - `coordinates`: of the unknowns (n, d), as for `analyse`.
-    - `memory_limit`: bytes that the direct solver may use for one matrix in double precision: its factor, its largest
-      temporary arrays and its index maps.
-    - `operations_limit`: floating-point operations that one factorisation may take; 1e11 are a few seconds.
-    - `tolerance`: of the conjugate gradients.
+    - `pattern`: sparsity pattern of the matrices.
+    - `coordinates`: (n, d) of the unknowns, as for `analyse`.
+    - `memory_limit`: maximum memory of the direct solver in bytes for one matrix in double precision: factor, largest
+      temporary arrays and index maps.
+    - `operations_limit`: maximum number of floating-point operations of one factorisation; 1e11 take a few seconds.
+    - `tolerance`: tolerance of the conjugate gradients.
     """
     tree = elimination_tree(pattern, coordinates)
-    # Fronts live as long as their parents need them; indices are 4 bytes, and a front's entry may need two.
+    # Fronts are kept until their parents have used them. An index takes 4 bytes, and an entry of a front may need two
+    # indices.
     memory = 8.0 * (tree.num_factor_entries + tree.num_front_entries) + 8.0 * tree.num_front_entries
     cost = f"a factorisation takes {tree.num_operations:.1e} operations and {memory / 1e6:.0f} MB"
     if memory > memory_limit:

@@ -1,11 +1,11 @@
-"""Nested dissection: an elimination order with little fill (NumPy and SciPy, once for a sparsity pattern).
+"""Nested dissection: an elimination order with little fill, computed in NumPy and SciPy once per sparsity pattern.
 
-The graph is halved again and again. Each halving takes out a *separator*, a set of nodes without which the two halves
-do not touch. Eliminating halves before separators keeps fill low: O(n log n) entries and O(n^1.5) operations for a
-planar mesh (George, SIAM J. Numer. Anal. 10, 1973).
+The graph is halved recursively. Each halving removes a *separator*, a set of nodes without which no edge connects the
+two halves. Eliminating halves before separators keeps fill low: O(n log n) entries and O(n^1.5) operations for a planar
+mesh (George, SIAM J. Numer. Anal. 10, 1973).
 
-The halving is a straight cut through the nodes' coordinates where they are given. Otherwise it is the perpendicular
-bisector, in graph distance, of two nodes that lie far apart. The nodes along the cut are thinned to the smallest
+If coordinates of the nodes are given, a part is halved by a straight cut. Otherwise the cut is the perpendicular
+bisector, in graph distance, of two nodes that lie far apart. The nodes along the cut are reduced to the smallest
 possible separator by a maximum matching of the cut edges (König's theorem; Pothen and Fan, ACM Trans. Math. Softw. 16,
 1990).
 """
@@ -16,15 +16,17 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_bipartite_matching
 
-# Coordinates are rounded to this share of their extent, so that the order does not hang on how they were rounded.
+# Coordinates are rounded to this number of decimals of their extent, so that the order does not depend on rounding
+# errors.
 _DIGITS = 7
 
 
 def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | None = None) -> np.ndarray:
-    """Split a symmetric graph (n, n) without diagonal into a complete binary tree, `depth` separators high.
+    """Split a symmetric graph (n, n) without diagonal into a complete binary tree of `depth` levels of separators.
 
-    Returns for each node of the graph the node of the tree it belongs to (n,): the root is 0, the children of t are
-    2 t + 1 and 2 t + 2; leaves hold what no separator took. `coordinates` (n, d) of the nodes make the cuts straight.
+    Returns for each node of the graph the tree node that it belongs to (n,): the root is 0, the children of t are 2 t +
+    1 and 2 t + 2; leaves hold the nodes that belong to no separator. With `coordinates` (n, d) of the nodes, cuts are
+    straight.
     """
     size = _num_nodes(graph)
     owner, halving = np.zeros(size, dtype=np.int64), np.arange(size)
@@ -34,7 +36,7 @@ def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | No
     entries = graph.tocoo()
     rows, columns = entries.coords
     for _ in range(depth):
-        # All parts of a level are halved at once; separators stay with the tree node that they were taken out at.
+        # All parts of a level are halved at once; a separator belongs to the tree node that it separates.
         inside = np.full(size, -1)
         tree_nodes, inside[halving] = np.unique(owner[halving], return_inverse=True)
         rows, columns = _within(inside, rows, columns)
@@ -45,7 +47,7 @@ def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | No
 
 
 def _within(part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The edges both ends of which lie in one part."""
+    """The edges that connect two nodes of the same part."""
     same = (part[rows] == part[columns]) & (part[rows] >= 0)
     return rows[same], columns[same]
 
@@ -53,16 +55,16 @@ def _within(part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np
 def _halve(
     graph: csr_array, rows: np.ndarray, columns: np.ndarray, part: np.ndarray, number: int, coordinates
 ) -> np.ndarray:
-    """Halve every part of a graph: 0 and 1 for the halves, 2 for the separator between them, for every node (n,).
+    """Halve every part of a graph. Returns for every node (n,) 0 or 1 for the halves, 2 for the separator between them.
 
-    `part` (n,): the number of a node's part, -1 for nodes of none; `rows`, `columns`: the edges within parts. Several
-    cuts are tried, and for each part the one kept whose separator is smallest for its balance.
+    `part`: (n,) index of the part of each node, -1 for none; `rows`, `columns`: edges within parts. Several cuts are
+    tried for each part; the best one minimises the size of the separator plus a penalty for imbalance.
     """
     nodes = np.flatnonzero(part >= 0)
     own = part[nodes]
     counts = np.bincount(own, minlength=number)
-    # Fronts are padded to the largest of their stage: the smaller the part, the more an even split is worth, and the
-    # less a node more in the separator costs.
+    # Fronts are padded to the largest one of their stage. The smaller the part, the more an even split is worth, and
+    # the less an additional node in the separator costs.
     small = counts < 400
     price_of_imbalance = np.where(small, 0.5, 0.1)
     best, best_cost = np.full(part.size, 2), np.full(number, np.inf)
@@ -87,7 +89,7 @@ def _halve(
 
 
 def _cut_keys(graph: csr_array, nodes: np.ndarray, part: np.ndarray, number: int, coordinates) -> list[np.ndarray]:
-    """Functions on the nodes, (k,) for those of `nodes`, whose level sets are sensible cuts of their parts."""
+    """Functions on `nodes` (k,) whose level sets are sensible cuts of their parts."""
     if coordinates is not None:
         return _straight_cuts(coordinates[nodes], part, number)
     order = np.argsort(part, kind="stable")
@@ -99,8 +101,8 @@ def _cut_keys(graph: csr_array, nodes: np.ndarray, part: np.ndarray, number: int
 
 
 def _straight_cuts(coordinates: np.ndarray, part: np.ndarray, number: int) -> list[np.ndarray]:
-    """Across each part's long axis, and across the two diagonals to either side of it: near-square parts have no clear
-    long axis."""
+    """Coordinates along the long axis of each part and along two directions on either side of it, because nearly square
+    parts have no clear long axis."""
     dimension = coordinates.shape[1]
 
     def sums(values):
@@ -118,14 +120,14 @@ def _straight_cuts(coordinates: np.ndarray, part: np.ndarray, number: int) -> li
 
 
 def _distance_cut(graph: csr_array) -> np.ndarray:
-    """Cut of one part without coordinates, in graph distance."""
+    """Function whose level sets cut one part of a graph without coordinates, from graph distances."""
     size = _num_nodes(graph)
     if size == 1:
         return np.zeros(1)
     count, label = connected_components(graph, directed=False)
     if count == 1:
         return _far_ends(graph)
-    # Parts that do not touch need no separator: whole components go to either side, the largest first.
+    # Unconnected components need no separator: whole components go to either side, the largest first.
     sizes = np.bincount(label)
     rank = np.empty(count, dtype=np.int64)
     rank[np.argsort(-sizes, kind="stable")] = np.arange(count)
@@ -151,7 +153,8 @@ def _distances(graph: csr_array, start: int) -> np.ndarray:
     order, predecessor = breadth_first_order(graph, start, directed=False)
     position = np.empty(_num_nodes(graph), dtype=np.int64)
     position[order] = np.arange(order.size)
-    # Breadth-first order lists layer after layer, and parents before children: where parents leave a layer, one ends.
+    # Breadth-first order lists layer after layer, and parents before children: a layer ends where the parents leave the
+    # previous layer.
     parent = position[predecessor[order[1:]]]
     distance = np.zeros(order.size)
     layer_start, layer = 1, 1
@@ -165,7 +168,8 @@ def _distances(graph: csr_array, start: int) -> np.ndarray:
 
 
 def _smallest_cover(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Fewest nodes that touch every edge between two sides (König: as many as a maximum matching has edges)."""
+    """Minimum set of nodes that touches every edge between two sides (König: its size equals that of a maximum
+    matching)."""
     if lower.size == 0:
         return np.empty(0, dtype=np.int64)
     left, left_local = np.unique(lower, return_inverse=True)
@@ -175,7 +179,8 @@ def _smallest_cover(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     match_of_right = np.full(right.size, -1)
     matched = match_of_left >= 0
     match_of_right[match_of_left[matched]] = np.flatnonzero(matched)
-    # Alternating paths from the unmatched left nodes; the cover is what they miss on the left and reach on the right.
+    # Follow alternating paths from the unmatched left nodes; the cover consists of the left nodes not reached and the
+    # right nodes reached.
     reached_left = ~matched
     reached_right = np.zeros(right.size, dtype=bool)
     while True:

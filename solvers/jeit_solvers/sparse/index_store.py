@@ -1,8 +1,8 @@
-"""Many index arrays kept in one.
+"""Storage of many index arrays in a single array.
 
-Every array and every module of a pytree costs microseconds each time it is passed to a jitted function; a plan has
-dozens of index arrays, and a small factorisation takes half a millisecond. So plans and patterns keep all their
-indices in one int32 array, and what a slice of it means in a static, hashable description.
+Passing a pytree to a jitted function costs microseconds for each of its arrays and modules. A plan has dozens of index
+arrays, and a small factorisation takes only half a millisecond. Therefore plans and patterns store all their indices in
+one int32 array, and the positions of the individual arrays in a static, hashable description.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from jeit_solvers.engines import add_into, as_array, gather, gather_or_zero, has
 
 
 class Slot(NamedTuple):
-    """Place of an index array in the store, and its shape."""
+    """Position and shape of an index array in the store."""
 
     start: int
     shape: tuple[int, ...]
 
     def read(self, indices: Int[Array, " total"]) -> Int[Array, "..."]:
-        """The index array, out of the store it was packed in."""
+        """The index array, read from the packed store."""
         stop = self.start + math.prod(self.shape)
         if has_values(indices):
             return np.asarray(indices)[self.start : stop].reshape(self.shape)  # pyright: ignore[reportReturnType]
@@ -39,14 +39,14 @@ class IndexStore:
         self._total = 0
 
     def add(self, array: np.ndarray) -> Slot:
-        """Keep an integer array; returns the slot to read it from later."""
+        """Store an integer array; returns the slot from which it is read later."""
         slot = Slot(self._total, tuple(array.shape))
         self._arrays.append(array.astype(np.int32).ravel())
         self._total += array.size
         return slot
 
     def pack(self) -> Int[Array, " total"]:
-        """Join all arrays into one. Raises `ValueError` if there are more indices than 32 bits can count."""
+        """Concatenate all arrays. Raises `ValueError` if there are more indices than 32-bit integers can count."""
         if self._total > np.iinfo(np.int32).max:
             raise ValueError(
                 f"The plan needs {self._total} indices, more than 32-bit integers can count: the matrix fills in too "
@@ -58,9 +58,10 @@ class IndexStore:
 class PaddedSum(NamedTuple):
     """Sums of scattered contributions. Scattering is slow on a CPU, so most contributions are *gathered*.
 
-    `gather` (width, sums) says which contributions each sum reads, with numbers out of range where it has fewer;
-    `overflow_sum` and `overflow_source` pair sums with the contributions beyond `width`, which are scattered: in rounds
-    that end at `rounds`, in each of which no sum is met twice and sums ascend.
+    `gather` (width, sums) holds the indices of the contributions to each sum, with an index out of range where a sum
+    has fewer than `width`. `overflow_sum` and `overflow_source` hold pairs of a sum and a contribution beyond `width`,
+    which are scattered. The pairs are ordered in rounds that end at `rounds`; in each round the sums ascend and none
+    occurs twice.
     """
 
     gather: Slot
@@ -72,12 +73,13 @@ class PaddedSum(NamedTuple):
     def create(
         cls, store: IndexStore, target: np.ndarray, source: np.ndarray, num_sums: int, num_sources: int
     ) -> "PaddedSum":
-        """Plan to add contribution `source[i]` of `num_sources` into sum `target[i]` of `num_sums`, for all i."""
+        """Plan the addition of contribution `source[i]` of `num_sources` to sum `target[i]` of `num_sums`, for all
+        i."""
         order = np.argsort(target, kind="stable")
         target, source = target[order], source[order]
         counts = np.bincount(target, minlength=num_sums)
         rank = np.arange(target.size) - np.repeat(np.cumsum(counts) - counts, counts)
-        # Number of contributions that each width would leave over; the width with the least predicted time is taken.
+        # Number of contributions left over for each width; the width with the shortest predicted time is chosen.
         left_over = target.size - np.concatenate([[0], np.cumsum(np.bincount(rank, minlength=1))])
         width = int(np.argmin(np.arange(left_over.size) * num_sums + _SCATTER_COST * left_over))
         gather = np.full((width, num_sums), num_sources, dtype=np.int32)
@@ -108,8 +110,8 @@ class PaddedSum(NamedTuple):
     def add_some(
         self, indices: Any, contributions: Inexact[Array, "sources *k"], total: Any, start: int, stop: int
     ) -> None:
-        """In NumPy: the sums from `start` to before `stop`, added to a `total` (sums, k) in place; so many at a time
-        that what is made on the way stays near the processor."""
+        """In NumPy, add the sums with indices from `start` up to, but not including, `stop` to `total` (sums, k) in
+        place. They are processed in chunks, so that temporary arrays stay in the cache."""
         at_once = max(1, _AT_ONCE // math.prod(contributions.shape[1:]))
         gathered: Any = self.gather.read(indices)
         for first in range(start, stop, at_once) if len(gathered) else ():
@@ -127,8 +129,8 @@ class PaddedSum(NamedTuple):
     def read_back(
         self, indices: Int[Array, " total"], sums: Inexact[Array, " sums"], into: Inexact[Array, " sources"]
     ) -> Inexact[Array, " sources"]:
-        """`into` with the sum that each contribution is added to in its place, one of them where it is added to more;
-        it must have one place more than there are contributions, which is overwritten."""
+        """`into` with the entry of each contribution replaced by its sum (by one of its sums if it is added to
+        several). `into` must have one entry more than there are contributions; this last entry is overwritten."""
         for layer in self.gather.read(indices):
             into = set_at(into, layer, sums)
         if self.overflow_sum.shape[0]:
@@ -137,14 +139,15 @@ class PaddedSum(NamedTuple):
         return into
 
 
-# Measured on two Zen 4 cores: a scattered contribution costs about as much as this many gathered ones.
+# Cost of a scattered contribution relative to a gathered one, measured on two Zen 4 cores.
 _SCATTER_COST = 4.0
-# Entries that NumPy gathers at a time.
+# Number of entries that NumPy gathers at a time.
 _AT_ONCE = 16384
 
 
 class IndexLayout:
-    """A static description that hashes once: JAX hashes and compares it at every call of a jitted function."""
+    """A static description that computes its hash only once, because JAX hashes and compares it at every call of a
+    jitted function."""
 
     def __init__(self, *content: Any):
         self.content = content

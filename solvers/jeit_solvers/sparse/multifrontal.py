@@ -1,6 +1,6 @@
-"""The numeric half of the direct solver: factorise, solve, and products with the inverse.
+"""The numerical part of the direct solver: factorisation, solution, and products with the inverse.
 
-In NumPy at once where the matrix is NumPy's, else in compiled programs.
+Computed in NumPy if the matrix is a NumPy array, else in compiled programs.
 """
 
 from __future__ import annotations
@@ -21,15 +21,17 @@ from jeit_solvers.engines import differentiable_batches, gather_or_zero, has_val
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.plan import FactorisationPlan, Stage
 
-# Entries of the fronts of a stage, from which threads are worth it; and of the fronts that are updated together.
+# Minimum number of entries of the fronts of a stage for which threads are used; number of entries of the fronts that
+# are updated together.
 _WORTH_A_THREAD, _TOGETHER = 200_000, 100_000
 
 
 class Factor(eqx.Module):
     """A factorised matrix A = L L^T: two arrays for every stage of its plan.
 
-    `inverses` (batch, pivots, pivots) of L's diagonal blocks, and `lowers` (batch, border, pivots), the blocks below
-    them: solving is nothing but matrix products. For a complex symmetric A, transposes are not conjugated.
+    **Fields**: `inverses`: (batch, pivots, pivots) inverses of the diagonal blocks of L; `lowers`: (batch, border,
+    pivots) blocks below them. Solving therefore needs only matrix products. For a complex symmetric A, transposes are
+    not conjugated.
     """
 
     inverses: tuple[Inexact[Array, "batch pivots pivots"], ...]
@@ -37,12 +39,13 @@ class Factor(eqx.Module):
 
     @property
     def positive_definite(self) -> Bool[Array, ""]:
-        """Whether the matrix was positive definite (complex: every pivot had a positive real part)."""
+        """Whether the matrix was positive definite (for a complex matrix: whether every pivot had a positive real
+        part)."""
         diagonals = [jnp.diagonal(inverse, axis1=-2, axis2=-1) for inverse in self.inverses]
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(diagonal), axis=(-2, -1)) for diagonal in diagonals]), axis=0)
 
     def require_positive_definite(self) -> None:
-        """Raise a ValueError if the matrix was not positive definite; does nothing while JAX traces."""
+        """Raise a ValueError if the matrix was not positive definite; does nothing if values are traced by JAX."""
         verdict = self.positive_definite
         if has_values(verdict) and not verdict.all():
             raise ValueError(
@@ -56,9 +59,9 @@ class Factor(eqx.Module):
 def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor:
     """Factorise the matrix with the given values (nnz,), in the order of the pattern that `plan` was made for.
 
-    Real values must make a positive definite matrix. Complex ones make a complex *symmetric* matrix, whose real part
-    must be positive definite (an admittivity). If they do not, the factor is NaN and `positive_definite` is false.
-    Raises `ValueError` for values of another shape.
+    Real values must form a positive definite matrix. Complex values form a complex *symmetric* matrix, whose real part
+    must be positive definite (an admittivity). Otherwise the factor is NaN and `positive_definite` is false. Raises
+    `ValueError` for values of another shape.
     """
     if values.shape != (plan.num_entries,):
         raise ValueError(
@@ -95,12 +98,12 @@ def _by_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexa
     return Factor(tuple(inverses), tuple(lowers))
 
 
-# Compiled functions of their own, so that a second program with the same plan need not trace them again.
+# Compiled separately, so that a second program with the same plan does not trace it again.
 _factorise = jax.jit(_by_stages, static_argnums=0)
 
 
 def _in_numpy(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[np.ndarray, " nnz"]) -> Factor:
-    """The same in NumPy: in place, the fronts of a stage shared between the cores."""
+    """`_by_stages` in NumPy, in place, with the fronts of a stage distributed over the cores."""
     stages, _ = layout.content
     extended = np.concatenate([values, np.ones(1, values.dtype)])
     inverses, lowers, left = [], [], []
@@ -119,7 +122,7 @@ def _in_numpy(layout: IndexLayout, indices: Int[Array, " total"], values: Inexac
 
 
 def _some_fronts(stage: Stage, indices, extended, left, panel, corner, inverse, lower, some: slice) -> None:
-    """Assembles and eliminates some fronts of a stage, in place."""
+    """Assemble and eliminate the fronts `some` of a stage, in place."""
 
     def add(sums, values, total):
         size = total[0].size
@@ -139,7 +142,7 @@ def _some_fronts(stage: Stage, indices, extended, left, panel, corner, inverse, 
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-    """x with A x = b, for one right-hand side (n,) or several (n, k) at once; raises `ValueError` for other shapes."""
+    """Solution x of A x = b for one right-hand side (n,) or several (n, k). Raises `ValueError` for other shapes."""
     vectors = _columns(plan, right_hand_sides, "solve")
     if isinstance(vectors, np.ndarray):
         return _both_ways(plan.layout, plan.indices, factor, vectors).reshape(right_hand_sides.shape)
@@ -159,7 +162,8 @@ _solve = jax.jit(_both_ways, static_argnums=0)
 
 
 def _batch_of_solves(batchable, plain, axis_size, batched, indices, factor, vectors):
-    """More right-hand sides for one factor are more columns; more factors are solved with one by one."""
+    """Batching rule: a batch of right-hand sides for one factor is solved as more columns, a batch of factors one by
+    one."""
     if any(jax.tree.leaves(batched[:2])):
         return one_by_one(batchable, plain, axis_size, batched, indices, factor, vectors)
     size, count = vectors.shape[1:]
@@ -170,9 +174,9 @@ def _batch_of_solves(batchable, plain, axis_size, batched, indices, factor, vect
 def half_solve(
     plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
 ) -> Inexact[Array, "rows k"]:
-    """Y = L^-1 P b, rows in the order of elimination and with rows of zeros for padding: Y^T Y = b^T A^-1 b.
+    """Y = L^-1 P b, with rows in the order of elimination and rows of zeros for padding, so that Y^T Y = b^T A^-1 b.
 
-    Half the work of `solve`, if products with the inverse are all that is wanted. Raises `ValueError` for other shapes.
+    Takes half the work of `solve`, if only products with the inverse are needed. Raises `ValueError` for other shapes.
     """
     vectors = _columns(plan, right_hand_sides, "half_solve")
     forward = _half_way if isinstance(vectors, np.ndarray) else _forward
@@ -183,13 +187,14 @@ def half_solve(
 def quadratic_form(
     plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
 ) -> Inexact[Array, "k k"]:
-    """b^T A^-1 b, symmetric (complex: not conjugated), by the forward half of a solve."""
+    """b^T A^-1 b, symmetric (for complex values not conjugated), by the forward half of a solve."""
     half = half_solve(plan, factor, right_hand_sides)
     return half.T @ half
 
 
 def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "rows k"]) -> Inexact[Array, "n k"]:
-    """P^T L^-T times vectors, rows as `half_solve` returns them: of standard normal ones, vectors of covariance A^-1.
+    """P^T L^-T times vectors, with rows as returned by `half_solve`. Standard normal vectors are mapped to vectors with
+    covariance A^-1.
 
     Raises `ValueError` for another number of rows.
     """
@@ -201,11 +206,11 @@ def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "
 
 
 def inverse_entries(plan: FactorisationPlan, factor: Factor) -> Inexact[Array, " nnz"]:
-    """The entries of A^-1 where A has some (nnz,), in the order of its pattern, diagonal first.
+    """Entries (nnz,) of A^-1 at the positions of the pattern of A, in the order of the pattern, diagonal first.
 
-    They follow from the factor and from each other, from the root of the elimination tree down, in about the time of a
-    factorisation, where all of A^-1 would take as many solves as there are rows. Takahashi, Fagan and Chin, Proc. 8th
-    PICA Conf. (1973) 63-69; Erisman and Tinney, Commun. ACM 18 (1975) 177-179.
+    They are computed from the factor by a recursion from the root of the elimination tree down, in about the time of a
+    factorisation; all of A^-1 would take as many solves as there are rows. Takahashi, Fagan and Chin, Proc. 8th PICA
+    Conf. (1973) 63-69; Erisman and Tinney, Commun. ACM 18 (1975) 177-179.
     """
     if isinstance(factor.inverses[0], np.ndarray):
         return _inverse_entries(plan.layout, plan.num_entries, plan.indices, factor)
@@ -215,11 +220,12 @@ def inverse_entries(plan: FactorisationPlan, factor: Factor) -> Inexact[Array, "
 def _inverse_entries(
     layout: IndexLayout, num_entries: int, indices: Int[Array, " total"], factor: Factor
 ) -> Inexact[Array, " nnz"]:
-    """With A = L L^T a front's part of the inverse Z, that of its border taken from its parent's, is
-    Z_bp = -Z_bb K, Z_pp = L_pp^-T L_pp^-1 + K^T Z_bb K, K = L_bp L_pp^-1."""
+    """Entries of the inverse Z, front by front from the root down. With A = L L^T and the part Z_bb of a front's border
+    taken from its parent, the other parts are Z_bp = -Z_bb K and Z_pp = L_pp^-T L_pp^-1 + K^T Z_bb K, where K = L_bp
+    L_pp^-1."""
     stages, _ = layout.content
     xp, dtype = namespace(factor), factor.inverses[0].dtype
-    entries = xp.zeros(num_entries + 2, dtype)  # one for padded pivots, and one for what is no entry
+    entries = xp.zeros(num_entries + 2, dtype)  # one more for padded pivots, and one for positions outside the pattern
     first_child = {one.parent: number for number, one in reversed(list(enumerate(stages))) if one.border}
     fronts: dict[int, Inexact[Array, "batch height height"]] = {}
     for number in reversed(range(len(stages))):
@@ -238,15 +244,16 @@ def _inverse_entries(
         if number in first_child:
             fronts[number] = whole
         if stage.border and first_child[stage.parent] == number:
-            del fronts[stage.parent]  # no front further down hangs on it
+            del fronts[stage.parent]  # no front further down needs it
     return entries[:num_entries]
 
 
 def _within(above: Inexact[Array, "parents height height"], rows: Int[Array, "batch border"]):
-    """Entries of the inverse in parents' fronts between the rows of children's borders, zero for padding."""
+    """Entries of the inverse between the rows of the children's borders, read from the parents' fronts; zero for
+    padding."""
     height = above.shape[-1]
     slot, place = rows // height, rows % height
-    # Padding is one beyond the last front.
+    # Padding gets the index after the last entry.
     flat = (slot[:, :, None] * height + place[:, :, None]) * height + place[:, None, :]
     there = rows < above.shape[0] * height
     flat = namespace(above).where(there[:, :, None] & there[:, None, :], flat, above.size)
@@ -285,7 +292,7 @@ def _columns(plan: FactorisationPlan, right_hand_sides: Inexact[Array, "n *k"], 
 def _half_way(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> list[Inexact[Array, "batch pivots k"]]:
-    """L^-1 times the vectors, stage by stage. A front's pivot rows gather what its children have subtracted."""
+    """L^-1 times the vectors, stage by stage. The pivot rows of a front gather the updates of its children."""
     stages, _ = layout.content
     count = vectors.shape[1]
     reduced, updates = [], []
@@ -310,8 +317,8 @@ def _backward(
     factor: Factor,
     reduced: list[Inexact[Array, "batch pivots k"]],
 ) -> Inexact[Array, "rows k"]:
-    """L^-T times the vectors, from the root down: the pivots of all stages. A front finds its border's solution in its
-    parent."""
+    """L^-T times the vectors, from the root down: the pivots of all stages. The solution at the border of a front is
+    read from its parent."""
     count, xp = reduced[0].shape[-1], namespace(reduced)
     fronts: dict[int, Inexact[Array, "rows k"]] = {}
     solved = []

@@ -1,15 +1,15 @@
-"""Entries of A⁻¹ between unknowns that lie near each other, of a sparse A, by elimination from strip to strip.
+"""Entries of A⁻¹ between nearby unknowns of a sparse matrix A, by elimination from strip to strip.
 
-Unknowns are parted into strips that are coupled to the next ones only: levels of a breadth-first search from one side.
-With blocks A_i of a strip and E_i between it and the next, elimination from the first strip on leaves
+Unknowns are partitioned into strips, each coupled only to its neighbours: the levels of a breadth-first search from one
+side. With blocks A_i of a strip and E_i between strips i and i + 1, elimination from the first strip on gives
 
     P_i = (A_i - Eᵀ_(i-1) P_(i-1) E_(i-1))⁻¹,  W_i = P_i E_i,
 
-and then, from the last strip back, G = A⁻¹ has the blocks (Takahashi, Fagan and Chin, Proc. 8th PICA Conf., 1973)
+and then, from the last strip back, the blocks of G = A⁻¹ are (Takahashi, Fagan and Chin, Proc. 8th PICA Conf., 1973)
 
     G_ij = -W_i G_(i+1)j  for j > i,    G_ii = P_i + W_i G_(i+1)(i+1) W_iᵀ.
 
-Only j up to i + `reach` are worked out: the work is that of products of a few large matrices.
+Only blocks with j up to i + `reach` are computed. The work consists of products of a few large matrices.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 
 
 class Strips(eqx.Module):
-    """Unknowns of a matrix in strips, of which some unknowns are wanted.
+    """Unknowns of a matrix, partitioned into strips, with the wanted unknowns first in each strip.
 
-    `position` (n,): strip · `size` + number within the strip, where wanted ones come first; `wanted`: the most of them
-    in one strip, or a few more. The `place` of a wanted unknown is strip · `wanted` + number within the strip.
+    `position`: (n,) strip · `size` + index within the strip; `number`: number of strips; `size`: maximum number of
+    unknowns in a strip; `wanted`: maximum number of wanted unknowns in a strip, rounded up. The `place` of a wanted
+    unknown is strip · `wanted` + index within the strip.
     """
 
     position: Int[np.ndarray, " n"]
@@ -44,7 +45,7 @@ class Strips(eqx.Module):
     def create(
         cls, pattern: SparsityPattern, coordinates: Inexact[np.ndarray, "n d"], wanted: Bool[np.ndarray, " n"]
     ) -> "Strips":
-        """Strips across the longest extent of the unknowns' coordinates."""
+        """Strips perpendicular to the longest extent of the unknowns' coordinates."""
         long, *others = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
         strip = _levels(pattern, long)
         # Neighbours in a strip are neighbours in memory.
@@ -54,39 +55,40 @@ class Strips(eqx.Module):
         within[order] = np.arange(len(strip)) - np.repeat(np.cumsum(counts) - counts, counts)
         size = int(counts.max())
         most = int(np.bincount(strip[wanted], minlength=1).max())
-        most = min(-(-max(most, 1) // 8) * 8, size)  # few sizes: programs are compiled for each
+        most = min(-(-max(most, 1) // 8) * 8, size)  # rounded to few sizes, because a program is compiled for each
         return cls((strip * size + within).astype(np.int32), len(counts), size, most)
 
     @property
     def place(self) -> Int[np.ndarray, " n"]:
-        """Places (n,) of unknowns that are wanted, among `number` · `wanted`; of no meaning for others."""
+        """Places (n,) of the wanted unknowns, in 0 … `number` · `wanted` - 1; meaningless for other unknowns."""
         return self.position // self.size * self.wanted + self.position % self.size
 
     def reach(self, groups: Int[np.ndarray, "g k"]) -> int:
-        """Greatest number of strips from the first to the last of a group's places; at least 1."""
+        """Maximum number of strips between the first and the last place of a group, at least 1."""
         strips = np.asarray(groups) // self.wanted
         return max(1, int((strips.max(axis=1) - strips.min(axis=1)).max()))
 
     def spread(self, rows: Inexact[Array, "n *k"]) -> Inexact[Array, "p *k"]:
-        """Rows of all unknowns in the order of places; zeros where a strip has fewer wanted ones than the most."""
+        """Rows of the unknowns in the order of places; zeros where a strip has fewer wanted unknowns than `wanted`."""
         shape = self.number * self.size, *rows.shape[1:]
         spread = jnp.zeros(shape, rows.dtype).at[self.position].set(rows).reshape(self.number, self.size, *shape[1:])
         return spread[:, : self.wanted].reshape(-1, *shape[1:])
 
 
 class NearInverse(eqx.Module):
-    """G between places of strips up to some strips apart: `band` (strips, wanted, columns) of G_ij, j from the row's
-    strip to as many after, for G is symmetric; and what was added to it, as `left` and `right` (p, r)."""
+    """G between places at most a few strips apart. **Fields**: `band`: (strips, wanted, columns) blocks G_ij, with j
+    from the strip i of the row to a few strips further, because G is symmetric; `left` and `right`: (p, r) factors of a
+    term left rightᵀ that is added to G."""
 
     band: Inexact[Array, "s p q"]
     left: Inexact[Array, "p r"]
     right: Inexact[Array, "p r"]
 
     def blocks(self, places: Int[Array, "g k"]) -> Inexact[Array, "g k k"]:
-        """G between the places of each group."""
+        """Blocks of G between the places of each group."""
         _, wanted, width = self.band.shape
         added = self.left[places] @ jnp.swapaxes(self.right[places], 1, 2)
-        if self.band.size >= 2**31:  # places are 32-bit integers, and so are their products
+        if self.band.size >= 2**31:  # places are 32-bit integers, and their products would overflow
             places = places.astype(jnp.int64)
         row, column = places[:, :, None], places[:, None]
         row, column = jnp.minimum(row, column), jnp.maximum(row, column)
@@ -94,14 +96,14 @@ class NearInverse(eqx.Module):
         return self.band.reshape(-1).at[index].get(mode="promise_in_bounds") + added
 
     def add(self, left: Inexact[Array, "p r"], right: Inexact[Array, "p r"]) -> "NearInverse":
-        """G + left rightᵀ, which must be symmetric; both in the order of places."""
+        """G + left rightᵀ, which must be symmetric; both factors have rows in the order of places."""
         joined = (jnp.concatenate(pair, axis=1) for pair in ((self.left, left), (self.right, right)))
         return NearInverse(self.band, *joined)
 
 
 @partial(jax.jit, static_argnums=2)
 def near_inverse(strips: Strips, operator: SparseSymmetric, reach: int) -> NearInverse:
-    """G = A⁻¹ between wanted unknowns of strips up to `reach` apart; NaN where A is not positive definite."""
+    """G = A⁻¹ between wanted unknowns of strips at most `reach` apart; NaN if A is not positive definite."""
     size, wanted = strips.size, strips.wanted
     blocks, couplings = _blocks(strips, operator)
 
@@ -130,7 +132,7 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, reach: int) -> NearI
 
 
 def _blocks(strips: Strips, operator: SparseSymmetric):
-    """A_i and E_i (number, size, size); unknowns that fill strips up are coupled to nothing."""
+    """A_i and E_i (number, size, size). Strips are filled up with unknowns that are not coupled to others."""
     shape = strips.number, strips.size, strips.size
     position = jnp.asarray(strips.position)
     rows, columns = position[operator.pattern.rows], position[operator.pattern.columns]
@@ -147,7 +149,8 @@ def _blocks(strips: Strips, operator: SparseSymmetric):
 
 
 def _levels(pattern: SparsityPattern, along: np.ndarray) -> Int[np.ndarray, " n"]:
-    """Levels (n,) of a breadth-first search from where a coordinate is least; of each part that hangs together."""
+    """Levels (n,) of a breadth-first search that starts where the coordinate `along` is smallest, in each connected
+    component."""
     rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
     graph = csr_array((np.ones(len(rows), np.float32), (rows, columns)), shape=(pattern.size, pattern.size))
     graph = graph + graph.T

@@ -13,11 +13,11 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 
 
 class SparseSymmetric(lineax.AbstractLinearOperator):
-    """The symmetric (n, n) matrix with the given values (nnz,) in a sparsity pattern.
+    """The symmetric (n, n) matrix with the given values (nnz,) in a sparsity pattern, as a lineax operator.
 
-    Real matrices are taken to be positive definite, as the solvers of this package need them. Complex ones are
-    symmetric, not Hermitian. Differentiable in `values`. Raises `ValueError` for values of another shape than the
-    pattern's, or not floating point.
+    Real matrices are assumed to be positive definite, as the solvers of this package require. Complex matrices are
+    symmetric, not Hermitian. Differentiable with respect to `values`. Raises `ValueError` for values of another shape
+    than that of the pattern, and for values that are not floating point.
     """
 
     values: Inexact[Array, " nnz"]
@@ -40,7 +40,7 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
         return self.pattern.multiply(self.values, vector)
 
     def as_matrix(self) -> Inexact[Array, "n n"]:
-        """The matrix with all its zeros, (n, n)."""
+        """The matrix as a dense array (n, n)."""
         return self.pattern.to_dense(self.values)
 
     def transpose(self) -> "SparseSymmetric":
@@ -48,11 +48,11 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
         return self
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape and kind of number of a vector to multiply."""
+        """Shape and data type of a vector that the matrix can be multiplied with."""
         return jax.ShapeDtypeStruct((self.pattern.size,), self.values.dtype)
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
-        """Shape and kind of number of a product; the same, for the matrix is square."""
+        """Shape and data type of a product, which equal those of the vector because the matrix is square."""
         return self.in_structure()
 
 
@@ -99,7 +99,7 @@ def _(operator: SparseSymmetric) -> bool:
 
 
 def require_sparse_symmetric(operator: lineax.AbstractLinearOperator, solver: str) -> SparseSymmetric:
-    """The operator, if it is a `SparseSymmetric`; otherwise a ValueError that says how to make one."""
+    """The operator, if it is a `SparseSymmetric`; otherwise raises a ValueError that explains how to make one."""
     if isinstance(operator, lineax.TaggedLinearOperator):
         operator = operator.operator
     if not isinstance(operator, SparseSymmetric):

@@ -1,4 +1,4 @@
-"""Patterns of sparse matrices, and their assembly."""
+"""Sparsity patterns of symmetric matrices, and assembly of matrices from element matrices."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ class SparsityPattern(eqx.Module):
     """Positions of the entries of a symmetric (n, n) matrix that may be non-zero: its lower triangle, diagonal
     included.
 
-    A matrix with this pattern is its `values` (nnz,): `values[k]` stands at `(rows[k], columns[k])` and also at
-    `(columns[k], rows[k])`. The diagonal comes first, `values[:n]`, then the entries below it, row by row.
+    A matrix with this pattern is represented by its `values` (nnz,): `values[k]` is the entry at
+    `(rows[k], columns[k])` and at `(columns[k], rows[k])`. The diagonal comes first, `values[:n]`, then the entries
+    below it, row by row.
 
-    Build one with `from_elements`, `from_entries` or `from_matrix`. Its indices are one
-    leaf of the pytree: pass a pattern to a jitted function as an argument, and they are not baked into the executable.
+    Build a pattern with `from_elements`, `from_entries` or `from_matrix`. Its indices are one leaf of the pytree, so
+    they are not compiled into a jitted function to which the pattern is passed as an argument.
     """
 
     indices: Int[Array, " total"]
@@ -33,12 +34,12 @@ class SparsityPattern(eqx.Module):
 
     @property
     def num_entries(self) -> int:
-        """Stored entries, nnz: the diagonal and what is below it."""
+        """Number of stored entries, nnz: the diagonal and the entries below it."""
         return self._slots.shape[1]
 
     @property
     def rows(self) -> Int[Array, " nnz"]:
-        """Row of every stored entry; not less than its column."""
+        """Row of every stored entry, greater than or equal to its column."""
         return self._slots.read(self.indices)[0]
 
     @property
@@ -56,15 +57,15 @@ class SparsityPattern(eqx.Module):
 
     @classmethod
     def from_elements(cls, groups: Sequence[Any], size: int) -> Self:
-        """The pattern of a finite-element matrix: nodes of one element are coupled.
+        """The pattern of a finite-element matrix, in which the nodes of each element are coupled.
 
         **Arguments:**
 
-        - `groups`: groups of elements, each an integer array (m, k) of node numbers: cells (m, 3), boundary
-          facets (b, 2) … A group may bring couplings that no other group has.
+        - `groups`: groups of elements, each an integer array (m, k) of node numbers: cells (m, 3), boundary facets (b,
+          2) … A group may add couplings that no other group has.
         - `size`: number of nodes, n.
 
-        Raises a ValueError for node numbers out of range, for elements that name a node twice, and for nodes that
+        Raises a ValueError for node numbers out of range, for elements that contain a node twice, and for nodes that
         belong to no element (their row would be empty and the matrix singular).
         """
         size = _checked_size(size)
@@ -94,9 +95,9 @@ class SparsityPattern(eqx.Module):
 
     @classmethod
     def from_entries(cls, rows: Any, columns: Any, size: int) -> Self:
-        """The pattern with the given entries, each named once as (row, column) or as (column, row).
+        """The pattern with the given entries, each named as (row, column) or as (column, row).
 
-        `assemble` then takes one array (entries,) in the order given here; entries named more than once add up.
+        `assemble` then takes one array (entries,) in the order given here; entries named more than once are added up.
         Raises a ValueError for indices out of range and for rows without a diagonal entry.
         """
         size = _checked_size(size)
@@ -113,7 +114,8 @@ class SparsityPattern(eqx.Module):
 
     @classmethod
     def from_matrix(cls, matrix: Any) -> tuple[Self, Array]:
-        """Pattern and values (nnz,) of a symmetric SciPy sparse matrix or dense array, both triangles given.
+        """Pattern and values (nnz,) of a symmetric SciPy sparse matrix or dense array, which must contain both
+        triangles.
 
         Raises a ValueError unless the matrix is square, symmetric (not Hermitian: complex values are not conjugated),
         finite and without missing diagonal entries.
@@ -142,11 +144,11 @@ class SparsityPattern(eqx.Module):
 
     @classmethod
     def _from_contributions(cls, row_lists, column_lists, shapes, size, where, what) -> Self:
-        """Unique entries of all groups in the pattern's order, and each group's map into them."""
+        """Pattern of the unique entries of all groups, with a map from the values of each group to the entries."""
         keys = []
         for rows, columns in zip(row_lists, column_lists, strict=True):
             above, below = np.maximum(rows, columns), np.minimum(rows, columns)
-            # Negative keys put the diagonal first, in row order.
+            # Entries on the diagonal get negative keys, so that they come first, in the order of rows.
             keys.append(np.where(above == below, above - size, above * size + below))
         unique, entry = np.unique(np.concatenate(keys), return_inverse=True)
         on_diagonal = np.zeros(size, dtype=bool)
@@ -170,12 +172,12 @@ class SparsityPattern(eqx.Module):
         return cls(store.pack(), IndexLayout(entries, maps), size)
 
     def assemble(self, *element_matrices: Inexact[Array, "..."] | None) -> Inexact[Array, " nnz"]:
-        """Add element matrices up into the matrix's values (nnz,).
+        """Add up element matrices to the values (nnz,) of the matrix.
 
-        One argument for each group the pattern was made from, in their order: symmetric matrices (m, k, k), of which
-        only the lower triangles are read; or just these, packed as (k (k + 1) / 2, m), rows in the order of
-        `numpy.tril_indices(k)`; or None, for a group that adds nothing this time. Real or complex.
-        Raises `ValueError` for another number of arguments, or if all are None.
+        Takes one argument for each group of the pattern, in their order: symmetric matrices (m, k, k), of which only
+        the lower triangles are read; or the packed lower triangles (k (k + 1) / 2, m), rows in the order of
+        `numpy.tril_indices(k)`; or None for a group that contributes nothing. Values are real or complex. Raises
+        `ValueError` for another number of arguments, or if all are None.
         """
         if len(element_matrices) != len(self._assembly):
             raise ValueError(
@@ -192,12 +194,12 @@ class SparsityPattern(eqx.Module):
         return sum(parts[1:], start=parts[0])
 
     def entries_between(self, values: Inexact[Array, " nnz"], group: int = 0) -> Inexact[Array, "pairs m"]:
-        """The matrix's entries between the nodes of each element of a group, packed as `assemble` takes them:
-        (k (k + 1) / 2, m), rows in the order of `numpy.tril_indices(k)`."""
+        """Entries of the matrix between the nodes of each element of a group, packed as for `assemble`: (k (k + 1) / 2,
+        m), rows in the order of `numpy.tril_indices(k)`."""
         return self._assembly[group].read_back(self.indices, values)
 
     def diagonal(self, values: Inexact[Array, " nnz"]) -> Inexact[Array, " n"]:
-        """The matrix's diagonal (n,)."""
+        """Diagonal of the matrix (n,)."""
         return values[: self.size]
 
     def multiply(self, values: Inexact[Array, " nnz"], vectors: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
@@ -250,9 +252,9 @@ def _check_range(indices: np.ndarray, size: int, name: str) -> None:
 
 
 class AssemblyMap(NamedTuple):
-    """The way from one group's element matrices to all the matrix's entries (nnz,).
+    """Map from the element matrices of one group to the entries (nnz,) of the matrix.
 
-    `shape` is (m, k) for m elements of k nodes, or (m,) for m values that are matrix entries themselves.
+    `shape` is (m, k) for m elements of k nodes, or (m,) for m values that are themselves entries of the matrix.
     """
 
     diagonal: PaddedSum
@@ -263,7 +265,8 @@ class AssemblyMap(NamedTuple):
     def create(
         cls, store: IndexStore, entry: np.ndarray, size: int, num_entries: int, shape: tuple[int, ...]
     ) -> "AssemblyMap":
-        """`entry` names the matrix entry of each packed value (pairs, m), row by row, or of each value (m,)."""
+        """Make the map. `entry`: index of the matrix entry of each packed value (pairs, m), row by row, or of each
+        value (m,)."""
         source = np.arange(entry.size)
         on_diagonal = entry < size
         return cls(
@@ -275,12 +278,12 @@ class AssemblyMap(NamedTuple):
     def apply(
         self, indices: Int[Array, " total"], matrices: Inexact[Array, "..."], name: str
     ) -> Inexact[Array, " nnz"]:
-        """The matrix entries that the group's element matrices add up to; see `SparsityPattern.assemble`."""
+        """Contribution of the group's element matrices to the entries of the matrix; see `SparsityPattern.assemble`."""
         flat = self._packed(matrices, name).reshape(-1)
         return namespace(flat).concatenate([self.diagonal.apply(indices, flat), self.below.apply(indices, flat)])
 
     def read_back(self, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Inexact[Array, "..."]:
-        """The matrix entry that each packed value is added to; see `SparsityPattern.entries_between`."""
+        """The matrix entry to which each packed value is added; see `SparsityPattern.entries_between`."""
         packed = (len(np.tril_indices(self.shape[1])[0]), self.shape[0]) if len(self.shape) > 1 else self.shape
         size = self.diagonal.gather.shape[1]
         into = namespace(values).zeros(math.prod(packed) + 1, values.dtype)
@@ -288,7 +291,7 @@ class AssemblyMap(NamedTuple):
         return self.below.read_back(indices, values[size:], into)[:-1].reshape(packed)
 
     def _packed(self, matrices: Inexact[Array, "..."], name: str) -> Inexact[Array, "..."]:
-        """One row of m values for each entry of the elements' lower triangles."""
+        """Element matrices as packed lower triangles, with one row of m values for each entry of a triangle."""
         if len(self.shape) == 1:
             if matrices.shape != self.shape:
                 raise ValueError(f"{name} must be the entries' values, shape {self.shape}; got {matrices.shape}.")

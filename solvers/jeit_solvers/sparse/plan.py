@@ -1,10 +1,9 @@
 """The plan of a factorisation: elimination tree, fronts and stages.
 
-The order of elimination as a tree of fronts, grouped into stages of like fronts.
-
-A *front* is a small dense matrix: its *pivots* are rows that are eliminated together, its *border* the later rows that
-their elimination touches (multifrontal method; Duff and Reid, ACM Trans. Math. Softw. 9, 1983). The fronts at the same
-height of the tree form a *stage*: they are padded to one shape and go through JAX as one batch.
+A *front* is a small dense matrix: its *pivots* are rows that are eliminated together, and its *border* consists of the
+later rows that their elimination changes (multifrontal method; Duff and Reid, ACM Trans. Math. Softw. 9, 1983). Fronts
+at the same height of the elimination tree form a *stage*: they are padded to one shape and processed by JAX as one
+batch.
 """
 
 from __future__ import annotations
@@ -22,23 +21,26 @@ from jeit_solvers.sparse.dissection import nested_dissection
 from jeit_solvers.sparse.index_store import IndexLayout, IndexStore, PaddedSum, Slot
 from jeit_solvers.sparse.pattern import SparsityPattern
 
-# Fronts this small still use matrix products well, and are small enough to be eliminated without looking inside.
+# Size of the fronts at the leaves of the tree: large enough for efficient matrix products, and small enough to be
+# treated as dense.
 _LEAF_SIZE = 24
-# The launch of one stage's operations takes as long as about this many floating-point operations.
+# Number of floating-point operations that take about as long as the launch of the operations of a stage.
 _OPERATIONS_WORTH_A_STAGE = 1e6
 
 
 class EliminationTree:
-    """Fronts, numbered from 0, of a sparsity pattern, and the borders that elimination gives them.
+    """Fronts of a sparsity pattern, numbered from 0, and their borders.
 
-    - `front`, `place` (n,): each matrix row's front, and its place among the front's pivots.
-    - `parent`, `stage`, `slot` (fronts,): each front's parent (-1 at the root), stage, and position in the stage.
-    - `early`, `late` (nnz,): the ends of each matrix entry, the one that is eliminated first and the other.
-    - For each stage: `borders`, sorted keys front * n + row; `batch`, `pivots`, `border`: its padded shape.
+    - `front`, `place`: (n,) front of each matrix row, and index of the row among the pivots of the front.
+    - `parent`, `stage`, `slot`: (fronts,) parent of each front (-1 at the root), its stage, and its position in the
+      stage.
+    - `early`, `late`: (nnz,) the two rows of each matrix entry, first the one that is eliminated earlier.
+    - `borders`: for each stage the sorted keys front * n + row of its borders; `batch`, `pivots`, `border`: number of
+      fronts of each stage and their padded shape.
     """
 
     def __init__(self, pattern: SparsityPattern, coordinates: np.ndarray | None):
-        """Dissect the pattern's graph, and find out what elimination in that order touches."""
+        """Dissect the graph of the pattern, and find the rows that elimination in the resulting order changes."""
         size = pattern.size
         rows, columns = np.asarray(pattern.rows, dtype=np.int64), np.asarray(pattern.columns, dtype=np.int64)
         self.size = size
@@ -58,7 +60,8 @@ class EliminationTree:
         self.border = [int(rank_within(keys // size).max(initial=-1)) + 1 for keys in self.borders]
 
     def _make_fronts(self, owner: np.ndarray, depth: int) -> None:
-        """Fronts out of tree nodes: small separators are eliminated together with those below them."""
+        """Make fronts from the nodes of the dissection: small separators are eliminated together with the separators
+        below them."""
         nodes = np.arange(2 ** (depth + 1) - 1)
         level = np.floor(np.log2(nodes + 1)).astype(int)
         largest = np.zeros(depth + 1, dtype=int)
@@ -79,7 +82,8 @@ class EliminationTree:
         self.slot[by_stage] = rank_within(self.stage[by_stage])
 
     def _find_borders(self) -> None:
-        """A front's border: the later ends of its entries, and its children's borders without its own pivots."""
+        """Find the border of each front: the later rows of its entries, and the borders of its children without its own
+        pivots."""
         first, second = self.front[self.early], self.front[self.late]
         pending = np.unique(first[first != second] * self.size + self.late[first != second])
         self.borders = []
@@ -93,33 +97,34 @@ class EliminationTree:
             pending = np.unique(np.concatenate([pending[~mine], inherited]))
 
     def position(self, fronts: np.ndarray, rows: np.ndarray, stage: int) -> np.ndarray:
-        """Local row of matrix rows in fronts of one stage: pivots first, then the border."""
+        """Local indices of matrix rows in fronts of one stage: pivots first, then the border."""
         keys, border = fronts * self.size + rows, self.borders[stage]
         in_border = np.searchsorted(border, keys) - np.searchsorted(border, fronts * self.size)
         return np.where(self.front[rows] == fronts, self.place[rows], self.pivots[stage] + in_border)
 
     @property
     def num_operations(self) -> float:
-        """Floating-point operations of one factorisation, padding included."""
+        """Number of floating-point operations of a factorisation, including padding."""
         pivots, border = np.asarray(self.pivots, dtype=float), np.asarray(self.border, dtype=float)
         return float((self.batch * (4 / 3 * pivots**3 + 2 * pivots**2 * border + 2 * pivots * border**2)).sum())
 
     @property
     def num_factor_entries(self) -> int:
-        """Numbers in the factor, padding included."""
+        """Number of entries of the factor, including padding."""
         return int(sum(c * (s + b) * s for c, s, b in zip(self.batch, self.pivots, self.border, strict=True)))
 
     @property
     def num_front_entries(self) -> int:
-        """Numbers in all fronts, about as many as the plan has indices."""
+        """Number of entries of all fronts, which is about the number of indices in the plan."""
         return int(sum(c * (s + b) ** 2 for c, s, b in zip(self.batch, self.pivots, self.border, strict=True)))
 
 
 def _merged_levels(largest: np.ndarray) -> list[int]:
-    """Number of levels of the tree in each stage, from the leaves up, for levels with separators up to `largest`.
+    """Number of levels of the tree in each stage, from the leaves up. `largest`: size of the largest separator of each
+    level.
 
-    Eliminating a separator together with the two below it makes a stage less, and wastes operations on the zeros
-    between these two. It is done where the waste is smaller than what a stage costs in itself.
+    Eliminating a separator together with the two separators below it saves a stage, but wastes operations on the zeros
+    between these two. They are merged if the waste costs less than a stage.
     """
 
     def operations(batch: int, pivots: int, border: int) -> float:
@@ -129,7 +134,8 @@ def _merged_levels(largest: np.ndarray) -> list[int]:
     while level >= 0:
         height, pivots = 1, int(largest[level])
         while level > 0:
-            # Half a front's surroundings were cut by the separators next above: borders are a few of these long.
+            # About half of a front's surroundings are separators of the next levels above, so its border is a few times
+            # as long as these.
             batch, above = 2 ** (level - 1), int(largest[level - 1])
             border = 3 * above
             apart = operations(2 * batch, pivots, border) + operations(batch, above, border)
@@ -148,15 +154,15 @@ def rank_within(groups: np.ndarray) -> np.ndarray:
 
 
 def _graph(rows: np.ndarray, columns: np.ndarray, size: int) -> csr_array:
-    """The pattern without its diagonal, both triangles."""
+    """Graph of the pattern: its entries without the diagonal, in both triangles."""
     rows, columns = rows[size:], columns[size:]
     ends = (np.concatenate([rows, columns]), np.concatenate([columns, rows]))
     return csr_array((np.ones(2 * rows.size, dtype=np.int8), ends), shape=(size, size))
 
 
 class Link(NamedTuple):
-    """Transfer to a stage from the fronts of an earlier one, `source`: sums over that stage's flattened Schur
-    complements, into `panel` and `corner`, and over its flattened right-hand-side updates, into `rows`."""
+    """Transfer to a stage from the fronts of an earlier stage `source`. **Fields**: `panel`, `corner`: sums of the
+    entries of that stage's flattened Schur complements; `rows`: sums of its flattened right-hand-side updates."""
 
     source: int
     panel: PaddedSum
@@ -165,11 +171,11 @@ class Link(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """A batch of fronts padded to one shape: `pivots` rows eliminated in each, `border` rows updated.
+    """A batch of fronts padded to one shape: in each front `pivots` rows are eliminated and `border` rows updated.
 
-    `entries` sums the matrix's values, and a one appended to them for padded pivots, into the fronts' first columns
-    (batch, pivots + border, pivots). `right_hand_side` (batch, pivots) names matrix rows, `above` (batch, border) rows
-    of the stage `parent`'s fronts; both are out of range for padding.
+    `entries` adds the values of the matrix, followed by a one for padded pivots, to the first columns of the fronts
+    (batch, pivots + border, pivots). `right_hand_side` (batch, pivots) holds indices of matrix rows, `above` (batch,
+    border) indices of rows in the fronts of the stage `parent`; indices out of range mark padding.
     """
 
     batch: int
@@ -183,9 +189,9 @@ class Stage(NamedTuple):
 
 
 class FactorisationPlan(eqx.Module):
-    """Everything that `factorise` and `solve` need to know about a sparsity pattern; made by `analyse`.
+    """Order of elimination and index maps of a sparsity pattern for `factorise` and `solve`; made by `analyse`.
 
-    The index maps are one leaf of the pytree: pass a plan to a jitted function as an argument.
+    The index maps are one leaf of the pytree; pass a plan to a jitted function as an argument.
     """
 
     indices: Int[Array, " total"]
@@ -200,22 +206,22 @@ class FactorisationPlan(eqx.Module):
 
     @property
     def solution(self) -> Slot:
-        """Index of each matrix row among the pivots of all stages, one stage after the other."""
+        """Index of each matrix row among the pivots of all stages, which are concatenated in their order."""
         return self.layout.content[1]
 
     @property
     def num_pivots(self) -> int:
-        """Rows of what `half_solve` returns, padding included."""
+        """Number of rows that `half_solve` returns, including padding."""
         return sum(stage.batch * stage.pivots for stage in self.stages)
 
     @property
     def num_factor_entries(self) -> int:
-        """Numbers in the factor, padding included; its memory is this times the size of a number."""
+        """Number of entries of the factor, including padding."""
         return sum(stage.batch * (stage.pivots + stage.border) * stage.pivots for stage in self.stages)
 
     @property
     def num_operations(self) -> int:
-        """Floating-point operations of one factorisation, padding included."""
+        """Number of floating-point operations of a factorisation, including padding."""
         return sum(
             stage.batch * (4 * s**3 // 3 + 2 * s * s * stage.border + 2 * s * stage.border**2)
             for stage in self.stages
@@ -226,16 +232,17 @@ class FactorisationPlan(eqx.Module):
 def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationPlan:
     """Find the order of elimination and the index maps of the direct solver for a sparsity pattern.
 
-    Runs in NumPy and SciPy, outside `jit`, once for a pattern. `coordinates` (n, d) of the unknowns, if they have any,
-    give a better order than the pattern alone. Raises a ValueError if their shape does not fit or they are not finite.
+    Runs in NumPy and SciPy, outside `jit`, once per pattern. `coordinates` (n, d) of the unknowns give a better order
+    than the pattern alone. Raises a ValueError if their shape does not fit or they are not finite.
     """
     return plan_of_tree(pattern, elimination_tree(pattern, coordinates))
 
 
 def elimination_tree(pattern: SparsityPattern, coordinates: Any = None) -> EliminationTree:
-    """Elimination tree from which `analyse` makes a plan; cheap to compute, and enough to estimate the plan's cost.
+    """Elimination tree from which `analyse` makes a plan. It is cheap to compute, and sufficient to estimate the cost
+    of the plan.
 
-    Raises `ValueError` for coordinates of another shape than (n, d), or not finite.
+    Raises `ValueError` for coordinates that do not have shape (n, d) or are not finite.
     """
     if coordinates is not None:
         coordinates = np.asarray(coordinates, dtype=float)
@@ -250,9 +257,9 @@ def elimination_tree(pattern: SparsityPattern, coordinates: Any = None) -> Elimi
 
 
 def plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> FactorisationPlan:
-    """All index maps for an elimination tree: those of another plan, while one of the same tree is in use, such as that
-    of a forward model whose mesh a prior has matrices on."""
-    known = _known(pattern, tree)
+    """Make the plan with all index maps for an elimination tree. If a plan of the same tree is in use, for example in a
+    forward model on the mesh of which a prior also needs matrices, its index maps are shared."""
+    known = _plan_key(pattern, tree)
     indices, layout = _INDICES.get(known), _LAYOUTS.get(known)
     if indices is None or layout is None:
         store = IndexStore()
@@ -266,15 +273,15 @@ def plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> Factorisati
     return FactorisationPlan(indices, layout, pattern.size, pattern.num_entries)
 
 
-def _known(pattern: SparsityPattern, tree: EliminationTree) -> bytes:
-    """Key by which a plan is recognised."""
+def _plan_key(pattern: SparsityPattern, tree: EliminationTree) -> bytes:
+    """Key of the plan of a tree in the cache of plans."""
     found = hashlib.blake2b(digest_size=16)
     for one in (pattern.rows, pattern.columns, tree.front, tree.place, tree.parent, tree.stage, tree.slot):
         found.update(np.asarray(one).tobytes())
     return found.digest()
 
 
-# Indices of plans in use: making a plan of a solid takes seconds, and keeping it hundreds of megabytes.
+# Index maps of plans in use, because making a plan of a solid takes seconds, and storing it hundreds of megabytes.
 _INDICES: WeakValueDictionary[bytes, Array] = WeakValueDictionary()
 _LAYOUTS: WeakValueDictionary[bytes, IndexLayout] = WeakValueDictionary()
 
@@ -286,7 +293,7 @@ def _stage(store: IndexStore, pattern: SparsityPattern, tree: EliminationTree, s
     right_hand_side = np.full((batch, pivots), tree.size)
     right_hand_side[tree.slot[tree.front[rows]], tree.place[rows]] = rows
 
-    # Where this stage's borders are found among the rows of their parents.
+    # Positions of the border rows of this stage among the rows of their parents.
     child, row = np.divmod(tree.borders[stage], tree.size)
     parent_front = tree.parent[child]
     parent = int(tree.stage[parent_front[0]]) if child.size else -1
@@ -313,13 +320,14 @@ def _stage(store: IndexStore, pattern: SparsityPattern, tree: EliminationTree, s
 def _matrix_entries(
     store: IndexStore, pattern: SparsityPattern, tree: EliminationTree, stage: int, height: int
 ) -> PaddedSum:
-    """The matrix's values into the fronts that eliminate them, and ones on the diagonal of padded pivots."""
+    """Sums that add the values of the matrix to the fronts that eliminate them, and ones to the diagonal of padded
+    pivots."""
     batch, pivots = int(tree.batch[stage]), tree.pivots[stage]
     entries = np.flatnonzero(tree.stage[tree.front[tree.early]] == stage)
     early, late = tree.early[entries], tree.late[entries]
     front = tree.front[early]
     column, row = tree.place[early], tree.position(front, late, stage)
-    # The fronts' pivot blocks are filled on both sides of the diagonal.
+    # Pivot blocks of the fronts are filled on both sides of the diagonal.
     both = (row < pivots) & (row != column)
     first = tree.slot[front] * height
     members = np.argsort(np.where(tree.stage == stage, tree.slot, tree.parent.size), kind="stable")[:batch]
@@ -337,7 +345,7 @@ def _link(store: IndexStore, tree: EliminationTree, source: int, stage: int) -> 
     height, count, width = pivots + border, int(tree.batch[source]), tree.border[source]
     child, row = np.divmod(tree.borders[source], tree.size)
     place, front = rank_within(child), tree.parent[child]
-    # Local row in the parent of each border row of each child; -1 is padding.
+    # Local row in the parent front of each border row of each child; -1 marks padding.
     into = np.full((count, width), -1)
     into[tree.slot[child], place] = tree.position(front, row, stage)
     parent_slot = np.zeros(count, dtype=np.int64)

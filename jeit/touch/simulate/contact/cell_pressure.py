@@ -1,4 +1,4 @@
-"""Compute the pressure on the cells of a mesh, at a few samples of each, which balances a load."""
+"""Pressure of indenters on the cells of a mesh, at several sample points per cell, in equilibrium with the load."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from jeit.touch.simulate.contact.indenters import Disc
 from jeit.touch.simulate.contact.press import AbstractSupport, Press
 from jeit.touch.simulate.contact.samples import Samples
 
-# A finer lattice is used for contacts on few samples; it resolves all that is as wide as this share of a cell.
+# Lattice for contacts on few samples; number of samples below which it is used; width that it resolves, as a share of
+# the radius of a cell.
 _FINE_LATTICE, _FEW, _FOUND = 11, 6, 1 / 6
-# The number of presses whose pressures are computed at once, so that memory fits in the cache.
+# Number of presses computed at once, so that the arrays fit in the cache.
 _AT_ONCE = 16
-# How much larger the reach of a contact is that has about half its area on the skin; Winkler's ball: 2^(1/4).
+# Factor of the reach of a contact with about half its area on the skin; 2^(1/4) for a ball on a Winkler foundation.
 _MARGIN = 1.25
-# The share of the area within reach of a press that is skin, below which its pressure may extend farther.
+# Share of skin in the area within reach of a press, below which its pressure may extend farther.
 _ON_SKIN = 0.6
 
 
 class PressedCells(NamedTuple):
-    """`cells` (n, c) under n touches, and the `pressure` (n, c, s) at their samples, pascals; 0 where a touch has
-    fewer."""
+    """**Fields**: `cells`: (n, c), numbers of the cells under n touches; `pressure`: (n, c, s), pressure at the samples
+    of each cell, pascals. Rows of touches with fewer cells are padded with zeros."""
 
     cells: Int[np.ndarray, "n c"]
     pressure: Float[np.ndarray, "n c s"]
@@ -40,10 +41,10 @@ def pressed_cells(
     touches: Sequence[tuple[Press, ...]],
     progress: Callable[[str], None] | None = None,
 ) -> PressedCells:
-    """Compute the cells under touches, each of one press or several, whose pressures are added.
+    """Compute the cells under touches and their pressure; the pressures of all presses of a touch are added.
 
-    Parts of an indenter over the edge of the skin carry nothing. `progress` is called with the number of presses done.
-    Raises `ValueError` for presses off the skin, and as the support does.
+    Parts of an indenter beyond the edge of the skin carry no load. `progress` is called with the number of presses
+    done. Raises `ValueError` for presses off the skin, and as the support.
     """
     presses = [press for touch in touches for press in touch]
     if not presses:
@@ -71,7 +72,7 @@ def _of_each(
     position = np.array([press.position for press in presses])
     shapes = _shapes(presses)
     farthest = samples.chord * np.array([press.indenter.reach for press in presses])
-    # The extent of pressure on a flat skin does not bound that in hollows.
+    # The extent of the pressure on a flat skin is no upper bound for that on a concave skin.
     reaches = farthest if samples.curved is not None else _reaches(support, presses, shapes)
     extent = np.minimum(reaches, farthest) + samples.radius
     tree = KDTree(samples.points.mean(axis=1))
@@ -106,7 +107,7 @@ def _of_each(
 
 
 def _shapes(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
-    """Number the indenters, with the same number for those that are equal."""
+    """Numbers of the indenters of presses; equal indenters have the same number."""
     numbers: dict = {}
     known: dict[int, int] = {}
     for press in presses:
@@ -118,9 +119,10 @@ def _shapes(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
 
 
 def _reaches(support: AbstractSupport, presses: Sequence[Press], shapes) -> Float[np.ndarray, " n"]:
-    """Greatest distance from its origin, metres, at which each press exerts pressure.
+    """Upper bound of the distance from the origin at which each press exerts pressure, metres.
 
-    It is that with up to twice its load, and somewhat more where the skin's edge leaves it less area.
+    The bound is the reach for the load rounded up to a power of two, times `_MARGIN` for presses at the edge of the
+    skin.
     """
     known: dict[tuple[int, int], float] = {}
     doublings = np.ceil(np.log2([press.load for press in presses]))
@@ -128,7 +130,7 @@ def _reaches(support: AbstractSupport, presses: Sequence[Press], shapes) -> Floa
         if tuple(case) not in known:
             try:
                 extent = _MARGIN * support.pressure(press.indenter, 2.0 ** case[1]).reach
-            except ValueError:  # more than it can carry: that of this press may not be
+            except ValueError:  # the rounded load exceeds the limit of the support; the load of the press may not
                 extent = press.indenter.reach
             known[tuple(case)] = min(extent, press.indenter.reach)
     return np.array([known[case] for case in zip(shapes, doublings, strict=True)])
@@ -149,10 +151,10 @@ def _alike(samples: Samples, support: AbstractSupport, presses: Sequence[Press],
 
 
 def _between(samples: Samples, support: AbstractSupport, press: Press, cells, there):
-    """Pressures (c, s) of a press on few samples: means of each of the `cells` (c,) over a finer lattice.
+    """Pressures (c, s) of a press on few samples: the mean over a finer lattice in each of the `cells` (c,).
 
-    The nearest sample has all of the load where that lattice is missed. Raises `ValueError` for one that touches no
-    skin.
+    If the press touches no point of the finer lattice either, the nearest sample carries the load. Raises `ValueError`
+    for a press that touches no skin.
     """
     points = samples.on(cells, _FINE_LATTICE)
     fine, coarse = points.shape[1], samples.points.shape[1]
@@ -177,7 +179,7 @@ def _between(samples: Samples, support: AbstractSupport, press: Press, cells, th
 
 
 def _bulge(samples: Samples, fall):
-    """None of a flat skin, which falls nowhere."""
+    """Distance of the surface below the plane of the press, for curved skins; None for flat skins."""
     return None if samples.curved is None else fall
 
 

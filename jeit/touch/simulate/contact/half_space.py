@@ -1,10 +1,10 @@
-"""A skin thick against the contact: an elastic half-space, whose surface sinks around a load too.
+"""Elastic half-space: support of a skin that is thick compared with the contact.
 
-The surface sinks by w = K p, K being the convolution with Boussinesq's (1 − ν²) / (π E r). A rigid indenter under a
-load W asks for pressure p ≥ 0 with w + gap = approach where p > 0, w + gap ≥ approach elsewhere, and ∫ p = W: by
-conjugate gradients along the contact, pixels leaving where pressure would be negative and entering where bodies overlap
-(Polonsky and Keer, Wear 231, 1999, 206-219), with K by FFT over a raster padded to twice its sides, so that no period
-is seen.
+The surface also sinks around the load: w = K p, where K is the convolution with Boussinesq's (1 − ν²) / (π E r). The
+pressure p ≥ 0 of a rigid indenter under a load W satisfies w + gap = approach where p > 0, w + gap ≥ approach
+elsewhere, and ∫ p = W. It is found by conjugate gradients over the pixels in contact; pixels leave the contact where
+the pressure would be negative, and enter it where the bodies overlap (Polonsky and Keer, Wear 231, 1999, 206-219). K is
+evaluated by FFT on a raster padded to twice its size, which avoids periodic images.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from jeit.touch.simulate.contact.press import (
     raster,
 )
 
-# Pixels along a side of the raster that finds the contact.
+# Number of pixels along a side of the raster on which the contact area is located.
 _COARSE = 24
-# The least share of a free contact's pressure on the skin, below which the pressure there is undetermined; and the
-# share that the points have to carry for it not to be computed.
+# Minimum share of a contact's load that must lie on the skin, as the pressure is otherwise not determined; and share of
+# the load carried by the points, above which this check is skipped.
 _LEAST_SHARE, _DOUBTED = 0.2, 0.5
-# Share of the load that the last step moves; and the greatest number of steps.
+# Share of the load moved in a step, below which the iteration stops; and maximum number of steps.
 _TOLERANCE, _MOST_STEPS = 1e-8, 2000
 
 
 class HalfSpace(AbstractSupport):
-    """An elastic half-space: its `modulus` E in pascals and Poisson's ratio `poisson`.
+    """An elastic half-space.
 
-    `pixels`: along a side of the raster on which the pressure is computed, over a rectangle little wider than the
-    contact.
+    **Fields**: `modulus`: Young's modulus E in pascals; `poisson`: Poisson's ratio; `pixels`: number of pixels along a
+    side of the raster on which the pressure is computed, a rectangle slightly larger than the contact.
     """
 
     modulus: float
@@ -45,8 +45,8 @@ class HalfSpace(AbstractSupport):
     pixels: int
 
     def __init__(self, modulus: float, poisson: float = 0.5, pixels: int = 64):
-        """Raises `ValueError` for a modulus that is not positive, a ratio that no isotropic body has, fewer than 8
-        pixels."""
+        """Create a half-space. Raises `ValueError` for a modulus that is not positive, a Poisson's ratio outside the
+        range of isotropic bodies, and fewer than 8 pixels."""
         check_modulus(modulus)
         if not (is_number(poisson) and -1 < poisson <= 0.5):
             raise ValueError(f"poisson must be above −1 and at most 0.5, that of rubber; it is {describe(poisson)}.")
@@ -56,14 +56,14 @@ class HalfSpace(AbstractSupport):
 
     @property
     def plane_modulus(self) -> float:
-        """E* = E / (1 − ν²), pascals."""
+        """Plane-strain modulus E* = E / (1 − ν²), pascals."""
         return self.modulus / (1 - self.poisson**2)
 
     def pressure(self, indenter: AbstractIndenter, load: float) -> PressureRaster:
-        """Pressure beneath `indenter` under `load` newtons.
+        """Pressure beneath `indenter` under a `load` in newtons.
 
         Raises `ValueError` for a load that is not positive and for indenters thinner than a pixel, and `RuntimeError`
-        where the contact is not found.
+        if the iteration does not converge.
         """
         check_load(load)
 
@@ -78,8 +78,9 @@ class HalfSpace(AbstractSupport):
         return PressureRaster(float(load), approach, reach, values, pixel)
 
     def spread(self, indenter: AbstractIndenter, loads, points, areas, fall=None):
-        """Each load's own pressure at these points, scaled to carry it: over an edge, what is cut off is made up for by
-        what is left. Raises `ValueError` also where less than a fifth is left, and for a curved skin, which it is not.
+        """Pressures (n, q) at the points of n loads, scaled to carry the load: at an edge, the points on the skin also
+        carry the part of the load beyond it. Raises `ValueError` as `pressure`, for a curved skin, and if less than a
+        fifth of the load lies on the skin.
         """
         if fall is not None:
             raise ValueError("support: a HalfSpace is flat, and the skin is curved; take a Foundation.")
@@ -99,7 +100,8 @@ class HalfSpace(AbstractSupport):
 
 
 def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
-    """Raise `ValueError` where less than a fifth of a pressure lies on the skin, of which there are these points."""
+    """Check how much of a pressure lies on the skin, given by points and their areas. Raises `ValueError` if it is less
+    than a fifth."""
     there = areas > 0
     places, pixel = raster(pressure.pixel * len(pressure.values) / 2, len(pressure.values))
     distance, nearest = KDTree(points[there]).query(places[pressure.values > 0])
@@ -113,10 +115,11 @@ def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
 
 
 def sinking(number: int, pixel, plane_modulus: float):
-    """Return the function from pressures (N, N), pascals, on pixels of these sides to the displacement of their
-    centres, metres.
+    """Return a function that computes the displacements (N, N) of the centres of pixels, metres, from pressures (N, N),
+    pascals. `number`: N; `pixel`: sides of a pixel, metres.
 
-    A uniformly pressed rectangle sinks as in Love (1929): Johnson, Contact Mechanics, 1985, equation 3.25.
+    The displacement due to a rectangle under uniform pressure is that of Love (1929): Johnson, Contact Mechanics, 1985,
+    equation 3.25.
     """
     along, half = np.arange(2 * number) - number, np.asarray(pixel) / 2
     x, y = np.meshgrid(pixel[0] * along, pixel[1] * along)
@@ -137,8 +140,9 @@ def sinking(number: int, pixel, plane_modulus: float):
 
 
 def rigid_contact(gap: np.ndarray, sink, total: float) -> tuple[np.ndarray, float]:
-    """Pressures, zero or more, of sum `total`, under which `sink` closes the `gap`, infinite where nothing can touch;
-    and the approach, metres. Raises `RuntimeError` where they are not found."""
+    """Find the pressures ≥ 0 with sum `total` whose displacements, computed by `sink`, close the `gap`; return them and
+    the approach, metres. The gap is infinite where nothing can touch. Raises `RuntimeError` if the iteration does not
+    converge."""
     may = np.isfinite(gap)
     gap = np.where(may, gap, 0.0)
     pressure = may * (total / may.sum())
@@ -153,7 +157,7 @@ def rigid_contact(gap: np.ndarray, sink, total: float) -> tuple[np.ndarray, floa
         response = sink(direction)
         response -= response[touching].mean()
         slope = np.sum(response * direction)
-        if square == 0 or slope <= 0:  # only rounding is left, or a single pixel touches
+        if square == 0 or slope <= 0:  # converged to rounding errors, or only one pixel is in contact
             break
         length = np.sum(distance[touching] * direction[touching]) / slope
         before, pressure = pressure, np.where(touching, np.maximum(pressure - length * direction, 0.0), 0.0)

@@ -1,5 +1,4 @@
-"""Simulate sets of drawn indents, with a skin's readings of them and their depth maps, in chunks, like sets of
-presses."""
+"""Sets of random indents with the voltages of a skin and depth maps, simulated in chunks like sets of presses."""
 
 from __future__ import annotations
 
@@ -17,9 +16,9 @@ from jeit.design.skin.resting_skin import RestingSkin
 from jeit.design.study.contents import Contents
 from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relative_changes, resting_skin
 
-# Increased when the simulation of the same set changes.
+# Version of the simulation, to be increased when its results change.
 _VERSION = 2
-# One of a worker's threads computes what the chunks share, and the others wait for it.
+# Lock with which only one thread of a worker computes the data shared by all chunks.
 _ONE = Lock()
 _MEANINGS = {
     "change": ("1", "change of each channel's voltage, relative to the skin at rest"),
@@ -28,11 +27,10 @@ _MEANINGS = {
 
 
 class IndentSet:
-    """A set of `number` touches drawn from `draws`, and exact readings of `skin` for them; the same for the same
-    `seed`.
+    """A set of `number` random touches drawn from `draws`, with the exact voltages of `skin`, determined by `seed`.
 
-    Depths are on a grid of `shape` (rows, columns) over the skin; `chunk`, the number of touches simulated, and
-    written, at once: it affects which are drawn too.
+    `shape`: (rows, columns) of the depth maps over the skin. `chunk`: number of touches that are simulated and written
+    at once; it also affects the random numbers.
     """
 
     def __init__(
@@ -45,7 +43,8 @@ class IndentSet:
         shape: tuple[int, int] = (48, 48),
         chunk: int = 1000,
     ):
-        """Raises `ValueError` for what is no skin, draws or seed, numbers below 1, and depths that the skin has not."""
+        """Create a set. Raises `ValueError` for invalid arguments, and for depths that reach the thickness of the
+        skin."""
         check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
         check_kind("draws", draws, IndentDraws, "IndentDraws([ball(0.015)], skin.flat_outline, (1e-3, 8e-3))")
         for name, given in (("number", number), ("chunk", chunk)):
@@ -65,19 +64,20 @@ class IndentSet:
 
     @property
     def chunks(self) -> list[range]:
-        """Numbers of the touches of each chunk."""
+        """Numbers of the touches in each chunk."""
         return [range(self.number)[start : start + self.chunk] for start in range(0, self.number, self.chunk)]
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that decides the results."""
+        """SHA-256 hash of everything that determines the results."""
         model = self.skin.model
         parts = model.mesh, model.electrodes, model.protocol, self.skin.conductivity, self.skin.thickness, self.draws
         own = _VERSION, self.number, self.seed, self.chunk, self.shape
         return _digest(parts, str(own))
 
     def solve(self, number: int) -> dict[str, np.ndarray]:
-        """Simulate the changes (k, M) and depths (k, rows, columns) of one chunk, as the store holds them."""
+        """Simulate one chunk of k touches: relative changes of voltages (k, M) and depth maps (k, rows, columns), by
+        name as in the store."""
         key = jax.random.fold_in(jax.random.key(self.seed), number)
         touches = self.draws.draw(key, len(self.chunks[number]))
         depth = depth_maps(touches, self.places) / float(self.skin.thickness)
@@ -86,7 +86,7 @@ class IndentSet:
         return {"change": relative_changes(self.skin, touches, resting), "depth": depth.astype(np.float32)}
 
     def contents(self) -> Contents:
-        """The contents of the set's store."""
+        """Description of the arrays in the store of the set."""
 
         def fill(group: Any) -> None:
             channels = self.skin.model.protocol.num_measurements
@@ -112,7 +112,7 @@ class IndentSet:
 
 
 class _Deep:
-    """A skin that is indented up to a depth, metres; equal to any like it."""
+    """A skin and its maximum depth of indentation, metres, as a hashable key: equal for equal skins and depths."""
 
     def __init__(self, skin: Skin, depth: float):
         self.skin, self.depth = skin, depth
@@ -128,12 +128,12 @@ class _Deep:
 
 @lru_cache(maxsize=1)
 def _resting(deep: _Deep) -> RestingSkin | None:
-    """Data that all chunks, of all sets of a skin, share; a gigabyte for a layer."""
+    """Data of the skin at rest shared by all chunks and sets of a skin; about a gigabyte for a layer."""
     return resting_skin(deep.skin, deep.depth)
 
 
 def _digest(parts: Any, text: str) -> str:
-    """SHA-256 of a tree of arrays, and a text."""
+    """SHA-256 hash of a tree of arrays and a text."""
     leaves, structure = jax.tree.flatten(parts)
     digest = hashlib.sha256(f"{text} {structure}".encode())
     for leaf in leaves:
@@ -142,13 +142,15 @@ def _digest(parts: Any, text: str) -> str:
 
 
 def image_places(skin: Skin, columns: int, rows: int) -> np.ndarray:
-    """Centres (rows, columns, 2) of pixels over the box of a skin, metres, row 0 at the least y."""
+    """Centres (rows, columns, 2) of the pixels of a grid over the bounding box of a skin, metres; row 0 is at the
+    minimum y."""
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     return pixel_places((low_x, high_x, low_y, high_y), (rows, columns))
 
 
 def pixel_places(extent: tuple[float, float, float, float], shape: tuple[int, int]) -> np.ndarray:
-    """Centres (rows, columns, 2) of pixels over a box (x_min, x_max, y_min, y_max), metres, row 0 at the least y."""
+    """Centres (rows, columns, 2) of the pixels of a grid over a box (x_min, x_max, y_min, y_max), metres; row 0 is at
+    the minimum y."""
     (low_x, high_x, low_y, high_y), (rows, columns) = extent, shape
     x = low_x + (high_x - low_x) * (np.arange(columns) + 0.5) / columns
     y = low_y + (high_y - low_y) * (np.arange(rows) + 0.5) / rows

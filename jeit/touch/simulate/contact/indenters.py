@@ -1,4 +1,4 @@
-"""Rigid indenters: the height of their surface above its lowest point."""
+"""Rigid indenters, described by the height of their surface above its lowest point."""
 
 from __future__ import annotations
 
@@ -17,12 +17,11 @@ from jeit_solvers.engines import host
 
 
 class AbstractIndenter(eqx.Module):
-    """A rigid body that moves straight down, in a frame of its own. Add another by writing one class."""
+    """Base class of rigid bodies that are pressed straight down, described in their own frame."""
 
     @abc.abstractmethod
     def gap(self, points: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "..."]:
-        """Height in metres, zero or more, of its surface above its lowest point over `points` (…, 2), metres; infinite
-        where there is none."""
+        """Height of the surface above its lowest point at `points` (…, 2), metres; infinite beside the indenter."""
 
     @property
     @abc.abstractmethod
@@ -31,33 +30,34 @@ class AbstractIndenter(eqx.Module):
 
 
 class Disc(AbstractIndenter):
-    """The flat end of a cylinder, such as a weight's: of `diameter` metres."""
+    """The flat end of a cylinder with `diameter` in metres, such as of a weight."""
 
     diameter: float
 
     def __init__(self, diameter: float):
-        """Raises `ValueError` for a diameter that is not positive."""
+        """Create a disc. Raises `ValueError` for a diameter that is not positive."""
         _check_size("diameter", diameter)
         self.diameter = float(diameter)
 
     def gap(self, points):
-        """Zero under it."""
+        """Zero beneath the disc, infinite elsewhere."""
         return _flat(_distance(points) <= self.diameter / 2)
 
     @property
     def reach(self) -> float:
-        """Its radius."""
+        """Radius of the disc, metres."""
         return self.diameter / 2
 
 
 class Ring(AbstractIndenter):
-    """The flat end of a tube, or hollow cylinder: of `outer_diameter` and `inner_diameter` metres."""
+    """The flat end of a tube with `outer_diameter` and `inner_diameter` in metres."""
 
     outer_diameter: float
     inner_diameter: float
 
     def __init__(self, outer_diameter: float, inner_diameter: float):
-        """Raises `ValueError` for diameters that are not positive, or a hole that leaves nothing."""
+        """Create a ring. Raises `ValueError` for diameters that are not positive, and for an inner diameter that is not
+        smaller than the outer one."""
         _check_size("outer_diameter", outer_diameter)
         _check_size("inner_diameter", inner_diameter, outer_diameter, "the outer diameter")
         if inner_diameter == outer_diameter:
@@ -67,76 +67,78 @@ class Ring(AbstractIndenter):
         self.outer_diameter, self.inner_diameter = float(outer_diameter), float(inner_diameter)
 
     def gap(self, points):
-        """Zero under its wall."""
+        """Zero beneath the wall of the tube, infinite elsewhere."""
         distance = _distance(points)
         return _flat((distance <= self.outer_diameter / 2) & (distance >= self.inner_diameter / 2))
 
     @property
     def reach(self) -> float:
-        """Its outer radius."""
+        """Outer radius, metres."""
         return self.outer_diameter / 2
 
 
 class Bar(AbstractIndenter):
-    """A flat rectangle, such as a cube's face or a ruler's edge: `length` along x and `width` along y, metres."""
+    """A flat rectangle, such as the face of a cube or the edge of a ruler, with `length` along x and `width` along y in
+    metres."""
 
     length: float
     width: float
 
     def __init__(self, length: float, width: float):
-        """Raises `ValueError` for sides that are not positive."""
+        """Create a bar. Raises `ValueError` for sides that are not positive."""
         _check_size("length", length)
         _check_size("width", width)
         self.length, self.width = float(length), float(width)
 
     def gap(self, points):
-        """Zero under it."""
+        """Zero beneath the bar, infinite elsewhere."""
         return _flat(_within(points, self.length, self.width))
 
     @property
     def reach(self) -> float:
-        """Half its diagonal."""
+        """Half the diagonal, metres."""
         return float(np.hypot(self.length, self.width) / 2)
 
 
 class Prism(AbstractIndenter):
-    """A roof upside down, with its ridge along x: `length` of the ridge, `width` of the base, `height`, all metres."""
+    """A prism that touches with an edge along x, like a roof upside down: `length` of the edge, `width` and `height` of
+    the triangular section, all in metres."""
 
     length: float
     width: float
     height: float
 
     def __init__(self, length: float, width: float, height: float):
-        """Raises `ValueError` for sides that are not positive."""
+        """Create a prism. Raises `ValueError` for sides that are not positive."""
         _check_size("length", length)
         _check_size("width", width)
         _check_size("height", height)
         self.length, self.width, self.height = float(length), float(width), float(height)
 
     def gap(self, points):
-        """2 height |y| / width."""
+        """Height 2 height |y| / width beneath the prism, infinite elsewhere."""
         slope = 2 * self.height * np.abs(np.asarray(points)[..., 1]) / self.width
         return np.where(_within(points, self.length, self.width), slope, np.inf)
 
     @property
     def reach(self) -> float:
-        """Half the diagonal of its base."""
+        """Half the diagonal of the base, metres."""
         return float(np.hypot(self.length, self.width) / 2)
 
 
 class Revolved(AbstractIndenter):
-    """The body that leaves an indentation of `jeit.design`, such as `Bell()`: the same profile, now of something rigid
-    that goes in as deep as its load takes it."""
+    """A rigid body of revolution with the profile of an `indentation` of `jeit.design`, such as `Bell()`; its depth in
+    the skin follows from the load."""
 
     indentation: AbstractIndentation
 
     def __init__(self, indentation: AbstractIndentation):
-        """Raises `ValueError` for what is no indentation."""
+        """Create the body. Raises `ValueError` for an argument that is not an indentation."""
         check_kind("indentation", indentation, AbstractIndentation, "an indentation, such as Bell() or Hemisphere()")
         self.indentation = indentation
 
     def gap(self, points):
-        """Difference of the profile's depth from that in its middle."""
+        """Depth of the profile in its middle minus that at the points; infinite beyond its reach."""
         distance = _distance(points)
         deepest = float(self.indentation.depth_at(host.zeros(())))
         gap = deepest - np.asarray(self.indentation.depth_at(distance))
@@ -144,29 +146,29 @@ class Revolved(AbstractIndenter):
 
     @property
     def reach(self) -> float:
-        """The indentation's."""
+        """Reach of the indentation, metres."""
         return float(self.indentation.reach)
 
 
 def ball(diameter: float) -> Revolved:
-    """The lower half of a ball of `diameter` metres. Raises `ValueError` for one that is not positive."""
+    """The lower half of a ball with `diameter` in metres. Raises `ValueError` for a diameter that is not positive."""
     check_metres("diameter", diameter)
     return Revolved(Hemisphere(diameter / 2, diameter))
 
 
 class DepthMap(AbstractIndenter):
-    """A surface of one's own, linear between its pixels' middles, round the origin.
+    """An indenter given by an image of its surface, centred at the origin and interpolated linearly between pixels.
 
-    **Fields**: `height` (rows, columns), metres, how far it stands out towards the skin, NaN where there is nothing;
-    row 0 at the least y; `pixel`, their side in metres.
+    **Fields**: `height`: (rows, columns), height of the surface towards the skin in metres, NaN where there is no
+    surface; row 0 is at the minimum y; `pixel`: side of a pixel in metres.
     """
 
     height: Float[np.ndarray, "rows columns"]
     pixel: float
 
     def __init__(self, height: ArrayLike, pixel: float):
-        """Raises `ValueError` for what is no image of at least 2 × 2 pixels, one that is infinite somewhere or NaN
-        throughout, and pixels of no size."""
+        """Create an indenter. Raises `ValueError` for an image of fewer than 2 × 2 pixels, an image with infinite
+        values or only NaN, and a pixel size that is not positive."""
         height = real_array("height", height, "an image (rows, columns), in metres")
         if height.ndim != 2 or min(height.shape) < 2 or np.isinf(height).any() or np.isnan(height).all():
             raise ValueError(
@@ -177,7 +179,7 @@ class DepthMap(AbstractIndenter):
         self.height, self.pixel = height, float(pixel)
 
     def gap(self, points):
-        """Difference of the surface's height from its greatest height."""
+        """Maximum height of the surface minus the height at the points; infinite where there is no surface."""
         middle = (np.array(self.height.shape) - 1) / 2
         place = np.moveaxis(np.asarray(points)[..., ::-1] / self.pixel + middle, -1, 0)
         flat = map_coordinates(self.height, place.reshape(2, -1), order=1, cval=np.nan)
@@ -186,17 +188,18 @@ class DepthMap(AbstractIndenter):
 
     @property
     def reach(self) -> float:
-        """Half the image's diagonal."""
+        """Half the diagonal of the image, metres."""
         return float(np.hypot(*self.height.shape) * self.pixel / 2)
 
 
 def check_indenter(name: str, given) -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no indenter."""
+    """Check that the argument `name` is an indenter. Raises `ValueError` otherwise."""
     check_kind(name, given, AbstractIndenter, "an indenter, such as Disc(0.02) or ball(0.015)")
 
 
 def _check_size(name: str, value, most: float = np.inf, limit: str = "") -> None:
-    """Raise `ValueError` as `check_metres` does, and warn of a length that looks like millimetres."""
+    """Check a length as `check_metres`, and warn if it looks like millimetres. Raises `ValueError` as
+    `check_metres`."""
     check_metres(name, value, most, limit)
     check_length(name, value)
 

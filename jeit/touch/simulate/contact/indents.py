@@ -1,4 +1,4 @@
-"""Indents: presses of bodies into a layer, and their random places and depths."""
+"""Indents, which are presses of bodies into a layer to a given depth, and random presses and indents."""
 
 from __future__ import annotations
 
@@ -24,15 +24,19 @@ from jeit.touch.simulate.contact.pressed_skin import PressedSkin
 from jeit.touch.simulate.contact.samples import lattice
 from jeit_solvers.engines import as_array
 
-# The number of places drawn at once for each that is needed, until one is on the skin.
+# Number of random places drawn at once for each place needed, of which those on the skin are used.
 _TRIES = 20
 
 
 class PressDraws(eqx.Module):
-    """Touches of one to `at_once` presses, each number as likely as another, all independent.
+    """Distribution of random touches. All draws are independent and uniform, except for the load, whose logarithm is
+    uniform; the angle of the indenter is uniform, too.
 
-    **Fields**: `indenters`, each as likely as another, turned by any angle; `outline` of the places, and their least
-    distance `margin` from it, metres, all over alike; `load`, least and greatest, newtons, its logarithm uniform.
+    - `indenters`: the indenters.
+    - `outline`: outline of the skin, within which places are drawn.
+    - `margin`: minimum distance of places from the outline, metres.
+    - `load`: minimum and maximum load, newtons.
+    - `at_once`: maximum number of simultaneous presses of a touch; the minimum is one.
     """
 
     indenters: tuple[AbstractIndenter, ...]
@@ -50,8 +54,8 @@ class PressDraws(eqx.Module):
         margin: float = 0.0,
         at_once: int = 1,
     ):
-        """Raises `ValueError` for no indenters, no outline, loads that are not positive and rising, and a margin that
-        leaves no place."""
+        """Create the distribution. Raises `ValueError` without indenters, for invalid arguments, for loads that are not
+        positive and in order, and for a margin that leaves no place."""
         check_kind("indenters", indenters, (list, tuple), "a list of them, such as [ball(0.015)]")
         indenters = tuple(indenters)
         if not indenters:
@@ -73,7 +77,7 @@ class PressDraws(eqx.Module):
             raise ValueError(f"margin is {1e3 * self.margin:g} mm, which leaves no place on the skin; give less.")
 
     def draw(self, key: Array, number: int) -> list[tuple[Press, ...]]:
-        """Draw `number` touches. Raises `ValueError` for what is no key, and no number."""
+        """Draw `number` touches, each a tuple of presses. Raises `ValueError` for an invalid key or number."""
         check_key(key)
         if not (isinstance(number, (int, np.integer)) and not isinstance(number, bool) and number >= 0):
             raise ValueError(f"number must be a whole number of touches, 0 or more; it is {describe(number)}.")
@@ -95,7 +99,8 @@ class PressDraws(eqx.Module):
         return [tuple(presses[end - count : end]) for end, count in zip(ends, counts, strict=True)]
 
     def innermost(self) -> np.ndarray:
-        """Of a thousand places (x, y), metres, on the skin, the one farthest from its edge."""
+        """Place (x, y), metres, approximately farthest from the edge of the skin: the best of a thousand random
+        places."""
         places = self._anywhere(np.random.default_rng(0), 1000)
         return places[np.asarray(self.outline.signed_distance(places)).argmax()]
 
@@ -107,14 +112,16 @@ class PressDraws(eqx.Module):
         return np.asarray(self.outline.signed_distance(places)) >= self.margin
 
 
-# Places in each cell of a mesh, see `lattice`; what of a sheet conducts at least, where it is pressed through.
+# Lattice of the samples in each cell, see `lattice`; minimum share of the conductivity of a sheet that remains where it
+# is indented through its whole thickness.
 _LATTICE, _LEAST = 2, 1e-3
-# Voltages are not divided by less than this share of the greatest.
+# Minimum divisor of relative changes, as a share of the maximum voltage.
 _FLOOR = 1e-3
 
 
 class Indent(eqx.Module):
-    """An `indenter` at a `depth` in metres, turned by `angle` radians, its origin at `position` (x, y), metres."""
+    """An `indenter` pressed to a `depth` in metres, with its origin at `position` (x, y) in metres, rotated by `angle`
+    in radians."""
 
     indenter: AbstractIndenter
     depth: float
@@ -122,7 +129,7 @@ class Indent(eqx.Module):
     angle: float
 
     def __init__(self, indenter: AbstractIndenter, depth: float, position: ArrayLike = (0.0, 0.0), angle: float = 0.0):
-        """Raises `ValueError` for what is no indenter, depth, place or angle."""
+        """Create an indent. Raises `ValueError` for an invalid indenter, depth, position or angle."""
         check_indenter("indenter", indenter)
         check_metres("depth", depth)
         self.indenter, self.depth = indenter, float(depth)
@@ -136,8 +143,8 @@ class Indent(eqx.Module):
 
 
 class IndentDraws(eqx.Module):
-    """Touches of one to `at_once` indents, drawn as `PressDraws` draws presses, with a `depth`, least and greatest,
-    metres, its logarithm uniform, in place of a load."""
+    """Distribution of random touches of one to `at_once` indents, as `PressDraws`, but with a minimum and maximum
+    `depth` in metres instead of a load; the logarithm of the depth is uniform."""
 
     presses: PressDraws
 
@@ -150,19 +157,19 @@ class IndentDraws(eqx.Module):
         margin: float = 0.0,
         at_once: int = 1,
     ):
-        """Raises `ValueError` as `PressDraws` does, and for depths that are no metres."""
+        """Create the distribution. Raises `ValueError` as `PressDraws`, and for invalid depths."""
         for one in depth:
             check_metres("depth", one, 0.1, "any skin is thick")
-        # Loads in newtons of the presses are depths in metres here.
+        # The presses hold depths in metres in place of loads in newtons.
         self.presses = PressDraws(indenters, outline, depth, margin=margin, at_once=at_once)
 
     @property
     def depth(self) -> tuple[float, float]:
-        """Least and greatest depth, metres."""
+        """Minimum and maximum depth, metres."""
         return self.presses.load
 
     def draw(self, key: Array, number: int) -> list[tuple[Indent, ...]]:
-        """Draw `number` touches. Raises `ValueError` for what is no key, and no number."""
+        """Draw `number` touches, each a tuple of indents. Raises `ValueError` for an invalid key or number."""
         drawn = self.presses.draw(key, number)
         return [tuple(Indent(one.indenter, one.load, one.position, one.angle) for one in touch) for touch in drawn]
 
@@ -170,7 +177,8 @@ class IndentDraws(eqx.Module):
 def depth_maps(
     touches: Sequence[Sequence[Indent]], places: Float[np.ndarray, "*shape 2"]
 ) -> Float[np.ndarray, "n *shape"]:
-    """Indentation depth of each of n touches at `places` (…, 2), metres: the deepest of its indents there."""
+    """Depth of the indentation by each of n touches at `places` (…, 2), metres: the maximum over the indents of the
+    touch."""
     maps = np.zeros((len(touches), *places.shape[:-1]))
     for number, touch in enumerate(touches):
         for indent in touch:
@@ -179,10 +187,11 @@ def depth_maps(
 
 
 def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCells:
-    """Changes of a skin's cells by n touches: nothing conducts where it is indented (Park et al. 2022, text S4).
+    """Relative changes of the conductivity of a skin's cells due to n touches; the indented volume does not conduct
+    (Park et al. 2022, text S4).
 
-    In a layer every cell loses the share of it that is indented; in a sheet, the share of its thickness. Raises
-    `ValueError` for indents as deep as the skin.
+    The conductivity of a cell decreases by the indented share of its volume in a layer, and by the indented share of
+    its thickness in a sheet. Raises `ValueError` for indents as deep as the skin.
     """
     check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
     mesh, thickness = skin.model.mesh, float(skin.thickness)
@@ -218,23 +227,23 @@ def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCe
 def relative_changes(
     skin: Skin, touches: Sequence[Sequence[Indent]], resting: RestingSkin | None = None
 ) -> Float[np.ndarray, "n M"]:
-    """Exact changes (n, M) of a skin's voltages by n touches, relative to those at rest, see `relative_to`.
+    """Exact changes (n, M) of a skin's voltages due to n touches, relative to those at rest, see `relative_to`.
 
-    `resting`: the same skin at rest, as of `resting_skin`, which many calls may share. Raises `ValueError` as
-    `indented_cells` does.
+    `resting`: data of the same skin at rest, from `resting_skin`, which several calls can share. Raises `ValueError` as
+    `indented_cells`.
     """
     touched = indented_cells(skin, touches)
     if resting is not None:
         rest = np.asarray(resting.rest)
         return relative_to(rest, rest + resting.changes(touched))
-    # The material's gains and noise apply to its readings only; these voltages are the model's own.
+    # The choice of material does not matter: only exact voltages are used, without gains and noise.
     pressed = PressedSkin(jax.random.key(0), skin.model, material("hydrogel"), conductivity=skin.model_conductivity)
     rest = np.asarray(skin.model.voltages(skin.model_conductivity))
     return relative_to(rest, pressed.voltages_under(touched))
 
 
 def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
-    """Prepare a skin at rest, for indents up to a `depth`, metres; None where it would take too much memory."""
+    """Prepare data of a skin at rest for indents up to a `depth` in metres; None if they would need too much memory."""
     mesh = skin.model.mesh
     touchable = np.ones(mesh.num_points, bool)
     if skin.num_layers:
@@ -245,9 +254,9 @@ def resting_skin(skin: Skin, depth: float) -> RestingSkin | None:
 
 
 def relative_to(reference: Float[np.ndarray, " M"], voltages: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n M"]:
-    """Changes (n, M) relative to a reference, volts, channel by channel.
+    """Changes (n, M) of voltages relative to a reference, channel by channel, without unit.
 
-    Channels that read next to nothing at rest are relative to a thousandth of the greatest.
+    The divisor is at least a thousandth of the maximum reference voltage.
     """
     size = np.abs(reference)
     return (voltages - reference) / np.maximum(size, _FLOOR * size.max())

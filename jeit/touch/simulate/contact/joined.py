@@ -1,15 +1,17 @@
-"""Sheets of two layers, and joined skins.
+"""Skins of two sheets, and indenters that are moved or joined.
 
-Two conducting sheets, one on the other, that touch where they are pressed: why a touch raises conductivity.
+A model of two conducting sheets, one on the other, that touch where they are pressed, so that a touch raises
+conductivity:
 
     ∇·(σ₁∇u) = g (u − w),    ∇·(σ₂∇w) = g (w − u),
 
-u in the lower sheet, which has the electrodes, w in the upper one, whose edge is insulated; g(x, y) is the conductance
-between them per area. Where g = 0 the upper sheet carries nothing; where √(σ/g) is small beside the contact both carry
-the current. Sheets that touch everywhere conduct like σ₁ + σ₂, no better however hard they are pressed, and so does a
-contact that an upper sheet is cut to. A contact on a whole upper sheet, which leads current past the contact too, tends
-to σ₁ + 2σ₂ (u = w on a disc in an unbounded sheet has the dipole σ₂/(σ₁ + σ₂), that of a disc so conductive). A
-`Material` whose `saturation` is σ₂/σ₁, or twice that, is the short form.
+where u is the potential of the lower sheet, which has the electrodes, w that of the upper sheet, whose edge is
+insulated, and g(x, y) the conductance between them per area. If g = 0, the upper sheet carries no current; if √(σ/g) is
+small compared with the contact, both sheets carry current. Sheets in contact everywhere conduct like σ₁ + σ₂ at most,
+and so does a contact if the upper sheet is only as large as the contact. For a contact on a larger upper sheet, which
+also leads current around the contact, the limit is σ₁ + 2σ₂: if u = w on a disc in an unbounded sheet, the dipole is
+σ₂/(σ₁ + σ₂), that of a disc of this conductivity. A `Material` with `saturation` σ₂/σ₁, or twice that, approximates
+this model.
 """
 
 from __future__ import annotations
@@ -29,14 +31,16 @@ from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indent
 from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, quadratic_form
 from jeit_solvers.engines import host, on_host
 
-# Of σ₂ over the area of the skin: the least conductance, which keeps an upper sheet from floating.
+# Minimum conductance between the sheets, relative to σ₂ divided by the area of the skin, which fixes the potential of
+# an upper sheet without contact.
 _LEAST = 1e-9
 
 
 class TwoSheets(eqx.Module):
-    """A sheet on the sheet of `model`, on the same mesh; the whole system of 2n unknowns is factorised at every call.
+    """Model of two sheets on the same mesh. The system of 2n unknowns, for n nodes, is factorised at every call.
 
-    **Fields**: `model` of the lower sheet; `pattern` and `plan` of the system of both.
+    **Fields**: `model`: forward model of the lower sheet; `pattern`, `plan`: sparsity pattern and factorisation plan of
+    the system.
     """
 
     model: ForwardModel
@@ -44,7 +48,8 @@ class TwoSheets(eqx.Module):
     plan: FactorisationPlan
 
     def __init__(self, model: ForwardModel):
-        """Raises `ValueError` for what is no model of a sheet with electrodes that have a size."""
+        """Create the model. Raises `ValueError` unless `model` is that of a sheet whose electrodes have a contact
+        impedance."""
         check_model(model)
         if model.mesh.dimension != 2 or model.electrodes.is_point:
             raise ValueError("model must be of a sheet (2-D mesh), with electrodes that have a contact impedance.")
@@ -58,11 +63,11 @@ class TwoSheets(eqx.Module):
     def voltages(
         self, conductivity: ArrayLike, upper_conductivity: ArrayLike, conductance: ArrayLike
     ) -> Float[np.ndarray, " M"]:
-        """Voltages (M,) of the lower sheet's channels.
+        """Voltages (M,) of the channels of the lower sheet.
 
-        `conductivity` of the lower sheet and `upper_conductivity`, S, one or one a cell; `conductance` between them per
-        area, S/m², one or one a cell (m,). Raises `ValueError` for those of other shapes, conductivities that are not
-        positive and conductances that are negative.
+        `conductivity`: of the lower sheet, and `upper_conductivity`: of the upper sheet, S, one value or one per cell;
+        `conductance`: between the sheets per area, S/m², one value or one per cell (m,). Raises `ValueError` for other
+        shapes, conductivities that are not positive, and negative conductances.
         """
         mesh, electrodes = on_host((self.model.mesh, self.model.electrodes))
         sheets = [
@@ -103,35 +108,36 @@ def _checked(conductance, number: int) -> Float[np.ndarray, " m"]:
 
 
 class Placed(AbstractIndenter):
-    """An `indenter` turned by `angle` radians, counter-clockwise, then moved to `position` (x, y), metres."""
+    """An `indenter` rotated counter-clockwise by `angle` in radians, then moved to `position` (x, y) in metres."""
 
     indenter: AbstractIndenter
     position: Float[np.ndarray, "2"]
     angle: float
 
     def __init__(self, indenter: AbstractIndenter, position: ArrayLike = (0.0, 0.0), angle: float = 0.0):
-        """Raises `ValueError` for what is no indenter, place or angle."""
+        """Create the indenter. Raises `ValueError` for an invalid indenter, position or angle."""
         check_indenter("indenter", indenter)
         self.indenter, self.position, self.angle = indenter, check_position(position), check_angle(angle)
 
     def gap(self, points):
-        """The indenter's, at the points as they lie in its frame."""
+        """Gap of the indenter at the points, transformed to its own frame."""
         cos, sin = np.cos(self.angle), np.sin(self.angle)
         return self.indenter.gap((np.asarray(points) - self.position) @ np.array([[cos, -sin], [sin, cos]]))
 
     @property
     def reach(self) -> float:
-        """The indenter's, and how far it was moved."""
+        """Reach of the indenter plus the distance by which it was moved, metres."""
         return float(np.hypot(*self.position) + self.indenter.reach)
 
 
 class Joined(AbstractIndenter):
-    """Several `parts`, one rigid body under one load: their lowest points are level. Mostly `Placed` ones."""
+    """One rigid body of several `parts` under one load, with their lowest points at the same height. Parts beside each
+    other are `Placed`."""
 
     parts: tuple[AbstractIndenter, ...]
 
     def __init__(self, *parts: AbstractIndenter):
-        """Raises `ValueError` for no parts, and for what is no indenter."""
+        """Create the body. Raises `ValueError` without parts, and for parts that are not indenters."""
         if not parts:
             raise ValueError(
                 "parts: give one indenter at least, such as Joined(Disc(0.01), Placed(Disc(0.01), (0.02, 0)))"
@@ -141,18 +147,18 @@ class Joined(AbstractIndenter):
         self.parts = parts
 
     def gap(self, points):
-        """The least of the parts'."""
+        """Minimum gap of the parts."""
         return np.min([part.gap(points) for part in self.parts], axis=0)
 
     @property
     def reach(self) -> float:
-        """The farthest of the parts'."""
+        """Maximum reach of the parts, metres."""
         return max(part.reach for part in self.parts)
 
 
 def check_position(position, *, in_space: bool = False) -> Float[np.ndarray, " d"]:
-    """A place (x, y) in metres as an array, or where it may be `in_space` (x, y, z). Raises `ValueError` for what is
-    none."""
+    """Convert a place (x, y) in metres to an array; if `in_space`, (x, y, z) is allowed, too. Raises `ValueError` for
+    anything else."""
     where = real_array("position", position, "(x, y) in metres")
     if where.shape not in ((2,), (3,))[: 1 + in_space] or not np.isfinite(where).all():
         raise ValueError(f"position: give (x, y) in metres, not {position!r}.")
@@ -160,7 +166,7 @@ def check_position(position, *, in_space: bool = False) -> Float[np.ndarray, " d
 
 
 def check_angle(angle) -> float:
-    """An angle in radians. Raises `ValueError` for what is none."""
+    """Convert an angle in radians to a float. Raises `ValueError` for anything but a number."""
     if not is_number(angle):
         raise ValueError(f"angle: give radians, not {angle!r}.")
     return float(angle)

@@ -1,4 +1,4 @@
-"""Materials of a layer, from elastic constants to conductivity, and elastic foundations."""
+"""Materials of skins, with their mechanical and electrical properties, and elastic foundations."""
 
 from __future__ import annotations
 
@@ -20,46 +20,49 @@ from jeit.touch.simulate.contact.press import (
     raster,
 )
 
-# Pixels along a side: of the raster that finds the contact, and of that on which the load is balanced.
+# Number of pixels along a side of the raster on which the contact is located, and of the raster on which the load is
+# balanced.
 _COARSE, _FINE = 24, 96
 
 
 class FoundationPressure(AbstractPressure):
-    """k (approach − gap) where that is positive; `stiffness` k in Pa/m. Known at every point, without a raster."""
+    """Pressure max(k (approach − gap), 0) of a foundation with `stiffness` k in Pa/m, evaluated at any point without a
+    raster."""
 
     indenter: AbstractIndenter
     stiffness: float
 
     def at(self, points):
-        """Pressure from the indenter's gap at points."""
+        """Pressure at points, pascals, from the gap of the indenter."""
         return self.stiffness * np.maximum(self.approach - self.indenter.gap(points), 0.0)
 
 
 class Foundation(AbstractSupport):
-    """Winkler's foundation: p = E δ / thickness (Johnson, Contact Mechanics, 1985, section 4.3).
+    """Winkler foundation: pressure p = E δ / thickness at indentation δ (Johnson, Contact Mechanics, 1985, section
+    4.3).
 
-    **Fields**: `modulus` E of the layer in pascals, that of compression between plates that keep it from spreading;
-    `thickness` in metres. It is for layers thinner than the contact is wide.
+    It applies to layers that are thin compared with the width of the contact. **Fields**: `modulus`: modulus E in
+    pascals of the layer under compression without lateral expansion; `thickness`: in metres.
     """
 
     modulus: float
     thickness: float
 
     def __init__(self, modulus: float, thickness: float):
-        """Raises `ValueError` for values that are not positive."""
+        """Create a foundation. Raises `ValueError` for values that are not positive."""
         check_modulus(modulus)
         check_metres("thickness", thickness)
         self.modulus, self.thickness = float(modulus), float(thickness)
 
     @property
     def stiffness(self) -> float:
-        """Pressure over indentation, Pa/m."""
+        """Pressure divided by indentation, Pa/m."""
         return self.modulus / self.thickness
 
     def pressure(self, indenter: AbstractIndenter, load: float) -> FoundationPressure:
-        """Pressure beneath `indenter` under `load` newtons.
+        """Pressure beneath `indenter` under a `load` in newtons.
 
-        Raises `ValueError` for a load that is not positive, one that presses through the layer, and indenters thinner
+        Raises `ValueError` for a load that is not positive or that presses through the layer, and for indenters thinner
         than a pixel.
         """
         check_load(load)
@@ -83,8 +86,8 @@ class Foundation(AbstractSupport):
         return FoundationPressure(float(load), approach, reach, indenter, self.stiffness)
 
     def spread(self, indenter: AbstractIndenter, loads, points, areas, fall=None):
-        """The approach is the one that balances the load on these very points; of a curved skin gaps are as much wider
-        as it falls away."""
+        """Pressures (n, q) with the approach that balances each load on the given points. On a curved skin, `fall` is
+        added to the gaps. Raises `ValueError` for a load that presses through the layer."""
         gap = indenter.gap(points) if fall is None else indenter.gap(points) + fall
         approach = level(gap, areas, loads / self.stiffness)
         deepest = approach.argmax()
@@ -102,10 +105,11 @@ class Foundation(AbstractSupport):
 def level(
     gap: Float[np.ndarray, "*n q"], area: Float[np.ndarray, "*n q"], volume: Float[np.ndarray, "*n"] | float
 ) -> Float[np.ndarray, "*n"]:
-    """The level δ at which Σ area · max(δ − gap, 0) is `volume`; 0 where every gap is infinite.
+    """Level δ at which Σ area · max(δ − gap, 0) equals `volume`, like the level of water over uneven ground; 0 if every
+    gap is infinite.
 
-    Water poured over ground: with the lowest m places under water δ is (volume + Σ area gap) / Σ area over these, exact
-    for the m at which the next place stands out.
+    If the m lowest points are under water, δ = (volume + Σ area · gap) / Σ area over these points. This is exact for
+    the smallest m for which the next point is not under water.
     """
     order = np.argsort(gap, axis=-1)
     heights = np.take_along_axis(gap, order, axis=-1)
@@ -119,26 +123,25 @@ def level(
 
 
 def check_modulus(modulus) -> None:
-    """Raise `ValueError` for what is no positive modulus in pascals."""
+    """Check a modulus in pascals. Raises `ValueError` unless it is positive."""
     if not (is_number(modulus) and modulus > 0):
         raise ValueError(f"modulus must be positive, in pascals (1e6 for a soft rubber); it is {describe(modulus)}.")
 
 
 class Material(eqx.Module):
-    """What a skin is made of; SI units. Other values: `dataclasses.replace(material("velostat"), noise=0.0)`.
+    """Material of a skin, in SI units. To change values: `dataclasses.replace(material("velostat"), noise=0.0)`.
 
-    **At rest**: `conductivity`, S/m, and `thickness`, metres, of what conducts; `support`, what carries the load.
-
-    **Pressed**: σ = σ₀ (1 + c q / (q + p½)) under an effective pressure q, c
-    being `saturation`, the relative change that no pressure exceeds, and p½ `half_pressure`, pascals, where it is half
-    so large. q follows the pressure with `hysteresis`, the greatest difference of unloading and loading over the
-    greatest pressure, and `creep`: (share, seconds) of every branch that is late.
-
-    **Drifting**, relative: `conductivity_trend` and `contact_trend` per second,
-    `conductivity_walk` and `contact_walk` per root of a second; the contacts' are of every electrode's impedance.
-
-    **Read**: `noise`, standard deviation of every voltage relative to the root mean square of all; `gain_spread`,
-    standard deviation of the logarithm of every channel's gain.
+    - `conductivity`: S/m, and `thickness`: metres, of the conductor at rest.
+    - `support`: mechanical support that carries the load.
+    - `saturation`, `half_pressure`: c and p½ (pascals) of the conductivity σ = σ₀ (1 + c q / (q + p½)) under an
+      effective pressure q: c is the limit of the relative change, and p½ the pressure at which half of it is reached.
+    - `hysteresis`: maximum difference of q between unloading and loading, divided by the maximum pressure.
+    - `creep`: (share, time constant in seconds) of each delayed branch of q.
+    - `conductivity_trend`, `contact_trend`: relative drift of the conductivity and of the contact impedance of each
+      electrode, per second.
+    - `conductivity_walk`, `contact_walk`: standard deviation of their random walk, relative, per √s.
+    - `noise`: standard deviation of the noise of each voltage, relative to the root mean square of all voltages.
+    - `gain_spread`: standard deviation of the logarithm of the gain of each channel.
     """
 
     conductivity: float
@@ -156,7 +159,7 @@ class Material(eqx.Module):
     gain_spread: float = 0.0
 
     def __check_init__(self):
-        """Raises `ValueError` for what no material has."""
+        """Check the fields. Raises `ValueError` for values out of range."""
         check_metres("thickness", self.thickness)
         check_support("support", self.support)
         for name in ("conductivity", "half_pressure"):
@@ -185,7 +188,7 @@ def _check(name: str, value, holds: Callable[[float], bool], wanted: str) -> Non
 
 
 def _are_branches(creep) -> bool:
-    """Whether it is pairs of a share and seconds, the shares of a sum below 1."""
+    """Whether `creep` consists of pairs (share, seconds) whose shares have a sum below 1."""
     if not isinstance(creep, (tuple, list)) or not all(
         isinstance(one, (tuple, list)) and len(one) == 2 for one in creep
     ):
@@ -195,11 +198,12 @@ def _are_branches(creep) -> bool:
     return sum(share for share, _ in creep) < 1
 
 
-# What papers print is named; all else is chosen, so that skins differ as their authors say they do.
+# Values from papers are cited; all others are assumptions, chosen so that skins differ as described by their authors.
 MATERIALS = {
-    # Chen et al. 2022, Pugach et al. 2015: carbon-filled polyolefin, 500 Ω cm, 0.1 mm. Two equal sheets conduct twice
-    # as well at most; Chen's double layer tends to a limit at 39 N. Pugach calls its hysteresis high. Chosen: half of
-    # the change at 30 kPa; 2 mm of soft rubber; hysteresis; creep from half a second to minutes; drift; 80 dB; gains.
+    # From Chen et al. 2022 and Pugach et al. 2015: carbon-filled polyolefin, 500 Ω cm, 0.1 mm thick. Two equal sheets
+    # have at most twice the conductivity of one; Chen's double layer approaches a limit at 39 N. Pugach describes the
+    # hysteresis as high. Assumed: half of the change at 30 kPa; support by 2 mm of soft rubber; value of the
+    # hysteresis; creep with 0.5 s to 2 minutes; drift; noise of -80 dB; gains.
     "velostat": Material(
         conductivity=0.2,
         thickness=1e-4,
@@ -215,10 +219,11 @@ MATERIALS = {
         noise=1e-4,
         gain_spread=0.01,
     ),
-    # Silvera Tawil et al. 2011: 12.5 mS a square, 0.6 mm, under 5 mm of foam, and squares of 660 mS that would allow a
-    # 54-fold conductivity were they one sheet in perfect contact. Russo et al. 2017: from 10 kPa up, elastic return and
-    # hysteresis. Chosen: five-fold at most, half of that change at 20 kPa; foam of 300 kPa; hysteresis and creep less
-    # than those of the film; drift; noise of 70 dB, that of a fabric's many contacts; gains.
+    # From Silvera Tawil et al. 2011: sheet conductance 12.5 mS, 0.6 mm thick, under 5 mm of foam, with squares of 660
+    # mS that would allow 54 times the conductivity if they formed one sheet in perfect contact. From Russo et al. 2017:
+    # response from 10 kPa on, elastic return, and hysteresis. Assumed: at most five times the conductivity, half of
+    # that change at 20 kPa; foam with a modulus of 300 kPa; less hysteresis and creep than the film; drift; noise of
+    # -70 dB, due to the many contacts in a fabric; gains.
     "conductive fabric": Material(
         conductivity=12.5e-3 / 0.6e-3,
         thickness=0.6e-3,
@@ -234,9 +239,9 @@ MATERIALS = {
         noise=3e-4,
         gain_spread=0.01,
     ),
-    # Park et al. 2022: 10 mm, pressing raises the impedance, hysteresis below 3 %. jeit.design: 1 S/m. Chosen: a tenth
-    # of the conductivity is left at most, half of that change at 50 kPa; 100 kPa; hardly any creep; drift, as gels dry;
-    # 66 dB (Park prints 0.45 Ω, of a specimen whose resistance he does not).
+    # From Park et al. 2022: 10 mm thick, pressing raises the impedance, hysteresis below 3 %. From jeit.design: 1 S/m.
+    # Assumed: conductivity falls to a tenth at high pressure, half of that change at 50 kPa; modulus of 100 kPa; little
+    # creep; drift, since gels dry; noise of -66 dB (Park gives 0.45 Ω for a specimen of unknown resistance).
     "hydrogel": Material(
         conductivity=1.0,
         thickness=10e-3,
@@ -256,6 +261,7 @@ MATERIALS = {
 
 
 def material(name: str) -> Material:
-    """The material of this name: "velostat", "conductive fabric" or "hydrogel". Raises `ValueError` for another."""
+    """Return the material with the given name: "velostat", "conductive fabric" or "hydrogel". Raises `ValueError` for
+    another name."""
     check_name("name", name, MATERIALS)
     return MATERIALS[name]

@@ -1,4 +1,4 @@
-"""Presses of a body onto a skin, and their pressure."""
+"""Presses of a body on a skin, and their pressure."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from jeit.touch.simulate.contact.joined import check_angle, check_position
 class AbstractPressure(eqx.Module):
     """Pressure in the frame of the indenter that causes it.
 
-    **Fields**: `load`, newtons; `approach`, how far the indenter has come down from where it first touched, metres;
-    `reach`, the distance from the frame's origin beyond which there is no pressure, metres.
+    **Fields**: `load`: newtons; `approach`: distance that the indenter has moved since its first contact, metres;
+    `reach`: distance from the origin beyond which there is no pressure, metres.
     """
 
     load: float
@@ -32,11 +32,12 @@ class AbstractPressure(eqx.Module):
 
 
 class AbstractSupport(eqx.Module):
-    """The mechanical response of a skin to a press. Add another by writing one class."""
+    """Base class of supports: the mechanical response of a skin to a press."""
 
     @abc.abstractmethod
     def pressure(self, indenter: AbstractIndenter, load: float) -> AbstractPressure:
-        """Pressure beneath `indenter` under `load` newtons. Raises `ValueError` for a load that cannot be carried."""
+        """Pressure beneath `indenter` under a `load` in newtons. Raises `ValueError` for a load that the support cannot
+        carry."""
 
     @abc.abstractmethod
     def spread(
@@ -47,42 +48,49 @@ class AbstractSupport(eqx.Module):
         areas: Float[np.ndarray, "n q"],
         fall: Float[np.ndarray, "n q"] | None = None,
     ) -> Float[np.ndarray, "n q"]:
-        """Pressures (n, q) under n `loads`, newtons, at `points` in the indenter's frame, each of which stands for an
-        area, m²: they carry the load among them, all of it, or are zero where the indenter touches none. `fall` of a
-        curved skin: how far below the frame's plane it lies at the points, metres. Raises `ValueError` as `pressure`
-        does, and for a curved skin where it is none of these."""
+        """Pressures (n, q), pascals, under n loads at given points. The points carry the whole load, or none if the
+        indenter touches none of them.
+
+        - `loads`: (n,), newtons.
+        - `points`: (n, q, 2), in the frame of the indenter, metres.
+        - `areas`: (n, q), area of the skin around each point, m².
+        - `fall`: (n, q), for curved skins, distance of the skin below the plane of the frame at the points, metres.
+
+        Raises `ValueError` as `pressure`, and for a curved skin if the support requires a flat one.
+        """
 
 
 class PressureRaster(AbstractPressure):
-    """Pressure known on pixels round the origin, row 0 at the least y, and linear between their middles.
+    """Pressure on a raster centred at the origin, interpolated linearly between the centres of pixels.
 
-    **Fields**: `values` (N, N), pascals, and `pixel`, their sides along x and y in metres; the others as of every
-    pressure.
+    **Fields**: `values`: (N, N), pascals, row 0 at the minimum y; `pixel`: sides of a pixel along x and y, metres; the
+    others as in `AbstractPressure`.
     """
 
     values: Float[np.ndarray, "N N"]
     pixel: Float[np.ndarray, "2"]
 
     def at(self, points):
-        """Pressure, linear between pixels, zero beyond them."""
+        """Pressure at points, pascals, interpolated linearly between pixels; zero outside the raster."""
         place = np.moveaxis((np.asarray(points) / self.pixel)[..., ::-1] + (len(self.values) - 1) / 2, -1, 0)
         flat = map_coordinates(self.values, place.reshape(2, -1), order=1, mode="grid-constant")
         return flat.reshape(place.shape[1:])
 
 
 def raster(half_widths, number: int) -> tuple[Float[np.ndarray, "N N 2"], Float[np.ndarray, "2"]]:
-    """Middles (N, N, 2) of `number` by `number` pixels over a rectangle round the origin, and their sides, metres."""
+    """Centres (N, N, 2) of the N × N pixels of a rectangle around the origin, and the sides of a pixel (2,), metres.
+    `half_widths`: half the sides of the rectangle; `number`: N."""
     pixel = 2 * np.asarray(half_widths, float) / number
     along = np.arange(number) - (number - 1) / 2
     return np.stack(np.meshgrid(pixel[0] * along, pixel[1] * along), axis=-1), pixel
 
 
 def contact_window(pressed, reach: float, number: int) -> Float[np.ndarray, "2"]:
-    """Half the sides in metres of a rectangle round the origin that holds the contact and little else.
+    """Half the sides, in metres, of a rectangle around the origin that encloses the contact closely.
 
-    `pressed(half_widths, number)` (N, N): where a raster of that window has contact. The window shrinks until the
-    contact fills more than half of both its sides: a light load on a ball touches a small part of it. It stays as it is
-    where a contact passes between the pixels.
+    `pressed(half_widths, number)`: (N, N), whether each pixel of a raster over that rectangle is in contact. Starting
+    from `reach`, the rectangle shrinks until the contact fills more than half of both its sides, since a light load on
+    a ball touches only a small part of it. If the contact lies between the pixels, the last rectangle is returned.
     """
     window = np.full(2, reach)
     while True:
@@ -97,13 +105,14 @@ def contact_window(pressed, reach: float, number: int) -> Float[np.ndarray, "2"]
 
 
 def check_load(load) -> None:
-    """Raise `ValueError` for what is no positive load in newtons."""
+    """Check a load in newtons. Raises `ValueError` unless it is positive."""
     if not (is_number(load) and load > 0):
         raise ValueError(f"load must be positive, in newtons (100 g weigh 0.98 N); it is {describe(load)}.")
 
 
 def check_seen(contact: Bool[np.ndarray, "N N"], pixel) -> None:
-    """Raise `ValueError` where a contact lies between the pixels of a raster, of these sides."""
+    """Check that a contact covers at least one pixel of a raster; `pixel`: sides of a pixel, metres. Raises
+    `ValueError` otherwise."""
     if not contact.any():
         raise ValueError(
             f"indenter: what touches of it is thinner than a pixel, {1e3 * np.max(pixel):.2g} mm, of the raster that "
@@ -112,16 +121,17 @@ def check_seen(contact: Bool[np.ndarray, "N N"], pixel) -> None:
 
 
 def check_support(name: str, given) -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no support."""
+    """Check that the argument `name` is a support. Raises `ValueError` otherwise."""
     check_kind(name, given, AbstractSupport, "a support, such as Foundation(1e6, 3e-3) or HalfSpace(1e6)")
 
 
 class Press(eqx.Module):
-    """An `indenter` under a `load` in newtons, turned by `angle` radians, its origin at `position` (x, y), metres.
+    """An `indenter` under a `load` in newtons, with its origin at `position` (x, y) in metres, rotated by `angle` in
+    radians.
 
-    On a curved skin `position` is (x, y, z), on the face that is touched, and the indenter comes down along the inward
-    normal there. With angle 0 its y axis is then up, as near to z as the surface goes, where this is not level, and
-    along y where it is; its x axis to the right, as seen from outside.
+    On a curved skin, `position` is (x, y, z) on the touched face, and the indenter moves along the inward normal. With
+    angle 0, seen from outside, its x axis points to the right and its y axis up: along the projection of the z axis
+    onto the surface, or of the y axis where the surface is nearly horizontal.
     """
 
     indenter: AbstractIndenter
@@ -130,7 +140,7 @@ class Press(eqx.Module):
     angle: float
 
     def __init__(self, indenter: AbstractIndenter, load: float, position: ArrayLike = (0.0, 0.0), angle: float = 0.0):
-        """Raises `ValueError` for what is no indenter, load, place or angle."""
+        """Create a press. Raises `ValueError` for an invalid indenter, load, position or angle."""
         check_indenter("indenter", indenter)
         check_load(load)
         self.indenter, self.load = indenter, float(load)
@@ -138,9 +148,10 @@ class Press(eqx.Module):
 
 
 class MovingPress(eqx.Module):
-    """A press over time: `load` (T,) newtons, 0 while it is lifted, `position` (T, 2) metres, on a curved skin (T, 3).
+    """A press over time, with one value for each of T frames; constant values may be given once.
 
-    `angle` (T,) radians. There is one value for each frame; what stays the same may be given once.
+    **Fields**: `indenter`; `load`: (T,) newtons, 0 while lifted; `position`: (T, 2) metres, or (T, 3) on a curved skin;
+    `angle`: (T,) radians.
     """
 
     indenter: AbstractIndenter
@@ -151,7 +162,8 @@ class MovingPress(eqx.Module):
     def __init__(
         self, indenter: AbstractIndenter, load: ArrayLike, position: ArrayLike = (0.0, 0.0), angle: ArrayLike = 0.0
     ):
-        """Raises `ValueError` for what is no indenter, negative loads, and what is not finite or not as long."""
+        """Create a moving press. Raises `ValueError` for an invalid indenter, negative loads, values that are not
+        finite, and different numbers of frames."""
         check_indenter("indenter", indenter)
         load = real_array("load", load, "newtons, one or one a frame (T,)")
         position = real_array("position", position, "(x, y) in metres, one or one a frame (T, 2)")
@@ -174,14 +186,15 @@ class MovingPress(eqx.Module):
         self.indenter, self.load, self.position, self.angle = indenter, load, position, angle
 
     def at(self, frame: int) -> Press | None:
-        """The press of one frame; None while it is lifted."""
+        """Press in one frame; None while lifted."""
         if not self.load[frame]:
             return None
         return Press(self.indenter, self.load[frame], self.position[frame], self.angle[frame])
 
 
 def touches_of(presses) -> list[tuple[Press, ...]]:
-    """List the simultaneous presses of each touch. Raises `ValueError` for none, and for what is none."""
+    """List the simultaneous presses of each touch, as tuples. Raises `ValueError` for an empty list, and for elements
+    that are not presses."""
     check_kind("presses", presses, (list, tuple), "a list of them, one for each frame, such as [press]")
     if not presses:
         raise ValueError("presses: give one at least.")
@@ -196,9 +209,9 @@ def touches_of(presses) -> list[tuple[Press, ...]]:
 
 
 def motions_of(motions, frames: int) -> list[MovingPress]:
-    """List the motions of a recording: one, or those of a list, which may be empty if nothing touches.
+    """List the motions of a recording, given as one motion or as a list, which is empty for an untouched skin.
 
-    Raises `ValueError` for what is none, those of another number of frames, and motions without any load.
+    Raises `ValueError` for anything else, for another number of frames, and for motions without any load.
     """
     motions = [motions] if isinstance(motions, MovingPress) else motions
     check_kind(

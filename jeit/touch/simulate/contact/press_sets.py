@@ -1,5 +1,5 @@
-"""Simulate sets of drawn touches and their frames, larger than memory: in chunks, to a Zarr store, here or on a
-cluster.
+"""Sets of random touches and their frames, larger than memory: simulated in chunks and written to a Zarr store, on this
+machine or on a cluster.
 
 The store and its chunks are as in the studies of `jeit.design`. Needs the extra `cluster`.
 """
@@ -25,7 +25,7 @@ from jeit.touch.simulate.contact.indents import PressDraws
 from jeit.touch.simulate.contact.press import Press
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin, check_seconds
 
-# Increased when the simulation of the same set changes.
+# Version of the simulation, to be increased when its results change.
 _VERSION = 1
 _MEANINGS = {
     "voltages": ("V", "what the channels read"),
@@ -37,10 +37,10 @@ _MEANINGS = {
 
 
 class PressSet:
-    """`number` touches drawn from `draws`, and the frames of `skin` for them; the same for the same `seed`.
+    """A set of `number` random touches drawn from `draws`, with the frames of `skin`, determined by `seed`.
 
-    `held` and `elapsed`, seconds, as in `PressedSkin.frames`; `chunk`, touches that are simulated, and written, at
-    once: it decides which are drawn too.
+    `held`, `elapsed`: seconds, as in `PressedSkin.frames`; `chunk`: number of touches that are simulated and written at
+    once; it also affects the random numbers.
     """
 
     def __init__(
@@ -54,8 +54,8 @@ class PressSet:
         elapsed: float = 0.0,
         chunk: int = 1000,
     ):
-        """Raises `ValueError` for what is no skin, draws, seed or time, numbers below 1, and greatest loads that the
-        skin does not carry, each indenter in the middle of it; what hangs over its edge goes deeper."""
+        """Create a set. Raises `ValueError` for invalid arguments, and if the skin cannot carry the maximum load of
+        each indenter in its middle; at the edge, indenters go deeper, which is not checked."""
         check_kind("skin", skin, PressedSkin, "a PressedSkin")
         check_kind("draws", draws, PressDraws, "PressDraws, such as PressDraws([ball(0.015)], Disk(0.05), (0.1, 10.0))")
         for name, given in (("number", number), ("chunk", chunk)):
@@ -72,12 +72,12 @@ class PressSet:
 
     @property
     def chunks(self) -> list[range]:
-        """Numbers of the touches of each chunk."""
+        """Numbers of the touches in each chunk."""
         return [range(self.number)[start : start + self.chunk] for start in range(0, self.number, self.chunk)]
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of all that decides the results."""
+        """SHA-256 hash of everything that determines the results."""
         model, number = self.skin.model, (_VERSION, self.number, self.seed, self.held, self.elapsed, self.chunk)
         parts = model.mesh, model.electrodes, model.protocol, self.skin.material, self.skin.conductivity
         leaves, structure = jax.tree.flatten((parts, self.skin.gain, self.draws))
@@ -87,8 +87,8 @@ class PressSet:
         return digest.hexdigest()
 
     def solve(self, number: int) -> dict[str, np.ndarray]:
-        """Simulate the touches and frames of one chunk, as the store holds them: (k, …), NaN where a touch has fewer
-        presses."""
+        """Simulate one chunk of k touches: arrays (k, …) by name as in the store, NaN where a touch has fewer presses
+        than `at_once`."""
         for_draws, for_frames = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), number))
         touches = self.draws.draw(for_draws, len(self.chunks[number]))
         results = {name: np.full((len(touches), *shape), np.nan) for name, (shape, _) in self._shapes().items()}
@@ -101,7 +101,7 @@ class PressSet:
         return results
 
     def contents(self) -> Contents:
-        """The contents of the set's store."""
+        """Description of the arrays in the store of the set."""
 
         def fill(group: Any) -> None:
             for name, (shape, dimensions) in self._shapes().items():
@@ -121,7 +121,7 @@ class PressSet:
         return Contents("press set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, fill)
 
     def _shapes(self) -> dict[str, tuple[tuple[int, ...], tuple[str, ...]]]:
-        """Of one touch: the shape of each array, and its dimensions."""
+        """Shape and dimensions of each array for one touch, by name."""
         each = (self.draws.at_once,), ("press",)
         return {
             "voltages": ((self.skin.model.protocol.num_measurements,), ("channel",)),
@@ -139,12 +139,12 @@ def simulate_presses(
     client: Any = None,
     progress: Callable[[Progress], None] | None = None,
 ):
-    """Simulate the unfinished chunks of a set, of presses or indents, and return it, as `open_presses` does.
+    """Simulate the unfinished chunks of a set of presses or indents, and return the set as `open_presses`.
 
-    Interrupted at any moment, it resumes from the last finished chunk when run again with the same store. `path`,
-    `client` and `progress` as in `jeit.design.run_study`. Raises `ValueError` for another set's store, for one that
-    another process writes, and as `PressedSkin.frames` does, `ImportError` without the extra `cluster`, and `OSError`
-    where the store cannot be written.
+    An interrupted simulation resumes after the last finished chunk when it is run again with the same store. `path`,
+    `client` and `progress` as in `jeit.design.run_study`. Raises `ValueError` for the store of another set, for a store
+    in use by another process, and as `PressedSkin.frames`; `ImportError` without the extra `cluster`; `OSError` if the
+    store cannot be written.
     """
     need_extra("cluster", "a set of touches")
     check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
@@ -159,10 +159,11 @@ def simulate_presses(
 
 
 def open_presses(presses: PressSet | IndentSet, path: str | Path):
-    """Open the set in a store as an `xarray.Dataset` with dimensions touch, channel and press (row and column of
-    indents).
+    """Open the set in a store as an `xarray.Dataset` with dimensions touch, channel and press, or, for indents, row and
+    column instead of press.
 
-    It is read on access; `finished` (touch,) states which touches are. Raises as `jeit.design.study.store.Store` does.
+    Data are read on access; `finished` (touch,) tells which touches have been simulated. Raises as
+    `jeit.design.study.store.Store`.
     """
     need_extra("cluster", "a set of touches")
     store = Store(presses.contents(), path, create=False)
@@ -173,7 +174,7 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
 
 
 def solve_presses(presses: PressSet | IndentSet, number: int) -> dict[str, np.ndarray]:
-    """Simulate one chunk of a set, as `PressSet.solve`: a function, which can be sent to workers of a cluster."""
+    """Simulate one chunk of a set as `PressSet.solve`, but as a function, which can be sent to workers of a cluster."""
     return presses.solve(number)
 
 

@@ -1,12 +1,12 @@
-"""A pressed skin: from loads to conductivity to voltages, with drift and the response of the material.
+"""Pressed skins: from loads to conductivity to voltages, with drift and the response of the material.
 
-Effective pressure of a material as a function of the pressure over time: hysteresis, then creep.
+The effective pressure q of a material follows from the pressure p over time by hysteresis, then creep.
 
-**Hysteresis** is a generalised play (Visintin, Differential Models of Hysteresis, 1994, section III.2) between the
-curves w = p, on which load rises, and w = p / (1 − H), on which it falls: w stays as it is between them. It is
-rate-independent; both curves end at zero, and their greatest difference after a load of p is H p.
+**Hysteresis** is a generalised play operator (Visintin, Differential Models of Hysteresis, 1994, section III.2) between
+the curve w = p, on which the load rises, and the curve w = p / (1 − H), on which it falls; between the curves, w is
+constant. It does not depend on the rate. Both curves end at zero, and their maximum difference after a load p is H p.
 
-**Creep** is that of a standard linear solid with several branches: a share a_k of w is delayed,
+**Creep** is that of a standard linear solid with several branches, in which a share a_k of w is delayed:
 
 q = (1 − Σ a_k) w + Σ a_k y_k, τ_k dy_k/dt = w − y_k,
 
@@ -43,10 +43,8 @@ from jeit_solvers.engines import as_array
 
 
 def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """Draw from `jax.random.normal`: the first of a power of two of draws.
-
-    Fewer programs are then compiled than there are records of different length.
-    """
+    """Draw standard normal numbers with `jax.random.normal`. The number of draws is rounded up to a power of two, so
+    that fewer programs are compiled for records of different lengths."""
     number = math.prod(shape)
     return np.asarray(jax.random.normal(key, (1 << max(number - 1, 0).bit_length(),)))[:number].reshape(shape)
 
@@ -54,39 +52,41 @@ def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..
 def walk(
     key: Array, seconds: Float[np.ndarray, " T"], trend: float, deviation: float, number: int
 ) -> Float[np.ndarray, "T k"]:
-    """Logarithms (T, k) of k quantities that drift from 0 at time 0: `trend` per second, the same for all, and a random
-    walk of `deviation` per root of a second for each; `seconds` (T,) do not fall."""
+    """Logarithms (T, k) of `number` = k drifting quantities, 0 at time 0: a common `trend` per second, and an
+    independent random walk with standard `deviation` per √s for each. `seconds`: (T,), in ascending order."""
     steps = np.diff(seconds, prepend=0.0)
     normal = standard_normal(key, (len(steps), number))
     return trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(np.sqrt(steps)[:, None] * normal, axis=0)
 
 
 def gains(key: Array, spread: float, number: int) -> Float[np.ndarray, " M"]:
-    """Gains of `number` channels: log-normal about 1, `spread` the deviation of the logarithm."""
+    """Draw gains of `number` channels, log-normal about 1; `spread`: standard deviation of the logarithm."""
     return np.exp(spread * standard_normal(key, (number,)))
 
 
 def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """Independent normal noise, volts."""
+    """Draw independent normal noise with standard `deviation`, volts."""
     return deviation * standard_normal(key, shape)
 
 
 class Strain(NamedTuple):
-    """State of a material at m places: `held` w (m,) and the `late` branches y (k, m), pascals."""
+    """State of a material at m points, in pascals. **Fields**: `held`: (m,), output w of the hysteresis; `late`: (k,
+    m), states y of the delayed branches."""
 
     held: Float[np.ndarray, " m"]
     late: Float[np.ndarray, "k m"]
 
 
 def unstrained(material: Material, number: int) -> Strain:
-    """State of `number` places without earlier load."""
+    """State of a material at `number` points without earlier load."""
     return Strain(np.zeros(number), np.zeros((len(material.creep), number)))
 
 
 def advance(
     material: Material, strain: Strain, pressure: Float[np.ndarray, " m"], seconds: float
 ) -> tuple[Strain, Float[np.ndarray, " m"]]:
-    """Return the state and the effective pressure (m,), pascals, `seconds` after `strain`, under `pressure` (m,)."""
+    """Advance the state `strain` by a time step in `seconds` to `pressure` (m,); return the new state and the effective
+    pressure (m,), pascals."""
     held = np.maximum(pressure, np.minimum(strain.held, pressure / (1 - material.hysteresis)))
     shares, times = _branches(material)
     late = strain.late
@@ -99,33 +99,36 @@ def advance(
 
 
 def held_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
-    """Effective pressure (…) of a first load that came at once and has stayed for `seconds`; pascals."""
+    """Effective pressure (…), pascals, under a first load that was applied suddenly and held for `seconds`."""
     shares, times = _branches(material)
     return np.asarray(pressure) * (1 - np.sum(shares * np.exp(-seconds / times)))
 
 
 def _branches(material: Material) -> tuple[np.ndarray, np.ndarray]:
-    """Shares and time constants, seconds, of the branches (k, 1)."""
+    """Shares (k, 1) and time constants (k, 1), in seconds, of the creep branches."""
     pairs = np.array(material.creep, float).reshape(-1, 2)
     return pairs[:, :1], pairs[:, 1:]
 
 
-# The number of touches processed at once; the numbers of cells by which they are grouped; and the ratio of their extent
-# to the root of their area, above which their contacts are apart.
+# Number of touches processed at once; numbers of cells that separate groups of touches; and ratio of the extent of a
+# touch to the root of its area, above which its contacts are taken to be apart.
 _AT_ONCE, _CELLS, _APART = 1024, (128, 512, 2048), 3.0
-# Changes below this share of the greatest change of a touch are left out.
+# Changes below this share of the maximum change of a touch are neglected.
 _LEAST = 1e-6
 
 
 class PressedSkin(eqx.Module):
-    """A sheet, or a layer, of a material that is pressed; readings are exact, by low-rank changes of one factorisation.
+    """A sheet or layer of a material that is pressed. Voltages are exact; they are computed by low-rank updates of one
+    factorisation.
 
-    **Fields**: `model`, any forward model of a sheet, or of a layer whose top is at its greatest z; `material`;
-    `conductivity` at rest, S/m (2-D: S), also tensors, which presses scale; `gain` (M,) of every channel; `face` of a
-    curved layer that is pressed, "outer" or "inner".
+    - `model`: forward model of a sheet, or of a layer with its top at the maximum z.
+    - `material`: the material.
+    - `conductivity`: at rest, S/m (2-D: S); may be tensors, which are scaled by presses.
+    - `gain`: (M,), gain of each channel.
+    - `face`: pressed face of a curved layer, "outer" or "inner".
 
-    The sheet may be a surface in space, and the layer a shell: presses are then at (x, y, z), and their material's
-    support a `Foundation`.
+    The sheet may be a surface in space, and the layer a shell. Presses are then at (x, y, z), and the support of the
+    material must be a `Foundation`.
     """
 
     model: ForwardModel
@@ -143,10 +146,10 @@ class PressedSkin(eqx.Module):
         conductivity: ArrayLike | None = None,
         face: str = "outer",
     ):
-        """Create a skin whose gains are drawn from `key`.
+        """Create a skin with random gains drawn with `key`.
 
-        `conductivity` at rest, S/m (2-D: S): the material's unless given. `face`: as in
-        `jeit.design.Skin.touched_face`. Raises `ValueError` for what is no key, model, material, conductivity or face.
+        `conductivity`: at rest, S/m (2-D: S); default: that of the material. `face`: as in
+        `jeit.design.Skin.touched_face`. Raises `ValueError` for invalid arguments.
         """
         check_key(key)
         check_model(model)
@@ -159,7 +162,7 @@ class PressedSkin(eqx.Module):
         self.gain = gains(key, material.gain_spread, model.protocol.num_measurements)
 
     def rest(self) -> Float[np.ndarray, " M"]:
-        """Voltages (M,) of the untouched skin without disturbances, as its channels read them."""
+        """Voltages (M,) of the untouched skin with gains, but without drift and noise."""
         return self.gain * self._at_rest
 
     def frames(
@@ -173,10 +176,10 @@ class PressedSkin(eqx.Module):
     ) -> Float[np.ndarray, "n M"]:
         """Simulate the voltages (n, M) of n touches of a skin without earlier load.
 
-        `presses`: one press for each touch, or a tuple of several at once. `held`: seconds that the load has been
-        there. `elapsed`: seconds since the skin was as its model says, over which it drifts, once for all these frames.
-        `progress` is called with a description of the progress. Raises `ValueError` for presses off the skin or through
-        it, and what is no press or time.
+        `presses`: for each touch, a press or a tuple of simultaneous presses. `held`: duration of the load, seconds.
+        `elapsed`: time during which the skin has drifted, seconds, the same for all frames. `progress` is called with a
+        description of the progress. Raises `ValueError` for presses off the skin or through it, and for invalid
+        arguments.
         """
         check_key(key)
         check_seconds("held", held)
@@ -191,7 +194,8 @@ class PressedSkin(eqx.Module):
         held: float = 1.0,
         progress: Callable[[str], None] | None = None,
     ) -> TouchedCells:
-        """The cells whose conductivity n touches change, and by how much; as of `frames`, whose errors it raises."""
+        """Cells whose conductivity is changed by n touches, and their relative changes. Arguments as in `frames`.
+        Raises `ValueError` as `frames`."""
         touches = touches_of(presses)
         pressed = pressed_cells(Samples.of(self.model.mesh, self.face), self.material.support, touches, progress)
         change = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
@@ -206,11 +210,11 @@ class PressedSkin(eqx.Module):
         *,
         progress: Callable[[str], None] | None = None,
     ) -> Float[np.ndarray, "T M"]:
-        """Voltages (T, M) at times `seconds` (T,) of a skin under moving presses, a `MovingPress` or several at once,
-        or `[]`: nothing touches it.
+        """Simulate voltages (T, M) at times `seconds` (T,) of a skin under moving presses.
 
-        The skin has had no load before the first frame, and drifts from time 0. Raises `ValueError` for times that are
-        negative or fall, motions of other lengths, and as `frames` does. `progress` is called with how far it is.
+        `motions`: a `MovingPress`, a list of simultaneous ones, or `[]` for an untouched skin. The skin has had no load
+        before the first frame, and drifts from time 0. `progress` is called with a description of the progress. Raises
+        `ValueError` for times that are negative or decrease, for motions of other lengths, and as `frames`.
         """
         check_key(key)
         seconds = _check_times(seconds)
@@ -224,10 +228,10 @@ class PressedSkin(eqx.Module):
         *,
         progress: Callable[[str], None] | None = None,
     ) -> list[Float[np.ndarray, "T M"]]:
-        """Simulate the voltages (T, M) of each of several recordings, pairs of motions and times, as in `record`.
+        """Simulate the voltages (T, M) of several recordings, given as pairs of motions and times as in `record`.
 
-        Each recording begins with this skin; they are processed together, which is much faster where there are many.
-        Raises `ValueError` for what are no such pairs, and as `record` does.
+        Each recording begins with a skin without earlier load. Many recordings are processed together, which is much
+        faster than one by one. Raises `ValueError` for elements that are not pairs, and as `record`.
         """
         check_key(key)
         wanted = "a list of pairs of motions and seconds, one for each recording"
@@ -251,8 +255,8 @@ class PressedSkin(eqx.Module):
         *,
         progress: Callable[[str], None] | None = None,
     ) -> TouchedCells:
-        """The cells whose conductivity changes in each of T frames, also by earlier loads; as of `record`, whose errors
-        it raises."""
+        """Cells whose conductivity is changed in each of T frames, also by earlier loads, and their relative changes.
+        Arguments as in `record`. Raises `ValueError` as `record`."""
         seconds = _check_times(seconds)
         motions = motions_of(motions, len(seconds))
         found = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
@@ -275,9 +279,9 @@ class PressedSkin(eqx.Module):
     def voltages_under(
         self, touched: TouchedCells, *, progress: Callable[[str], None] | None = None
     ) -> Float[np.ndarray, "n M"]:
-        """Voltages (n, M) of the model under n touches, undisturbed.
+        """Voltages (n, M) of the model under n touches, without gains, drift and noise.
 
-        `progress` is called with the number of touches done. Raises as `touch_changes` does.
+        `progress` is called with the number of touches done. Raises as `touch_changes`.
         """
         done = 0
         voltages = np.tile(self._at_rest, (len(touched.places), 1))
@@ -297,10 +301,10 @@ class PressedSkin(eqx.Module):
     def read(
         self, key: Array, exact: Float[np.ndarray, "n M"], seconds: Float[np.ndarray, " t"]
     ) -> Float[np.ndarray, "n M"]:
-        """Readings of exact voltages at `seconds` (n,), or (1,) for all, with drift, gains and noise, volts.
+        """Add drift, gains and noise to exact voltages (n, M) at times `seconds`, (n,) or (1,) for all; return volts.
 
-        A sheet of e^d σ with contacts e^c z has the voltages of one of σ with contacts e^(c + d) z, over e^d; the
-        effect of contacts is linearised about the skin at rest. Raises `ValueError` for what is no key.
+        Voltages for conductivity e^d σ and contact impedances e^c z are those for σ and e^(c + d) z, divided by e^d.
+        The effect of contacts is linearised about the skin at rest. Raises `ValueError` for an invalid key.
         """
         check_key(key)
         for_conductivity, for_contacts, for_noise = jax.random.split(key, 3)
@@ -315,17 +319,18 @@ class PressedSkin(eqx.Module):
 
     @property
     def _dimension(self) -> int:
-        """Dimension of the places of presses."""
+        """Number of coordinates of the positions of presses."""
         return 3 if is_curved(self.model.mesh) else 2
 
     @cached_property
     def _at_rest(self) -> Float[np.ndarray, " M"]:
-        """Voltages of the model at rest."""
+        """Voltages (M,) of the model at rest."""
         return np.asarray(self.model.voltages(self.conductivity))
 
     @cached_property
     def _contact_slope(self) -> Float[np.ndarray, "L M"]:
-        """∂v/∂log z (L, M) of the skin at rest, volts; none for points."""
+        """Derivative ∂v/∂log z (L, M) of the voltages at rest by the logarithms of the contact impedances, volts; zero
+        for point electrodes."""
         electrodes, protocol = self.model.electrodes, self.model.protocol
         if electrodes.is_point:
             return np.zeros((electrodes.num_electrodes, protocol.num_measurements))
@@ -335,7 +340,7 @@ class PressedSkin(eqx.Module):
 
 
 def _touched(places, cells, change, number: int) -> TouchedCells:
-    """The changes that are not negligible, as `TouchedCells`, the first of each row."""
+    """Collect the changes that are not negligible as `TouchedCells`, padded with zeros at the end of each row."""
     kept = np.abs(change) > _LEAST * np.abs(change).max(axis=1, keepdims=True)
     rows, there = padded([row[one] for row, one in zip(cells, kept, strict=True)])
     wide = _even(rows.shape[1]) - rows.shape[1]
@@ -346,7 +351,7 @@ def _touched(places, cells, change, number: int) -> TouchedCells:
 
 
 def _together(each: Sequence[TouchedCells]) -> TouchedCells:
-    """Concatenate the touched cells of one skin, padded with zeros at the ends of their rows."""
+    """Concatenate the touched cells of several recordings, padded with zeros at the end of each row."""
     wide = max(one.cells.shape[1] for one in each)
 
     def joined(name: str) -> Array:
@@ -358,10 +363,10 @@ def _together(each: Sequence[TouchedCells]) -> TouchedCells:
 
 
 def _kinds(mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, "n c"]) -> list[np.ndarray]:
-    """Group the touches that change anything by similar cost.
+    """Group touches by similar cost, and return the numbers of the touches in each group.
 
-    Returns the numbers of the touches of each group: by how many cells they have, and whether these lie together or, of
-    several contacts, apart.
+    Groups differ in the number of touched cells, and in whether these are close together or form contacts that are
+    apart. Touches without changes are left out.
     """
     there = change != 0
     number = there.sum(axis=1)
@@ -374,12 +379,12 @@ def _kinds(mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, 
 
 
 def _even(number: int) -> int:
-    """The least of 16, 32, 64 … that is not less: JAX compiles for every number of touches and of cells."""
+    """Round up to a power of two, at least 16, since JAX compiles a program for every number of touches and cells."""
     return 2 ** max(4, (number - 1).bit_length())
 
 
 def check_seconds(name: str, value) -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no time from zero on."""
+    """Check that the argument `name` is a time in seconds, zero or more. Raises `ValueError` otherwise."""
     if not (is_number(value) and value >= 0):
         raise ValueError(f"{name} must be seconds, zero or more; it is {describe(value)}.")
 

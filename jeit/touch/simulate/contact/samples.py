@@ -1,4 +1,5 @@
-"""Points on the cells of a skin at which pressure is computed, in the frames of presses."""
+"""Sample points on the cells of a skin at which pressure is computed, and their coordinates in the frames of
+presses."""
 
 from __future__ import annotations
 
@@ -14,20 +15,22 @@ from jeit.mesh import Mesh, check_flat, measures
 from jeit.mesh.geodesic import Triangles
 from jeit.touch.simulate.contact.press import Press
 
-# Barycentric coordinates in a cell are multiples of 1 / (lattice + 1), moved inwards by the same for all.
+# Lattice n of the samples in a cell: barycentric coordinates are (i + 1/k) / (n + 1) with integers i of sum n, for a
+# cell with k corners.
 _LATTICE = 2
-# Cosine of the angle between a curved skin and a press, from which on it is beneath; what is within a distance of the
-# press's axis is then within 1 / cos(60° / 2) times as much of the place pressed, on a ball.
+# Minimum cosine of the angle between the normal of a curved skin and that at the press, for the skin to be beneath the
+# indenter. On a ball, the distance of a point from the place pressed is then at most 1 / cos(60° / 2) times its
+# distance from the axis of the press.
 _BENEATH, _CHORD = 0.5, 1.2
-# Of the z axis along a normal, from which on "up" in the plane that touches a curved skin is along y.
+# Minimum z component of a normal, above which "up" in the tangent plane of a curved skin is along y.
 _LEVEL = 0.866
-# The greatest distance of a press from the surface, relative to its largest triangle.
+# Maximum distance of a press from the surface, relative to the root of the area of its largest triangle.
 _OFF = 0.5
 
 
 class Curved(NamedTuple):
-    """Of a curved skin: the `surface` that is touched, normals (m, k, 3) of it where the cells' `corners` are, and
-    (m, 3) where the cells are."""
+    """Geometry of a curved skin. **Fields**: `surface`: the touched surface; `corners`: (m, k, 3), its unit normals at
+    the corners of cells; `cells`: (m, 3), its unit normals at the cells."""
 
     surface: Triangles
     corners: Float[np.ndarray, "m k 3"]
@@ -35,9 +38,14 @@ class Curved(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Places (m, s, d) on m cells of a skin, in the plane or on the surface that is touched, metres; the `area` (m,)
-    that each of a cell's stands for, m²; the radius of the largest cell, metres; where the cells' `corners` (m, k, d)
-    are there; and what is known of a `curved` skin, None of a flat one."""
+    """Sample points on m cells of a skin, in the plane or on the touched surface.
+
+    - `points`: (m, s, d), sample points, metres.
+    - `area`: (m,), area per sample of each cell, m².
+    - `radius`: radius of the largest cell, metres.
+    - `corners`: (m, k, d), corners of the cells, projected onto the plane or the touched surface, metres.
+    - `curved`: geometry of a curved skin; None for flat skins.
+    """
 
     points: Float[np.ndarray, "m s d"]
     area: Float[np.ndarray, " m"]
@@ -47,8 +55,8 @@ class Samples(NamedTuple):
 
     @classmethod
     def of(cls, mesh: Mesh, face: str = "outer") -> "Samples":
-        """Of a sheet, or of a layer, whose cells are all pressed as the skin above them is: of a curved one that on
-        its `face`."""
+        """Create the samples of a sheet or a layer. The cells of a layer are pressed like the surface above them, in a
+        curved layer like its `face`."""
         if is_curved(mesh):
             return cls._of_curved(mesh, face)
         check_flat(mesh, "these presses")
@@ -66,19 +74,20 @@ class Samples(NamedTuple):
         corners, normals = feet.points[cells], surface.normals_at(feet)[cells]
         above = surface.nearest(corners.mean(axis=1)).triangle
         points = _rounded(corners, normals, _LATTICE)
-        # Of a layer, cells beneath a triangle share its area by their volumes.
+        # In a layer, the area of a triangle of the surface is divided among the cells beneath it by their volumes.
         share = size / np.bincount(above, size, len(surface.cells))[above]
         area = share * surface.areas[above] / points.shape[1]
         return cls(points, area, _radius(corners), corners, Curved(surface, normals, surface.normals[above]))
 
     def on(self, cells: Int[np.ndarray, " c"], number: int) -> Float[np.ndarray, "c s d"]:
-        """Places in some of the cells, more of them the greater `number` is."""
+        """Sample points (c, s, d) in the given cells, on a lattice whose fineness increases with `number`."""
         if self.curved is None:
             return lattice(self.corners[cells], number)
         return _rounded(self.corners[cells], self.curved.corners[cells], number)
 
     def check(self, presses: Sequence[Press]) -> None:
-        """Raise `ValueError` for presses whose places have another dimension, or are off a curved skin."""
+        """Check the positions of presses. Raises `ValueError` for positions with another number of coordinates, and for
+        positions off a curved skin."""
         dimension, kind = self.points.shape[-1], "flat" if self.curved is None else "curved"
         for press in presses:
             if len(press.position) != dimension:
@@ -99,7 +108,7 @@ class Samples(NamedTuple):
             )
 
     def near(self, presses: Sequence[Press], cells: Sequence) -> list[Int[np.ndarray, " c"]]:
-        """Those of the cells of each press that face it: a sleeve's far side does not."""
+        """Select the cells of each press that face it, unlike the far side of a sleeve."""
         if self.curved is None:
             return [np.asarray(own, int) for own in cells]
         towards = _frames(self.curved.surface, presses)[1][:, 2]
@@ -108,15 +117,16 @@ class Samples(NamedTuple):
 
     @property
     def chord(self) -> float:
-        """How far from a press places may be, straight through space, for each metre from its axis."""
+        """Maximum ratio of the distance of a point from the place pressed to its distance from the axis of the
+        press."""
         return 1.0 if self.curved is None else _CHORD
 
     def seen(self, presses: Sequence[Press], cells: Int[np.ndarray, "b c"], points: Float[np.ndarray, "b q d"]):
-        """Places in the frames of the presses' indenters (b, q, 2); how far below the plane through the place pressed
-        each is (b, q), 0 on a flat skin; and what shares of the cells' areas (b, c) are seen from the indenter.
+        """Transform points to the frames of indenters, which move along the inward normal at the place pressed.
 
-        An indenter comes straight down, along the inward normal at the place pressed, so that what is beneath a point
-        of it is what that line meets: of a surface that falls away it is farther down.
+        Returns the coordinates of the points in the frames (b, q, 2); their distance (b, q) below the tangent plane at
+        the place pressed, 0 on a flat skin; and the ratio (b, c) of the area of each cell as projected along the normal
+        to its area.
         """
         cos, sin = (function([press.angle for press in presses])[:, None] for function in (np.cos, np.sin))
         if self.curved is None:
@@ -130,7 +140,7 @@ class Samples(NamedTuple):
 
 
 def lattice(corners: Float[np.ndarray, "m k d"], number: int) -> Float[np.ndarray, "m s d"]:
-    """Places (m, s, d) in cells of these corners, spread evenly; more of them the greater `number` is."""
+    """Evenly spaced points (m, s, d) in cells with the given corners; their number s increases with `number`."""
     return np.einsum("sk,mkd->msd", _weights(corners.shape[1], number), corners)
 
 
@@ -140,21 +150,25 @@ def _weights(size: int, number: int) -> Float[np.ndarray, "s k"]:
 
 
 def _rounded(corners, normals, number: int) -> Float[np.ndarray, "m s 3"]:
-    """Places of the `lattice`, moved from the triangles onto the surface that they stand for."""
+    """Points of the `lattice`, moved from flat triangles onto the curved surface that they approximate."""
     weights = _weights(corners.shape[1], number)
     return rounded(np.einsum("sk,mkd->msd", weights, corners), weights, corners[:, None], normals[:, None])
 
 
 def rounded(points, weights, corners, normals) -> Float[np.ndarray, "... 3"]:
-    """Points (…, 3) of flat triangles with `weights` (…, k) of `corners` (…, k, 3), on the curved surface whose unit
-    `normals` (…, k, 3) there are: half of the way to where the planes that touch it at the corners are, exact to second
-    order (Boubekeur and Alexa, Phong tessellation, ACM Transactions on Graphics 27(5), 2008, at 1/2)."""
+    """Move points (…, 3) of flat triangles onto the curved surface with unit `normals` (…, k, 3) at the `corners`
+    (…, k, 3); `weights`: (…, k), barycentric coordinates of the points.
+
+    Points are moved half of the way to the interpolated projections onto the tangent planes at the corners, which is
+    exact to second order (Boubekeur and Alexa, Phong tessellation, ACM Transactions on Graphics 27(5), 2008, at 1/2).
+    """
     below = np.sum((corners - points[..., None, :]) * normals, axis=-1)
     return points + np.einsum("...k,...k,...kd->...d", weights / 2, below, normals)
 
 
 def _frames(surface: Triangles, presses: Sequence[Press]):
-    """Places pressed (b, 3) and axes there (b, 3, 3): to the right, up and out, as one sees the skin with z upwards."""
+    """Points pressed (b, 3) and axes of the frames there (b, 3, 3): right, up and outwards, as seen from outside with z
+    upwards."""
     at = surface.nearest(np.array([press.position for press in presses]))
     corners = surface.cells[at.triangle]
     origin = rounded(at.points, at.weights, surface.points[corners], surface.node_normals[corners])

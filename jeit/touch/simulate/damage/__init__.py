@@ -1,7 +1,7 @@
-"""Simulate damage of skins: cuts, electrodes that fail, and repair.
+"""Simulation of damaged skins: cuts, faulty electrodes, and repair.
 
-Voltages are computed for the damaged conductivity, on a mesh that is fine along the cut; readings have the drift, gains
-and noise of the material, which continue through the damage.
+Voltages are computed for the conductivity of the damaged skin, on a mesh that is fine along the cut. Readings include
+the drift, gains and noise of the material, which continue when damage occurs.
 """
 
 from __future__ import annotations

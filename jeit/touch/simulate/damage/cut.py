@@ -1,4 +1,4 @@
-"""Cuts of a skin, and their repair."""
+"""Cuts in a skin, and their repair."""
 
 from __future__ import annotations
 
@@ -16,20 +16,24 @@ from jeit.forward.system import check_conductivity
 from jeit.mesh import Domain, Mesh, Refine, centroids, check_flat, measures
 from jeit.touch.simulate.contact import Material
 
-# The number of directions tried for a cut before another place; and the turn of a bent one, radians.
+# Maximum number of random cuts that are tried; minimum and maximum angle of a bend, in radians.
 _TRIES, _LEAST_BEND, _MOST_BEND = 400, 0.35, 1.2
 
 
 class Cut(eqx.Module):
-    """A slit along `path` (k, 2), metres, to a `depth`, its share of the thickness, 1 for all of it; what is cut
-    conducts `residual` times as well as before."""
+    """A cut in a skin.
+
+    **Fields**: `path`: (k, 2) vertices in metres; `depth`: depth of the cut as a share of the thickness, 1 for a cut
+    through the skin; `residual`: factor by which the conductivity of the cut cells is multiplied.
+    """
 
     path: Float[np.ndarray, "k 2"]
     depth: float
     residual: float
 
     def __init__(self, path: ArrayLike, depth: float = 1.0, residual: float = 1e-6):
-        """Raises `ValueError` for a path of fewer than two places, or of no length, and shares that are none."""
+        """Create a cut. Raises `ValueError` for a path with fewer than two vertices or with a segment of zero length,
+        and for a depth or residual out of range."""
         path = real_array("path", path, "places (k, 2), metres, two or more")
         if path.ndim != 2 or path.shape[1] != 2 or len(path) < 2 or not np.isfinite(path).all():
             raise ValueError(f"path must be finite places (k, 2), metres, two or more; it has shape {path.shape}.")
@@ -47,15 +51,16 @@ class Cut(eqx.Module):
         return float(np.linalg.norm(np.diff(self.path, axis=0), axis=1).sum())
 
     def refine(self, cell_size: float = 1e-3) -> Refine:
-        """For a mesh that is fine along the cut: `Rectangle(…).mesh(num_points=n, refine=cut.refine())`.
+        """Refinement of a mesh along the cut: `Rectangle(…).mesh(num_points=n, refine=cut.refine())`.
 
-        `cell_size` in metres. Raises `ValueError` for one that is none.
+        `cell_size` in metres. Raises `ValueError` for a size that is not positive.
         """
         check_metres("cell_size", cell_size)
         return Refine(self.along(cell_size), cell_size=cell_size)
 
     def along(self, step: float) -> Float[np.ndarray, "n 2"]:
-        """Places (n, 2) on the path, no more than `step` metres apart. Raises `ValueError` for a step that is none."""
+        """Points (n, 2) on the path, at most `step` metres apart. Raises `ValueError` for a step that is not
+        positive."""
         check_metres("step", step)
         pieces = [
             np.linspace(start, end, max(2, int(np.ceil(np.linalg.norm(end - start) / step)) + 1))
@@ -64,9 +69,9 @@ class Cut(eqx.Module):
         return np.concatenate([piece[:-1] for piece in pieces] + [self.path[-1:]])
 
     def cells(self, mesh: Mesh) -> Int[np.ndarray, " c"]:
-        """Numbers of the cells that the cut goes through, seen from above; in a layer, all those to its depth.
+        """Numbers of the cells that the cut crosses, seen from above; in a layer, down to the depth of the cut.
 
-        Raises `ValueError` for what is no mesh, and for a cut that misses it.
+        Raises `ValueError` for an argument that is not a flat mesh, and for a cut that crosses no cell.
         """
         check_kind("mesh", mesh, Mesh, "a Mesh, that of the skin")
         check_flat(mesh, "cuts")
@@ -85,12 +90,12 @@ class Cut(eqx.Module):
     def conductivity(
         self, mesh: Mesh, conductivity: ArrayLike, thickness: float | None = None
     ) -> Float[np.ndarray, " m"]:
-        """Conductivity (m,) of the skin with the cut, S/m (2-D: S), from that without.
+        """Conductivity (m,) of the skin with the cut, S/m (2-D: S), computed from that without the cut.
 
-        A layer's cells to the depth of the cut conduct next to nothing. A sheet of `thickness` metres that is cut to a
-        part of it resists across the cut as if it were longer by (4h/π) ln csc(πr/2h), with the depth r that is left of
-        the thickness h: the blockage of a diaphragm in a channel (Lamb, Hydrodynamics, 6th edition, §306). Raises
-        `ValueError` for a conductivity that is none, and for a part of a sheet's depth without its thickness.
+        The cells of the cut are multiplied by `residual`. In a sheet of `thickness` h metres that is cut in part, with
+        a remaining thickness r, the resistance across the cut is that of a sheet longer by (4h/π) ln csc(πr/2h), as for
+        a diaphragm in a channel (Lamb, Hydrodynamics, 6th edition, §306). Raises `ValueError` for an invalid
+        conductivity, and for a partial cut of a sheet without its thickness.
         """
         values = np.asarray(check_conductivity(mesh, conductivity))
         if values.ndim > 1 or np.iscomplexobj(values) or values.size not in (1, mesh.num_cells):
@@ -117,10 +122,11 @@ def draw_cut(
     bent: float = 0.5,
     margin: float = 5e-3,
 ) -> Cut:
-    """A cut somewhere in an `outline`, all of it `margin` metres from its edge: of uniform length between the two,
-    metres, in any direction, bent once with a chance of `bent`, by 20 to 70 degrees.
+    """Draw a random cut inside an `outline`, more than `margin` metres from its edge.
 
-    Raises `ValueError` for what is no key or outline, lengths that are none, and a skin that is too small for them.
+    The length is uniform between the minimum and maximum `length`, in metres, and the direction is uniform. With
+    probability `bent`, the cut has one bend of 20 to 70 degrees. Raises `ValueError` for invalid arguments, and if the
+    skin is too small for the cut.
     """
     check_key(key)
     check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
@@ -146,7 +152,7 @@ def draw_cut(
 
 
 def _cross(start, end, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Whether lines from `first` to `second` (m, 2) cross that from `start` to `end`."""
+    """Whether the segments from `first` to `second` (m, 2) cross the segment from `start` to `end`."""
     along, edge = end - start, second - first
     one, other = _turn(along, first - start), _turn(along, second - start)
     return (one * other <= 0) & (_turn(edge, start - first) * _turn(edge, end - first) <= 0)
@@ -156,17 +162,19 @@ def _turn(first, second) -> np.ndarray:
     return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
 
 
-# Park et al. (2022), figure S13, show more hysteresis after repair, without a figure: chosen, half as much again.
+# Factor of the hysteresis after a repair. Park et al. (2022), figure S13, show an increase without a number; 1.5 is an
+# assumption.
 _MORE = 1.5
 
 
 def mended(
     mesh: Mesh, conductivity: ArrayLike, cut: Cut, material: Material, share: float = 1.0
 ) -> tuple[Float[np.ndarray, " m"], Material]:
-    """Conductivity (m,) of a skin whose cut was glued, S/m (2-D: S), and its material.
+    """Conductivity (m,) of a skin whose cut was repaired, S/m (2-D: S), and its material.
 
-    `conductivity` of the skin before the cut, of which what was cut has `share` again, about 0.9 to 1.1; the material
-    has half as much hysteresis again. Raises `ValueError` for what is no cut, material or share, and as `Cut.cells`.
+    `conductivity`: that of the skin before the cut, S/m (2-D: S); `share`: factor of the conductivity of the repaired
+    cells, about 0.9 to 1.1. The hysteresis of the material is multiplied by 1.5, up to 0.9. Raises `ValueError` for
+    invalid arguments, and as `Cut.cells`.
     """
     check_kind("cut", cut, Cut, "the Cut that was mended")
     check_kind("material", material, Material, 'a Material, such as material("hydrogel")')

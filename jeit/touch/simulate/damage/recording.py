@@ -1,4 +1,4 @@
-"""Recordings of skins that are damaged, with faults of electrodes."""
+"""Simulated recordings of damaged skins and of skins with faulty electrodes."""
 
 from __future__ import annotations
 
@@ -18,23 +18,25 @@ from jeit.touch.simulate.contact import MovingPress, PressedSkin
 
 FaultKind = Literal["dead", "loose", "torn"]
 FAULTS: tuple[FaultKind, ...] = ("dead", "loose", "torn")
-# Contact impedance of a dead electrode, relative to before; the limit of the source's voltage, relative to the greatest
-# that it drives at rest.
+# Factor of the contact impedance of a dead electrode; and limit of the source's voltage, relative to its maximum for
+# the skin at rest.
 _DEAD, _RAIL = 1e7, 5.0
-# A loose contact fluctuates between these factors, its logarithm with this time constant in seconds; the number of
-# levels at which it is solved.
+# Minimum and maximum factor of the impedance of a loose contact; time constant of the fluctuations of its logarithm, in
+# seconds; number of levels for which voltages are solved.
 _LOOSE, _WANDERING, _LEVELS = (10.0, 1000.0), 0.5, 7
-# Voltage picked up by a wire that hangs in the air, relative to the root mean square of all voltages.
+# Voltage picked up by a disconnected wire, relative to the root mean square of all voltages.
 _STRAY = 0.02
 
 
 class ElectrodeFault(eqx.Module):
-    """What happens to an `electrode` (its number, from 0).
+    """A fault of an electrode.
 
-    **Fields**: `kind`, one of `FAULTS`. "dead": its contact impedance is 10⁷ times as large; what it drives, the source
-    cannot, which gives out at five times the greatest voltage at rest, and what it measures floats. "loose": its
-    contact impedance is 10 to 1,000 times as large, and wanders within half a second. "torn": no current and no
-    voltage; its channels read what a wire picks up, or a constant `rail`, volts, if that is given.
+    - `electrode`: its number, from 0.
+    - `kind`: one of `FAULTS`. "dead": the contact impedance is multiplied by 10⁷, the source is limited to five times
+      its maximum voltage at rest, and measurements on the electrode read only noise. "loose": the factor of the contact
+      impedance fluctuates between 10 and 1,000, with a time constant of half a second. "torn": the electrode is
+      disconnected; its channels read noise, or the constant `rail`.
+    - `rail`: constant reading of the channels of a torn electrode, volts, or None.
     """
 
     electrode: int
@@ -42,7 +44,7 @@ class ElectrodeFault(eqx.Module):
     rail: float | None = None
 
     def __check_init__(self):
-        """Raises `ValueError` for an electrode or a kind that there is not, and a rail that is no voltage."""
+        """Check the fields. Raises `ValueError` for an invalid electrode, kind or rail."""
         if not (isinstance(self.electrode, (int, np.integer)) and self.electrode >= 0):
             raise ValueError(f"electrode must be its number, from 0; it is {describe(self.electrode)}.")
         check_name("kind", self.kind, FAULTS)
@@ -52,10 +54,10 @@ class ElectrodeFault(eqx.Module):
     def changes(
         self, key: Array, model: ForwardModel, conductivity: ArrayLike, seconds: Float[np.ndarray, " T"]
     ) -> Float[np.ndarray, "T M"]:
-        """Differences of the voltages (T, M) of a skin at rest from those without the fault, at `seconds` (T,), volts.
+        """Change of the voltages (T, M) of a skin at rest due to the fault, at times `seconds` (T,), volts.
 
-        `conductivity` of the skin, S/m (2-D: S). Raises `ValueError` for what is no key or model, an electrode that it
-        lacks, and times that are none.
+        `conductivity` of the skin, S/m (2-D: S). Raises `ValueError` for invalid arguments, and for an electrode that
+        the model does not have.
         """
         check_key(key)
         check_model(model)
@@ -86,7 +88,7 @@ class ElectrodeFault(eqx.Module):
         return model.with_electrodes(worse)
 
     def _driven(self, model: ForwardModel, conductivity) -> Float[np.ndarray, " M"]:
-        """Voltages (M,) with a dead electrode, from a source of limited voltage."""
+        """Voltages (M,) with a dead electrode and a source of limited voltage."""
         before, after = (np.asarray(one.transfer_impedance(conductivity)) for one in (model, self._worse(model, _DEAD)))
         drive = np.asarray(model.protocol.drive)
         spans = [np.ptp(np.where(drive != 0, drive @ z.T, 0.0), axis=1) for z in (before, after)]
@@ -95,7 +97,8 @@ class ElectrodeFault(eqx.Module):
         return voltages * current[np.asarray(model.protocol.drive_index)]
 
     def _wandering(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
-        """Voltages (T, M) of a contact that fluctuates, solved at a few levels of its logarithm."""
+        """Voltages (T, M) for a fluctuating contact impedance, interpolated between solutions at a few levels of its
+        logarithm."""
         low, high = np.log(_LOOSE)
         levels = np.linspace(low, high, _LEVELS)
         solved = [np.asarray(self._worse(model, float(np.exp(one))).voltages(conductivity)) for one in levels]
@@ -106,7 +109,7 @@ class ElectrodeFault(eqx.Module):
             kept = np.exp(-step / _WANDERING) if number else 0.0
             now = kept * now + np.sqrt(1 - kept**2) * one
             place[number] = now
-        # Uniform in its logarithm: the quantile of a normal variable.
+        # The distribution function of the normal variable makes the logarithm uniformly distributed.
         share = np.asarray(jax.scipy.stats.norm.cdf(place)) * (_LEVELS - 1)
         below = np.minimum(share.astype(int), _LEVELS - 2)
         part = (share - below)[:, None]
@@ -115,20 +118,23 @@ class ElectrodeFault(eqx.Module):
 
 
 def check_fault(name: str, given) -> None:
-    """Raise `ValueError`, about the argument `name`, for what is no `ElectrodeFault`."""
+    """Check that the argument `name` is an `ElectrodeFault`. Raises `ValueError` otherwise."""
     check_kind(name, given, ElectrodeFault, 'an ElectrodeFault(3, "dead")')
 
 
 class Mishap(eqx.Module):
-    """From `time` on, seconds: the skin is `skin`, of the same model and gains, if that is given; and `fault`s are
-    there."""
+    """A change of a skin during a recording.
+
+    **Fields**: `time`: when it happens, seconds; `skin`: the skin from then on, with the same channels and gains, or
+    None for no change of the skin; `faults`: faults of electrodes from then on.
+    """
 
     time: float
     skin: PressedSkin | None = None
     faults: tuple[ElectrodeFault, ...] = ()
 
     def __check_init__(self):
-        """Raises `ValueError` for what is no time, skin or fault."""
+        """Check the fields. Raises `ValueError` for an invalid time, skin or fault."""
         if not (is_number(self.time) and self.time >= 0):
             raise ValueError(f"time must be seconds, zero or more; it is {describe(self.time)}.")
         if self.skin is not None:
@@ -145,11 +151,11 @@ def record_mishaps(
     seconds: Float[np.ndarray, " T"],
     mishaps: Sequence[Mishap],
 ) -> Float[np.ndarray, "T M"]:
-    """Simulate voltages (T, M) at `seconds` (T,) of a skin under moving presses, `[]` for none, through its mishaps.
+    """Simulate voltages (T, M) at times `seconds` (T,) of a skin under moving presses (`[]` for none) with mishaps.
 
-    From each mishap on, until the next, skin and faults are those of the mishap. Drift, gains and noise continue
-    through all of them. Every frame is solved anew, as a skin with another conductivity. Raises `ValueError` for what
-    are no mishaps, those of a skin with other channels, and as `PressedSkin.touched_in_time` does.
+    Each mishap sets the skin and the faults until the next one. Drift, gains and noise continue through all of them.
+    Every frame is solved with its own conductivity. Raises `ValueError` for invalid mishaps, for a skin with other
+    channels, and as `PressedSkin.touched_in_time`.
     """
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")
@@ -173,7 +179,7 @@ def record_mishaps(
         for fault_key, fault in enumerate(stage.faults):
             own = jax.random.fold_in(jax.random.fold_in(key, number), fault_key)
             exact[there] += fault.changes(own, now.model, now.conductivity, seconds[there])
-        # One key for every stage: their drift and noise are those of one recording.
+        # The same key for all stages, so that drift and noise continue through the recording.
         found[there] = now.read(key, exact, seconds)[there]
     return found
 
@@ -184,8 +190,8 @@ def exact_record(
     seconds: Float[np.ndarray, " T"],
     wanted: np.ndarray,
 ) -> Float[np.ndarray, "T M"]:
-    """Voltages (T, M) of the model, undisturbed, in the frames that are `wanted` (T,); at rest in the others. Raises
-    `ValueError` as `PressedSkin.touched_in_time` does."""
+    """Voltages (T, M) of the model without drift and noise in the `wanted` (T,) frames, and voltages at rest in the
+    others. Raises `ValueError` as `PressedSkin.touched_in_time`."""
     voltages = np.tile(np.asarray(skin.model.voltages(skin.conductivity)), (len(seconds), 1))
     if not np.any([np.any(motion.load) for motion in ([motions] if isinstance(motions, MovingPress) else motions)]):
         return voltages

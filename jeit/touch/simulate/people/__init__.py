@@ -1,4 +1,4 @@
-"""Simulate people who touch a skin: how each of them makes each of six gestures, and the skin's readings."""
+"""Simulation of people who touch a skin: how each person makes each of six gestures, and the readings of the skin."""
 
 from __future__ import annotations
 

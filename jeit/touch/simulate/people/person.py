@@ -1,13 +1,11 @@
-"""Simulated people who gesture on a skin: their manners, and their motion.
+"""Simulated people who make gestures on a skin: parameters of the gestures, and motion of the hand.
 
-How six gestures are made by most people: Table I of Silvera Tawil et al. (2011), its words as numbers.
-
-The table has words only: of area, intensity, displacement and duration. What number each stands for is chosen here,
-once, from everyday touch, and the same word is the same number in every gesture: a fingertip's contact is 7 mm in
-radius, a flat hand's through foam some 20; typing takes 1 N, resting fingers 2, a firm push 10; a knock is there for a
-seventh of a second, a caress for a second. A word that spans a range, such as small to large, spreads more from person
-to person. For in-plane displacement there is only yes: fingers stroke at some 0.1 m/s along a hand's length, and
-scratch to and fro, faster and less far.
+Table I of Silvera Tawil et al. (2011) describes how six gestures are usually made, in words for area, intensity,
+displacement and duration. The numbers for these words are assumptions from everyday touch, and the same for all
+gestures: the contact of a fingertip has a radius of 7 mm, that of a flat hand through foam about 20 mm; typing takes
+1 N, resting fingers 2 N, a firm push 10 N; a knock lasts 0.15 s, a caress about 1 s. Words for a range, such as small
+to large, have a larger spread among people. For displacement in the plane, the table only says yes: here fingers stroke
+at about 0.1 m/s over the length of a hand, and scratch back and forth, faster and over a shorter path.
 """
 
 from __future__ import annotations
@@ -26,23 +24,25 @@ from jeit.touch.simulate.contact.joined import Joined, Placed
 from jeit.touch.simulate.contact.press import MovingPress
 
 TRAITS = ("force", "radius", "duration", "speed", "path")
-"""Parameters of a touch: force, N; radius of a disc as large as its contact, m; duration, s; and of moving touches
-speed, m/s, and path, m, of a sweep."""
+"""Parameters of a touch: force, N; radius of a disc with the area of the contact, m; duration, s; and, for moving
+touches, speed, m/s, and length of the path of a sweep, m."""
 
-# Of each word: the median, and the deviation of its logarithm among people.
+# Median, and standard deviation of the logarithm among people, for each word. Units: m, N and s.
 _AREA = {"small": (7e-3, 0.2), "sm-large": (12e-3, 0.45), "med-large": (20e-3, 0.3)}
 _INTENSITY = {"low": (1.0, 0.3), "low-med": (2.0, 0.4), "med-high": (5.0, 0.4), "high": (10.0, 0.3)}
 _DURATION = {"short": (0.15, 0.3), "med-long": (1.2, 0.4)}
+# Standard deviation of the logarithm of speed and path among people.
 _MOVING = 0.35
-# Deviation of the logarithm of every trait between touches of one person.
+# Standard deviation of the logarithm of each parameter among touches of one person.
 _WITHIN = 0.25
 
 
 @dataclass(frozen=True)
 class Manner:
-    """How a gesture is made: the words of Table I for area, intensity and duration.
+    """Description of a gesture by the words of Table I.
 
-    Where it moves: also speed, m/s, and path of a sweep, m.
+    **Fields**: `area`, `intensity` and `duration`: words; `speed`: m/s, and `path`: length of a sweep, m, both 0 for
+    gestures that do not move.
     """
 
     area: str
@@ -53,22 +53,22 @@ class Manner:
 
     @property
     def medians(self) -> Float[np.ndarray, " 5"]:
-        """Medians of `TRAITS` among people, in SI units; 0 where it does not move."""
+        """Medians of `TRAITS` among people, in SI units; speed and path are 0 for gestures that do not move."""
         return np.array([*(one[0] for one in self._words), self.speed, self.path])
 
     @property
     def spread(self) -> Float[np.ndarray, " 5"]:
-        """Deviations of the logarithms of `TRAITS` among people."""
+        """Standard deviations of the logarithms of `TRAITS` among people."""
         return np.array([*(one[1] for one in self._words), _MOVING, _MOVING])
 
     @property
     def within(self) -> float:
-        """Deviation of their logarithms between touches of one person."""
+        """Standard deviation of the logarithms of `TRAITS` among touches of one person."""
         return _WITHIN
 
     @property
     def moves(self) -> bool:
-        """Whether it is displaced in the plane."""
+        """Whether the contact moves along the skin."""
         return self.path > 0
 
     @property
@@ -84,35 +84,39 @@ MANNERS: dict[str, Manner] = {
     "scratch": Manner("sm-large", "med-high", "med-long", speed=0.2, path=0.05),
     "slap": Manner("med-large", "high", "short"),
 }
-"""The six gestures, in the paper's order."""
+"""The six gestures by name, in the order of the paper."""
 
 GESTURES = tuple(MANNERS)
 """Names of the gestures."""
 
 
-# Seconds recorded before a touch, and the least after it; the number of frames is a multiple of the last.
+# Time recorded before a touch and minimum time after it, in seconds; the number of frames is a multiple of `_EVEN`.
 _BEFORE, _AFTER, _EVEN = 0.1, 0.5, 16
-# Pascals, more than a hand's pressure; metres of a hand's middle from the skin's edge, at least; metres that a hand
-# rolls which stays where it is; shares of a long touch in which its load comes and goes; how much a load wobbles.
+# Maximum mean pressure of a hand, Pa; minimum distance of its path from the edge of the skin, m; maximum path of a hand
+# that does not move along the skin but rolls, m; share of a long touch in which the load rises, and in which it falls;
+# relative amplitude of fluctuations of the load.
 _MOST_PRESSURE, _MARGIN, _ROLL, _RAMP, _WOBBLE = 120e3, 15e-3, 2e-3, 0.15, 0.08
-# The number of fingertips that scratch, and their distance over their radius; the reduction of their load where they
-# turn.
+# Number of fingertips of a scratch, their distance divided by their radius, and relative reduction of the load at the
+# turning points.
 _TIPS, _APART, _LIGHTER = 3, 2.6, 0.4
-# The number of places tried until a path lies on the skin, before it is made shorter, by this factor.
+# Number of random places tried for a path on the skin, and factor by which the path is then shortened.
 _TRIES, _SHORTER = 20, 0.8
 
 
 def gesture_motion(
     rng: np.random.Generator, gesture: str, traits: Float[np.ndarray, " 5"], outline: Domain, rate: float
 ) -> tuple[MovingPress, Float[np.ndarray, " T"]]:
-    """A gesture with these traits (`TRAITS`, SI units) anywhere on the skin, and the times of its frames, seconds, at
-    `rate` frames/s, from 0.1 s before it to 0.5 s after it, as the skin recovers late."""
+    """Simulate a gesture with the given `traits` (see `TRAITS`, SI units) at a random place on the skin.
+
+    Returns the press and the times (T,) of its frames, seconds, at `rate` frames/s, from 0.1 s before to 0.5 s after
+    the gesture, since the skin recovers slowly.
+    """
     force, radius, duration, speed, path = traits
     manner = MANNERS[gesture]
     force = min(force, _MOST_PRESSURE * np.pi * radius**2)
     frames = int(np.ceil((_BEFORE + duration + _AFTER) * rate))
     seconds = np.arange(_EVEN * -(-frames // _EVEN)) / rate
-    # Frames are not synchronised with touches.
+    # Touches begin at a random time between two frames.
     share = (seconds - _BEFORE - rng.uniform(0, 1) / rate) / duration
     within = (share > 0) & (share < 1)
     share = np.clip(share, 0, 1)
@@ -127,12 +131,12 @@ def gesture_motion(
         tip = radius / np.sqrt(_TIPS)
         offsets = _APART * tip * (np.arange(_TIPS) - (_TIPS - 1) / 2)
         indenter = Joined(*(Placed(Disc(2 * tip), (0.0, offset)) for offset in offsets))
-    # A hand may lie across the edge, but not beside the skin.
+    # The hand may extend over the edge of the skin, but its path lies on the skin.
     return MovingPress(indenter, load, place, angle), seconds
 
 
 def _loads(rng: np.random.Generator, share: np.ndarray, gesture: str, sweeps: int) -> np.ndarray:
-    """Load relative to its maximum, at shares of the duration."""
+    """Load relative to its nominal value, at times given as shares of the duration."""
     if MANNERS[gesture].duration == "short":
         return np.sin(np.pi * share)
     ramp = np.clip(np.minimum(share, 1 - share) / _RAMP, 0, 1)
@@ -145,7 +149,7 @@ def _loads(rng: np.random.Generator, share: np.ndarray, gesture: str, sweeps: in
 
 
 def _somewhere(rng: np.random.Generator, outline: Domain, length: float) -> tuple[np.ndarray, float, float]:
-    """Middle, angle and length of a straight path on the skin; a shorter one where none of the length is found."""
+    """Draw the middle, angle and length of a straight path on the skin; the length is reduced if no place is found."""
     low_x, high_x, low_y, high_y = map(float, outline.extent)
     while True:
         for _ in range(_TRIES):
@@ -158,17 +162,18 @@ def _somewhere(rng: np.random.Generator, outline: Domain, length: float) -> tupl
         length *= _SHORTER
 
 
-# Least distance, metres, of a hand's centre from the edge; a skin has room for it.
+# Minimum width and height of a skin for a hand, in metres.
 _LEAST_SIDE = 0.06
 
 
 class Person(eqx.Module):
-    """How one person makes the six gestures: the medians (6, 5) of `TRAITS` of their touches, `GESTURES` in rows."""
+    """A simulated person. **Fields**: `medians`: (6, 5), median of each of the `TRAITS` (columns) in touches of this
+    person, for each of the `GESTURES` (rows), in SI units."""
 
     medians: Float[np.ndarray, "6 5"]
 
     def __check_init__(self):
-        """Raises `ValueError` for other shapes, and what is negative or not finite."""
+        """Check the medians. Raises `ValueError` for another shape, and for negative or infinite values."""
         check_kind("medians", self.medians, np.ndarray, "an array (6, 5), such as of Person.draw(key)")
         if self.medians.shape != (len(GESTURES), len(TRAITS)):
             raise ValueError(f"medians have shape {self.medians.shape}; give ({len(GESTURES)}, {len(TRAITS)}).")
@@ -177,7 +182,8 @@ class Person(eqx.Module):
 
     @classmethod
     def draw(cls, key: Array) -> "Person":
-        """Draw a person: medians are log-normal about those of each gesture. Raises `ValueError` for what is no key."""
+        """Draw a random person, whose medians are log-normally distributed about those of each gesture. Raises
+        `ValueError` for an invalid key."""
         check_key(key)
         normal = np.asarray(jax.random.normal(key, (len(GESTURES), len(TRAITS))))
         manners = MANNERS.values()
@@ -187,11 +193,11 @@ class Person(eqx.Module):
     def touch(
         self, key: Array, gesture: str, outline: Domain, *, rate: float = 60.0
     ) -> tuple[MovingPress, Float[np.ndarray, " T"]]:
-        """Simulate a gesture by this person anywhere on a skin of this `outline`.
+        """Simulate a gesture of this person at a random place on a skin with this `outline`.
 
-        Returns the press, and the times (T,) of its frames, seconds, at `rate` frames/s, some before and after it.
-        Traits are log-normal about the person's own. Raises `ValueError` for what is no key, gesture, outline or rate,
-        and a skin too small for a hand.
+        Returns the press and the times (T,) of its frames, seconds, at `rate` frames/s, which begin before and end
+        after the touch. Traits are log-normally distributed about the medians of the person. Raises `ValueError` for
+        invalid arguments, and for a skin too small for a hand.
         """
         check_key(key)
         check_name("gesture", gesture, GESTURES)

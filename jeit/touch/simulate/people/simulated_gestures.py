@@ -1,4 +1,4 @@
-"""Simulated gestures of many people, one by one or as a stream."""
+"""Simulated gestures of many people, as separate recordings or as a stream."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from jeit.touch.simulate.contact.press import MovingPress
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin
 from jeit.touch.simulate.people.person import GESTURES, Person
 
-# Seconds since the reference, at most, in which a skin drifts; frames of the reference, and of the untouched skin: each
-# of so many drifts.
+# Maximum time since the reference, during which the skin drifts, in seconds; number of frames of the reference; number
+# of recordings of the untouched skin, each with its own drift; and number of frames of each.
 _LATEST, _REFERENCE, _DRIFTS, _FRAMES = 60.0, 60, 40, 16
-# The number of recordings simulated at once.
+# Number of recordings simulated at once.
 _AT_ONCE = 120
 
 
@@ -34,11 +34,11 @@ def simulate_gestures(
     rate: float = 60.0,
     progress: Callable[[str], None] | None = None,
 ) -> GestureSet:
-    """`each` times each of the `gestures` by each of the `people`, in this order, on a skin of this `outline`.
+    """Simulate `each` recordings of each of the `gestures` by each of the `people` on a skin with this `outline`.
 
-    The skin has drifted for up to a minute since its reference, and has had no load before. `rate`: frames/s.
-    `progress` is called with how far it is. Raises `ValueError` for what is no key, skin, person, gesture or number, no
-    people, and as `Person.touch` and `PressedSkin.record` do.
+    Before each recording, the skin has drifted for up to a minute since its reference, without load. `rate`: frames/s.
+    `progress` is called with a description of the progress. Raises `ValueError` for invalid arguments, and as
+    `Person.touch` and `PressedSkin.record`.
     """
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")
@@ -80,14 +80,20 @@ def simulate_gestures(
     )
 
 
-# Untouched seconds before the first gesture.
+# Time before the first gesture, in seconds.
 _FIRST = 2.0
 
 
 @dataclass(frozen=True)
 class GestureStream:
-    """F frames of M channels: `seconds` (F,), `voltages` (F, M), volts; and of its n touches the `gesture` (n,), whose
-    it was, `person` (n,), a number, and when a load began and ended, `onset` and `offset` (n,), seconds."""
+    """A stream of F frames of M channels with n touches.
+
+    - `seconds`: (F,), times of the frames.
+    - `voltages`: (F, M), volts.
+    - `gesture`: (n,), name of the gesture of each touch.
+    - `person`: (n,), number of the person who made it.
+    - `onset`, `offset`: (n,), first and last time with load of each touch, seconds.
+    """
 
     seconds: Float[np.ndarray, " F"]
     voltages: Float[np.ndarray, "F M"]
@@ -107,11 +113,11 @@ def simulate_gesture_stream(
     pause: float = 1.0,
     rate: float = 60.0,
 ) -> GestureStream:
-    """`number` gestures drawn at random, by people drawn at random, on a skin of this `outline` that nobody touches for
-    the first two seconds, and between them for `pause` seconds or more; `rate`: frames/s.
+    """Simulate a stream of `number` random gestures of random people on a skin with this `outline`.
 
-    The skin creeps and drifts all the while. Raises `ValueError` for what is no key, skin, person or number, and as
-    `Person.touch` and `PressedSkin.record` do.
+    The skin is not touched for the first two seconds, and for at least `pause` seconds between gestures. It creeps and
+    drifts throughout. `rate`: frames/s. Raises `ValueError` for invalid arguments, and as `Person.touch` and
+    `PressedSkin.record`.
     """
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")
