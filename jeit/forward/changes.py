@@ -106,23 +106,37 @@ class _Piece(NamedTuple):
     mass: Float[np.ndarray, "q k k"]
 
 
+def _pieces_alone(mesh: Mesh, electrodes: AbstractElectrodes, electrode: int) -> list[_Piece]:
+    """Contact mass of one electrode, for unit contact impedance, where electrodes share facets or cells."""
+    alone = np.where(np.arange(electrodes.num_electrodes) == electrode, 1.0, _OPEN)
+    contact = on_host(electrodes.with_contact_impedance(alone)).contact(mesh)
+    pieces = []
+    for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
+        touched = np.abs(mass).max(axis=(1, 2)) > 2 / _OPEN * np.abs(mass).max()
+        pieces.append(_Piece(np.asarray(nodes)[touched], np.asarray(mass)[touched]))
+    return pieces
+
+
 class ContactSensitivity:
     """Derivative ∂Z/∂ log z of the transfer impedance with respect to each contact impedance, on one mesh.
     `electrodes`: electrodes of the complete model; their positions and sizes are fixed."""
 
     def __init__(self, mesh: Mesh, electrodes: AbstractElectrodes):
-        self._pieces: list[list[_Piece]] = []
-        self._loads: list[Float[np.ndarray, " n"]] = []
         mesh, number = on_host(mesh), electrodes.num_electrodes
-        for electrode in range(number):
-            alone = np.where(np.arange(number) == electrode, 1.0, _OPEN)
-            contact = on_host(electrodes.with_contact_impedance(alone)).contact(mesh)
-            pieces = []
-            for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
-                touched = np.abs(mass).max(axis=(1, 2)) > 2 / _OPEN * np.abs(mass).max()
-                pieces.append(_Piece(np.asarray(nodes)[touched], mass[touched]))
-            self._pieces.append(pieces)
-            self._loads.append(contact.load[:, electrode])
+        whole = on_host(electrodes.with_contact_impedance(np.ones(number))).contact(mesh)
+        self._loads: list[Float[np.ndarray, " n"]] = list(np.asarray(whole.load).T)
+        self._pieces: list[list[_Piece]] = [[] for _ in range(number)]
+        for nodes, mass in zip(whole.nodes, whole.mass, strict=True):
+            nodes, mass = np.asarray(nodes), np.asarray(mass)
+            held = np.flatnonzero(np.abs(mass).max(axis=(1, 2)) > 0)
+            # An electrode that touches a facet or cell has a load at all of its nodes.
+            touches = (np.asarray(whole.load)[nodes[held]] != 0).all(axis=1)
+            if (touches.sum(axis=1) > 1).any():
+                self._pieces = [_pieces_alone(mesh, electrodes, one) for one in range(number)]
+                return
+            for electrode, pieces in enumerate(self._pieces):
+                own = held[touches[:, electrode]]
+                pieces.append(_Piece(nodes[own], mass[own]))
 
     def __call__(
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance

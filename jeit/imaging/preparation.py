@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -18,11 +19,13 @@ from jeit.data.imageable import FrameQuality, assess
 from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.electrodes import AbstractMovableElectrodes
 from jeit.forward import ForwardModel
 from jeit.imaging.wiring import Wiring, exchanges_message, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channels import electrode_misfits
+from jeit.inverse.placement import place_electrodes
 from jeit.mesh import Body, Mesh, OwnMesh, Solid
 from jeit_solvers.engines import as_array
 
@@ -73,6 +76,10 @@ _SHARP = 3.0
 # Misfit of an electrode, relative to that of the others, above which it counts as unlike them. In sound tanks the ratio
 # was at most 2.6.
 _UNLIKE = 3.0
+# Misfit of the reference up to which described electrode positions are taken as they are; standard deviation of these
+# positions, relative to the width of the body: 2° of a disk; and the ratio of misfits below which estimated positions
+# are used.
+_EXPLAINED, _MISPLACED, _BETTER = 0.01, 0.0175, 0.7
 
 
 @dataclass(frozen=True)
@@ -241,6 +248,7 @@ def calibrated_model(
         if contact is None and chosen == "each" and not calibration.distinguishes_contacts:
             chosen = "common"  # the data do not determine one impedance per electrode
             calibration = calibrate(model, voltages, mask=mask, contact=chosen)
+        calibration = _with_places(calibration, model, voltages, mask, chosen)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
             raise ValueError(
@@ -248,6 +256,26 @@ def calibrated_model(
                 "and are geometry and protocol right?"
             )
     return calibration, chosen
+
+
+def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, contact: str) -> Calibration:
+    """The calibration with electrode positions estimated along, where that explains the reference far better.
+
+    Described positions that explain it are kept, and so are they where a misfit has other causes: of a deep tank under
+    a model of two dimensions positions explain little.
+    """
+    movable = isinstance(model.electrodes, AbstractMovableElectrodes)
+    if not movable or np.iscomplexobj(voltages) or not float(calibration.misfit) > _EXPLAINED:
+        return calibration
+    width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+    try:
+        placed = place_electrodes(model, voltages, deviation=_MISPLACED * width, mask=mask)
+        again = calibrate(placed.model, voltages, mask=mask, contact=contact)
+    except ValueError:
+        return calibration
+    if not float(again.misfit) < _BETTER * float(calibration.misfit):
+        return calibration
+    return eqx.tree_at(lambda one: one.shift, again, as_array(placed.shift), is_leaf=lambda one: one is None)
 
 
 def select_frames(

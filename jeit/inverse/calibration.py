@@ -121,7 +121,8 @@ class Calibration(eqx.Module):
     complex if the voltages are; `voltages` (M,): voltages predicted by the fitted model; `misfit`: ‖predicted -
     measured‖ / ‖measured‖ over the channels used; `contact_deviation` (k,): standard deviations of the logarithms of
     the k fitted contact impedances, estimated from the residuals; `iterations`: number of iterations; `outcome`:
-    `Status.number` of how the fit ended; `reason`: a sentence on why it did not converge, empty if it did.
+    `Status.number` of how the fit ended; `reason`: a sentence on why it did not converge, empty if it did; `shift`
+    (L, a): displacements of electrodes whose positions were estimated (`jeit.inverse.placement`), metres, else None.
     """
 
     model: ForwardModel
@@ -132,6 +133,7 @@ class Calibration(eqx.Module):
     iterations: int | Int[Array, ""]
     outcome: int | Int[Array, ""]
     reason: str = eqx.field(static=True, default="")
+    shift: Float[Array, "L a"] | None = None
 
     @property
     def status(self) -> Status:
@@ -148,7 +150,14 @@ class Calibration(eqx.Module):
 
     @property
     def note(self) -> str:
-        """Sentence that explains a large misfit; empty if the misfit is not large."""
+        """Sentence on estimated electrode positions, or else on a large misfit; empty if there is neither."""
+        if self.shift is not None:
+            shift = 1e3 * np.linalg.norm(np.asarray(self.shift), axis=1)
+            return (
+                f"electrodes were estimated to be up to {shift.max():.2g} mm from where they are described (root mean "
+                f"square {np.sqrt(np.mean(shift**2)):.2g} mm), which explains the reference far better. If the "
+                "description is exact, look for another cause: contacts, channels, order."
+            )
         if not float(self.misfit) > _MUCH:
             return ""
         if self.model.mesh.dimension == 3:

@@ -1,0 +1,186 @@
+"""Electrode positions and contact impedances estimated from a reference frame.
+
+Electrodes are rarely exactly where a description says, and their contacts differ. A frame of the homogeneous body shows
+by how much: with shifts t of the electrodes along the ways in which they can move, contact impedances z = z₀ e^ζ and a
+conductivity σ, the estimate minimises
+
+    ½ ‖(v(σ, t, z) - y) / κn‖² + ½ ‖t / s‖² + ½ ζᵀ Γ⁻¹ ζ,
+
+n being the `relative_noise` of the channels, s the standard deviation of the positions before the data, and Γ the
+covariance of the logarithms of the contact impedances, which have a common part. κ is estimated from the residual.
+Derivatives need no further solve: at fixed fields only the energy of electrode l depends on t_l
+(`jeit.forward.changes`).
+
+Kolehmainen, Vauhkonen, Karjalainen and Kaipio, Physiological Measurement 18 (1997) 289, errors of electrode positions;
+Vilhunen, Kaipio, Vauhkonen, Savolainen and Vauhkonen, Measurement Science and Technology 13 (2002) 1848, contact
+impedances; Darde, Hyvönen, Seppänen and Staboulis, SIAM Journal on Imaging Sciences 6 (2013) 176, both at once.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jeit.electrodes.electrodes import AbstractMovableElectrodes
+from jeit.forward import ForwardModel
+from jeit.forward.changes import ContactSensitivity
+from jeit.forward.model import select_channels
+from jeit.inverse.channels import IndependentChannels, relative_noise
+from jeit_solvers import Descent, QuadraticModel, ridge_model
+from jeit_solvers.engines import as_array, on_host
+
+# Standard deviations of the logarithms of contact impedances: of each electrode's own part, and of the common one. And
+# of the logarithm of the conductivity, about that which fits the described model best.
+_OWN_CONTACT, _COMMON_CONTACT, _CONDUCTIVITY = 1.0, 4.0, 2.0
+# Steps of the two fits, before and after κ is estimated; the tolerance of their cost.
+_STEPS, _RTOL = 15, 3e-3
+# κ in units of `relative_noise`: 0.1 % of a voltage at least.
+_LEAST_NOISE = 0.1
+# Share of the body's width by which positions are varied for derivatives.
+_VARIED = 1e-4
+
+
+class Placement(NamedTuple):
+    """**Fields**: `model`: the model with the estimated electrodes; `conductivity`: estimated background, S; `shift`
+    (L, a): displacements along the a directions in which each electrode can move, metres; `deviation` (L, a): their
+    posterior standard deviations, metres."""
+
+    model: ForwardModel
+    conductivity: float
+    shift: Float[np.ndarray, "L a"]
+    deviation: Float[np.ndarray, "L a"]
+
+
+class _Point(NamedTuple):
+    """Model at a trial point, with its conductivity, fields F, impedance Z and predicted voltages (M,)."""
+
+    model: ForwardModel
+    conductivity: float
+    fields: Float[np.ndarray, "n L"]
+    impedance: Float[np.ndarray, "L L"]
+    voltages: Float[np.ndarray, " M"]
+
+
+def place_electrodes(model: ForwardModel, voltages, *, deviation: float, mask=None) -> Placement:
+    """Estimate where the electrodes of a `model` are, and their contact impedances, from a frame of the homogeneous
+    body.
+
+    `voltages` (M,), volts; `mask` (M,): True for channels to use; `deviation`: standard deviation of the described
+    positions, metres, in every direction in which an electrode can move. Raises `ValueError` for electrodes that cannot
+    move, or voltages that have the opposite sign of the model's.
+    """
+    if not isinstance(model.electrodes, AbstractMovableElectrodes):
+        raise ValueError(f"electrodes: {type(model.electrodes).__name__} have no position that can be estimated.")
+    problem = _Problem(model, np.asarray(voltages), mask, deviation)
+    size, scale = len(problem.spread), 1.0
+    found: Any = np.zeros(size)
+    descent = Descent(rtol=_RTOL, damping=1e-2, history=_STEPS + 1)
+    for _ in range(2):
+        found, _ = descent.at_once(problem.expand, found, scale, _STEPS)
+        scale, covariance = problem.noise_and_covariance(found, scale)
+    here = problem.at(found)
+    assert here is not None
+    shifts = slice(1, 1 + problem.directions.shape[0] * problem.directions.shape[1])
+    values = (problem.spread @ found)[shifts], np.sqrt(np.diag(problem.spread @ covariance @ problem.spread.T))[shifts]
+    shift, spread = (one.reshape(problem.directions.shape[:2]) for one in values)
+    return Placement(here.model, here.conductivity, shift, spread)
+
+
+class _Problem:
+    """Voltages and their derivatives by coefficients of unit variance: those of log σ, of the shifts, and of log zσ."""
+
+    def __init__(self, model: ForwardModel, measured: np.ndarray, mask, deviation: float):
+        self.given, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
+        self.used = np.isfinite(measured) if mask is None else np.asarray(mask, bool) & np.isfinite(measured)
+        self.measured = measured
+        self.noise = np.asarray(relative_noise(measured, self.used))
+        electrodes: Any = model.electrodes
+        self.directions = np.asarray(electrodes.directions(self.mesh))
+        self.step = _VARIED * float(np.ptp(np.asarray(self.mesh.points), axis=0).max())
+        number, ways = self.directions.shape[:2]
+        unit = np.asarray(model.voltages(1.0))[self.used]
+        if not unit @ measured[self.used] > 0:
+            raise ValueError("voltages: they have the opposite sign of the model's.")
+        self.first = float(np.log(unit @ unit / (unit @ measured[self.used])))
+        contact = _OWN_CONTACT**2 * np.eye(number) + _COMMON_CONTACT**2
+        self.spread = np.zeros((1 + number * (ways + 1),) * 2)
+        self.spread[0, 0] = _CONDUCTIVITY
+        middle = np.arange(1, 1 + number * ways)
+        self.spread[middle, middle] = deviation
+        self.spread[1 + number * ways :, 1 + number * ways :] = np.linalg.cholesky(contact)
+
+    def at(self, coefficients: Float[np.ndarray, " p"]) -> _Point | None:
+        """The model at some coefficients; None where electrodes would overlap or leave the body."""
+        number, ways = self.directions.shape[:2]
+        values = self.spread @ coefficients
+        shift, contact = values[1 : 1 + number * ways].reshape(number, ways), values[1 + number * ways :]
+        log_conductivity = self.first + values[0]
+        electrodes: Any = self._moved(self.given.electrodes, shift)
+        impedance = np.asarray(self.given.electrodes.contact_impedance) * np.exp(contact - values[0])
+        try:
+            model = self.given.with_electrodes(electrodes.with_contact_impedance(impedance))
+        except ValueError:
+            return None
+        conductivity = float(np.exp(log_conductivity))
+        fields, transfer = on_host(model.fields(conductivity))
+        predicted = np.asarray(select_channels(self.protocol, transfer))
+        return _Point(model, conductivity, fields, transfer, predicted)
+
+    def expand(self, coefficients, scale: float) -> QuadraticModel:
+        """Cost, and a step of Levenberg-Marquardt, at a `scale` κ of the noise."""
+        here = self.at(coefficients)
+        if here is None:
+            return np.inf, lambda damping: None  # pyright: ignore
+        residual = self._residual(here) / scale
+        cost = 0.5 * (residual @ residual + coefficients @ coefficients)
+        same: Any = np.eye(len(residual))
+
+        def step(damping):
+            rows = self._jacobian(here) / scale
+            return ridge_model(residual, rows, coefficients, same, same)[1](damping)  # pyright: ignore
+
+        return cost, step
+
+    def noise_and_covariance(self, coefficients, scale: float) -> tuple[float, Float[np.ndarray, "p p"]]:
+        """κ estimated from the residual, and the posterior covariance of the coefficients with it.
+
+        Dependent channels count once: the residual has as many degrees of freedom as independent channels, less those
+        that the fit has used.
+        """
+        here = self.at(coefficients)
+        assert here is not None
+        residual, rows = self._residual(here), self._jacobian(here)
+        independent = min(len(IndependentChannels.create(self.given.protocol).index), len(residual))
+        share = independent / len(residual)
+        hessian = rows.T @ rows / scale**2
+        fitted = np.trace(np.linalg.solve(hessian + np.eye(len(hessian)), hessian))
+        freedom = max(independent - fitted, 0.3 * independent)
+        scale = max(_LEAST_NOISE, float(np.sqrt(share * (residual @ residual) / freedom)))
+        return scale, np.linalg.inv(rows.T @ rows / scale**2 + np.eye(len(hessian)))
+
+    def _residual(self, here: _Point) -> Float[np.ndarray, " u"]:
+        return ((here.voltages - self.measured) / self.noise)[self.used]
+
+    def _jacobian(self, here: _Point) -> Float[np.ndarray, "u p"]:
+        """Derivatives of the weighted voltages by the coefficients."""
+        given: Any = here.model.electrodes
+        contact = np.asarray(given.contact_impedance)
+        by_contact = ContactSensitivity(self.mesh, given)(here.fields, here.impedance, contact)
+        columns = [-here.impedance]  # of log σ at fixed zσ
+        for way in range(self.directions.shape[1]):
+            one_way = self.step * (np.arange(self.directions.shape[1]) == way)
+            ends = [self._moved(given, np.tile(sign * one_way, (len(contact), 1))) for sign in (1, -1)]
+            up, down = (ContactSensitivity(self.mesh, one)(here.fields, here.impedance, contact) for one in ends)
+            columns.append((down - up) / (2 * self.step))
+        shifts = np.stack(columns[1:], axis=1).reshape(-1, *here.impedance.shape)
+        every = np.concatenate([columns[0][None], shifts, by_contact])
+        rows = np.stack([np.asarray(select_channels(self.protocol, one)) for one in every], axis=1)
+        return (rows / self.noise[:, None])[self.used] @ self.spread
+
+    def _moved(self, electrodes, shift: Float[np.ndarray, "L a"]):
+        """The electrodes shifted along their directions, metres."""
+        place = np.asarray(electrodes.position) + np.einsum("la,lad->ld", shift, self.directions)
+        return eqx.tree_at(lambda one: one.position, electrodes, as_array(place))

@@ -1,0 +1,83 @@
+"""Electrode positions estimated from a reference frame: against the true ones of a simulated tank, on another mesh."""
+
+import numpy as np
+import pytest
+
+from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, ring
+from jeit.data import Measurement
+from jeit.electrodes import NodeElectrodes
+from jeit.electrodes.body_mesh import body_mesh
+from jeit.imaging.preparation import prepare_difference
+from jeit.inverse.placement import place_electrodes
+
+RADIUS, SIGMA, WIDTH = 0.1, 0.02, 0.02
+DISK, PROTOCOL = Disk(RADIUS), adjacent(16, current=1e-3)
+DESCRIBED = BoundaryElectrodes(ring(RADIUS, 16), WIDTH, 0.005)
+
+
+def turned(degrees):
+    """The described places, each turned by so many degrees counter-clockwise."""
+    described = np.asarray(DESCRIBED.position)
+    angle = np.arctan2(described[:, 1], described[:, 0]) + np.deg2rad(degrees)
+    return RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def tank():
+    """Turns of the electrodes, degrees, and the voltages of the tank without a body, on a finer mesh."""
+    rng = np.random.default_rng(0)
+    degrees, impedance = 1.5 * rng.normal(size=16), 0.005 * np.exp(0.7 * rng.normal(size=16))
+    electrodes = BoundaryElectrodes(turned(degrees), WIDTH, impedance)
+    voltages = np.asarray(ForwardModel(body_mesh(DISK, electrodes, 4000), electrodes, PROTOCOL).voltages(SIGMA))
+    return degrees, voltages * (1 + 0.002 * rng.normal(size=len(voltages)))
+
+
+def test_electrodes_are_found_where_they_are(tank):
+    """But for maps of the disk onto itself that keep angles, which a homogeneous disk's voltages hardly show: a turn of
+    all electrodes, and shifts as of cos θ and sin θ."""
+    degrees, voltages = tank
+    model = ForwardModel(body_mesh(DISK, DESCRIBED, 1500), DESCRIBED, PROTOCOL)
+    placed = place_electrodes(model, voltages, deviation=np.deg2rad(2) * RADIUS)
+    place = np.asarray(DESCRIBED.position) / RADIUS
+    hidden = np.column_stack([np.ones(16), place])
+    left = np.rad2deg(placed.shift[:, 0] / RADIUS) - degrees
+    left, degrees = (one - hidden @ np.linalg.lstsq(hidden, one)[0] for one in (left, degrees))
+    assert placed.shift.shape == placed.deviation.shape == (16, 1)
+    assert np.std(left) < 0.2 * np.std(degrees)
+    assert placed.conductivity == pytest.approx(SIGMA, rel=0.02)
+    predicted = np.asarray(placed.model.voltages(placed.conductivity))
+    before = np.asarray(model.voltages(SIGMA))
+    assert np.linalg.norm(predicted - voltages) < 0.05 * np.linalg.norm(before - voltages)
+    moved = np.asarray(placed.model.electrodes.position) - np.asarray(DESCRIBED.position)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.abs(placed.shift[:, 0]), rtol=1e-9)
+
+
+def measured(voltages, name):
+    mask = np.ones(voltages.shape, bool)
+    return Measurement(voltages, mask, PROTOCOL, electrodes=DESCRIBED, domain=DISK, name=name)
+
+
+def test_a_difference_is_prepared_with_the_places_that_explain_the_reference(tank):
+    _, voltages = tank
+    prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
+    assert prepared.calibration.shift.shape == (16, 1)
+    assert float(prepared.calibration.misfit) < 0.01
+    assert np.abs(np.asarray(prepared.model.electrodes.position) - np.asarray(DESCRIBED.position)).max() > 1e-3
+
+
+def test_places_that_explain_the_reference_are_kept(tank):
+    model = ForwardModel(body_mesh(DISK, DESCRIBED, 4000), DESCRIBED, PROTOCOL)
+    voltages = np.asarray(model.voltages(SIGMA))
+    prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
+    assert prepared.calibration.shift is None
+    np.testing.assert_array_equal(prepared.model.electrodes.position, DESCRIBED.position)
+
+
+def test_what_cannot_be_placed_is_refused(tank):
+    _, voltages = tank
+    model = ForwardModel(DISK.mesh(num_points=800), DESCRIBED, PROTOCOL)
+    with pytest.raises(ValueError, match="opposite sign"):
+        place_electrodes(model, -voltages, deviation=1e-3)
+    nodes = NodeElectrodes(np.arange(16))
+    with pytest.raises(ValueError, match="NodeElectrodes have no position that can be estimated"):
+        place_electrodes(ForwardModel(model.mesh, nodes, PROTOCOL), voltages, deviation=1e-3)
