@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -15,6 +15,7 @@ from jeit.arguments import percent
 
 if TYPE_CHECKING:
     from jeit.image import Inclusion
+    from jeit.image.inclusions import Interval
 
 
 # Maximum width of a table, in characters.
@@ -153,3 +154,37 @@ def inclusion_table(
 
     whole = table_of(" ")
     return whole if Console(width=_WIDTH + 1).measure(whole).maximum <= _WIDTH else table_of("\n")
+
+
+def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Table:
+    """Create a table of fitted bodies with 68 % intervals of their area, change of conductivity and strength.
+
+    `background`: conductivity of the reference, S. If the data leave an end of an interval open, only the other end is
+    given.
+    """
+    close = {"box": None, "padding": (0, 2), "collapse_padding": True}
+    columns = ["x / mm", "y / mm", "area / mm²", "change of con-\nductivity / %", "strength / mm²"]
+    table = Table("inclusion", *columns, **close, caption="below each value its 68 % interval", caption_justify="left")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for one in inclusions:
+        area = with_interval(one.area, one.area_interval, lambda value: f"{1e6 * value:.0f}")
+        change = with_interval(one.peak / background, one.contrast_interval, lambda value: f"{100 * value:+.3g}")
+        strength = with_interval(one.strength, one.strength_interval, lambda value: f"{1e6 * value:.0f}")
+        place = [f"{1e3 * value:.1f}" for value in one.centroid]
+        table.add_row(one.kind, *place, area, change, strength)
+    return table
+
+
+def with_interval(value: float | None, interval: "Interval | None", written: Callable[[Any], str]) -> str:
+    """A value above its interval as text; "at least" or "at most" the known end where the other one is open."""
+    if value is None or interval is None:
+        return "not known" if value is None else written(value)
+    low, high = interval
+    if low is None and high is None:
+        return "not determined"
+    if high is None:
+        return f"at least {written(low)}"
+    if low is None:
+        return f"at most {written(high)}"
+    return f"{written(value)}\n{written(low)} to {written(high)}"

@@ -13,17 +13,18 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
 
-from jeit.electrodes.electrodes import AbstractElectrodes
+from jeit.electrodes.electrodes import AbstractElectrodes, AbstractMovableElectrodes
 from jeit.forward.model import ForwardModel, channel_voltages, evaluate, fields_and_impedance_of, select_channels
 from jeit.forward.system import field_gradients, stiffness
 from jeit.forward.transfer import ElectrodeImpedance
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
-from jeit_solvers.engines import on_host
+from jeit_solvers.engines import as_array, on_host
 
 # Number of cells processed at a time, so that their products of gradients stay in the cache.
 _CELLS = 256
@@ -155,3 +156,44 @@ class ContactSensitivity:
             local = fields[nodes]
             energy += np.einsum("qip,qir->pr", local, np.einsum("qij,qjr->qir", mass, local))
         return energy
+
+
+# Fraction of the mesh's width by which electrodes are shifted for derivatives.
+_SHIFTED = 1e-4
+
+
+class PlacementSensitivity:
+    """∂Z of every shift of the electrodes along the directions in which they can move, by central differences of the
+    contact energy at fixed fields, and of every log z. `electrodes` must be movable; their places and sizes hold."""
+
+    def __init__(self, mesh: Mesh, electrodes: AbstractMovableElectrodes):
+        mesh = on_host(mesh)
+        self.directions = np.asarray(electrodes.directions(mesh))
+        self._contact_impedance = np.asarray(electrodes.contact_impedance)
+        self._step = _SHIFTED * float(np.ptp(np.asarray(mesh.points), axis=0).max())
+        self._here = ContactSensitivity(mesh, electrodes)
+        self._ends = []
+        for way in range(self.directions.shape[1]):
+            shift = np.zeros(self.directions.shape[:2])
+            shift[:, way] = self._step
+            ends = [shifted(electrodes, self.directions, one) for one in (shift, -shift)]
+            self._ends.append([ContactSensitivity(mesh, one) for one in ends])
+
+    def __call__(self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"]):
+        """∂Z (p, L, L), ohms per metre for the L · a shifts, electrode by electrode, then ohms for the L log z; from F
+        and Z with these electrodes."""
+        contact = self._contact_impedance
+        by_shift = []
+        for up, down in self._ends:
+            energies = [one(fields, impedance, contact) for one in (down, up)]
+            by_shift.append((energies[0] - energies[1]) / (2 * self._step))
+        by_shift = np.stack(by_shift, axis=1).reshape(-1, *impedance.shape)
+        return np.concatenate([by_shift, self._here(fields, impedance, contact)])
+
+
+def shifted(
+    electrodes: AbstractMovableElectrodes, directions: Float[np.ndarray, "L a d"], shift: Float[np.ndarray, "L a"]
+) -> AbstractMovableElectrodes:
+    """The electrodes with each position shifted along its `directions`, metres."""
+    place = np.asarray(electrodes.position) + np.einsum("la,lad->ld", shift, directions)
+    return eqx.tree_at(lambda one: one.position, electrodes, as_array(place))

@@ -53,13 +53,19 @@ class SolidForm(eqx.Module):
 _LEAST_AREA = {2: 0.004, 3: 0.001}
 
 
+Interval = tuple[float | None, float | None]
+"""Ends of a 68 % credible interval, None where the data leave an end open."""
+
+
 class Inclusion(eqx.Module):
     """A region of raised or lowered conductivity.
 
     **Fields**: `sign`: +1 for conductive, -1 for resistive; `centroid` in metres, weighted by the change; `area` in m²
     (in solids: volume in m³); `peak`: the strongest change in the region, in the unit of the image; `on_surface`:
     whether the region lies on a surface in space, so that it has an area although its centroid has three coordinates;
-    `form`: shape of an inclusion that was fitted to data as a body in a solid, else None.
+    `form`: shape of an inclusion that was fitted to data as a body in a solid, else None. Where they were estimated:
+    `contrast_interval`: 68 % interval of the change relative to the background; `area_interval`: of the area, m²;
+    `strength`: area times (σ/σ₀ - 1) / (σ/σ₀ + 1), m², and `strength_interval`.
     """
 
     sign: int
@@ -68,6 +74,10 @@ class Inclusion(eqx.Module):
     peak: float
     on_surface: bool = False
     form: SolidForm | None = None
+    contrast_interval: Interval | None = None
+    area_interval: Interval | None = None
+    strength: float | None = None
+    strength_interval: Interval | None = None
 
     @property
     def is_solid(self) -> bool:

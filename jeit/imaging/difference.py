@@ -281,17 +281,31 @@ def _inclusions(
     if found.shapes is not None:
         bodies = found.shapes.bodies
         labels = _labels(found.mesh, bodies, grid) if settings.segment else None
-        listed = [
-            Inclusion(one.sign, tuple(one.centroid.tolist()), one.measure, one.sign * one.contrast, form=_form(one))
-            for one in bodies
-        ]
-        return [_with_change(one, background) for one in listed], labels
+        return [_of_body(one, float(background)) for one in bodies], labels
     departure, noise = as_array(np.real(found.departure)), None
     if isinstance(reconstruction, Reconstruction) and reconstruction.inversion.penalty.is_standard_normal:
         noise = as_array(image_noise(reconstruction))
     regions = inclusion_regions(found.mesh, departure, level=found.level, least_peak=settings.least_peak, noise=noise)
     inclusions = [_with_change(one, background) if found.iterative else one for one, _ in regions]
     return inclusions, _covered(regions, grid) if settings.segment else None
+
+
+def _of_body(body: Star | Ellipsoid, background: float) -> Inclusion:
+    """The inclusion that a fitted body is, with its intervals if they were estimated."""
+    place = tuple(body.centroid.tolist())
+    if isinstance(body, Star) and (known := body.quantities) is not None:
+        return Inclusion(
+            body.sign,
+            place,
+            known.area,
+            background * known.change,
+            contrast_interval=known.change_interval,
+            area_interval=known.area_interval,
+            strength=known.strength,
+            strength_interval=known.strength_interval,
+        )
+    one = Inclusion(body.sign, place, body.measure, body.sign * body.contrast, form=_form(body))
+    return _with_change(one, background)
 
 
 def _form(body: Star | Ellipsoid) -> SolidForm | None:

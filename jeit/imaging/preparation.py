@@ -6,9 +6,8 @@ import functools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -26,8 +25,9 @@ from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channels import electrode_misfits
 from jeit.inverse.placement import place_electrodes
+from jeit.inverse.shapes.quantities import Accuracy
 from jeit.mesh import Body, Mesh, OwnMesh, Solid
-from jeit_solvers.engines import as_array
+from jeit_solvers.engines import as_array, has_values
 
 
 class Clock:
@@ -71,6 +71,8 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
 SOLID_POINTS, SHEET_POINTS = 10_000, 2000
 # Minimum share of a difference that is assumed to remain unexplained by any model.
 _LEAST_MISFIT = 0.03
+# The same besides errors of electrode positions and contacts.
+_LEAST_OTHER = 0.02
 # Factor by which this share is larger for images with sharp outlines.
 _SHARP = 3.0
 # Misfit of an electrode, relative to that of the others, above which it counts as unlike them. In sound tanks the ratio
@@ -164,17 +166,23 @@ class PreparedDifference:
         return self._off_by(_SHARP)
 
     @property
+    def accuracy(self) -> Accuracy:
+        """Errors of the difference, from which intervals are computed: noise, the unknown part of electrode positions
+        and contacts, and the share of the difference that equals the misfit of the reference, at least 2 %."""
+        return Accuracy(self._off_by(1.0, _LEAST_OTHER), self.calibration.model_error)
+
+    @property
     def modelled_share(self) -> float:
         """Share of the variance of `sharp_noise` that is due to the model error, from 0 to 1; 1 if the noise is not
         known."""
         sharp = np.asarray(self.sharp_noise)[0] / np.asarray(self.relative_noise)[0]
         return 1 - (0 if self.noise is None else self.noise / float(sharp)) ** 2
 
-    def _off_by(self, times: float) -> Float[Array, " M"]:
+    def _off_by(self, times: float, least: float = _LEAST_MISFIT) -> Float[Array, " M"]:
         shape, used = np.asarray(self.relative_noise), np.asarray(self.mask)
         size = np.sqrt(np.mean(np.abs(np.asarray(self.difference)[used] / shape[used]) ** 2))
         noise = min(1.0, 0.1 * size) if self.noise is None else self.noise
-        return as_array(shape * np.hypot(noise, times * max(float(self.calibration.misfit), _LEAST_MISFIT) * size))
+        return as_array(shape * np.hypot(noise, times * max(float(self.calibration.misfit), least) * size))
 
 
 def prepare_difference(
@@ -259,23 +267,27 @@ def calibrated_model(
 
 
 def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, contact: str) -> Calibration:
-    """The calibration with electrode positions estimated along, where that explains the reference far better.
+    """The calibration with what is not known of electrode positions; these are estimated if that explains the reference
+    far better.
 
-    Described positions that explain it are kept, and so are they where a misfit has other causes: of a deep tank under
-    a model of two dimensions positions explain little.
+    Described positions that explain the reference are kept. So are they where a misfit has other causes: estimated
+    positions explain little of a deep tank under a two-dimensional model.
     """
     movable = isinstance(model.electrodes, AbstractMovableElectrodes)
-    if not movable or np.iscomplexobj(voltages) or not float(calibration.misfit) > _EXPLAINED:
+    if not movable or np.iscomplexobj(voltages) or not has_values(model, voltages):
         return calibration
     width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
     try:
         placed = place_electrodes(model, voltages, deviation=_MISPLACED * width, mask=mask)
+        calibration = replace(calibration, model_error=placed.error)
+        if not float(calibration.misfit) > _EXPLAINED:
+            return calibration
         again = calibrate(placed.model, voltages, mask=mask, contact=contact)
     except ValueError:
         return calibration
     if not float(again.misfit) < _BETTER * float(calibration.misfit):
         return calibration
-    return eqx.tree_at(lambda one: one.shift, again, as_array(placed.shift), is_leaf=lambda one: one is None)
+    return replace(again, shift=as_array(placed.shift), model_error=placed.error)
 
 
 def select_frames(

@@ -122,7 +122,8 @@ class Calibration(eqx.Module):
     measured‖ / ‖measured‖ over the channels used; `contact_deviation` (k,): standard deviations of the logarithms of
     the k fitted contact impedances, estimated from the residuals; `iterations`: number of iterations; `outcome`:
     `Status.number` of how the fit ended; `reason`: a sentence on why it did not converge, empty if it did; `shift`
-    (L, a): displacements of electrodes whose positions were estimated (`jeit.inverse.placement`), metres, else None.
+    (L, a): displacements of electrodes whose positions were estimated (`jeit.inverse.placement`), metres, else None;
+    `model_error`: the `ModelError` of positions and contact impedances, if it was estimated.
     """
 
     model: ForwardModel
@@ -134,6 +135,7 @@ class Calibration(eqx.Module):
     outcome: int | Int[Array, ""]
     reason: str = eqx.field(static=True, default="")
     shift: Float[Array, "L a"] | None = None
+    model_error: Any = None
 
     @property
     def status(self) -> Status:

@@ -20,13 +20,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jeit.electrodes.electrodes import AbstractMovableElectrodes
 from jeit.forward import ForwardModel
-from jeit.forward.changes import ContactSensitivity
+from jeit.forward.changes import PlacementSensitivity, shifted
 from jeit.forward.model import select_channels
 from jeit.inverse.channels import IndependentChannels, relative_noise
 from jeit_solvers import Descent, QuadraticModel, ridge_model
@@ -37,21 +36,50 @@ from jeit_solvers.engines import as_array, on_host
 _OWN_CONTACT, _COMMON_CONTACT, _CONDUCTIVITY = 1.0, 4.0, 2.0
 # Steps of the two fits, before and after κ is estimated; the tolerance of their cost.
 _STEPS, _RTOL = 15, 3e-3
+# Standard deviation of the logarithm of each contact impedance's drift between two frames.
+_DRIFT = 0.1
 # κ in units of `relative_noise`: 0.1 % of a voltage at least.
 _LEAST_NOISE = 0.1
-# Share of the body's width by which positions are varied for derivatives.
-_VARIED = 1e-4
 
 
 class Placement(NamedTuple):
     """**Fields**: `model`: the model with the estimated electrodes; `conductivity`: estimated background, S; `shift`
     (L, a): displacements along the a directions in which each electrode can move, metres; `deviation` (L, a): their
-    posterior standard deviations, metres."""
+    posterior standard deviations, metres; `error`: what stays unknown."""
 
     model: ForwardModel
     conductivity: float
     shift: Float[np.ndarray, "L a"]
     deviation: Float[np.ndarray, "L a"]
+    error: "ModelError"
+
+
+class ModelError(NamedTuple):
+    """What is not known of electrode positions and contact impedances once the reference frame is: an error of the
+    model, of a difference as well.
+
+    **Fields**: `factor` (p, p): F with the posterior covariance F Fᵀ of the shifts, metres, and of the logarithms of
+    the contact impedances. These also drift between the two frames, by 10 %.
+
+    Kaipio and Somersalo, Journal of Computational and Applied Mathematics 198 (2007) 493.
+    """
+
+    factor: Float[np.ndarray, "p p"]
+
+    def voltages(self, model: ForwardModel, conductivity, background) -> Float[np.ndarray, "M q"]:
+        """Errors (M, q) of the difference v(`conductivity`) - v(`background`), volts, for unit coefficients.
+
+        Both in S (3-D: S/m). The covariance of the difference is the product of the errors with their transpose.
+        """
+        electrodes: Any = model.electrodes
+        sensitivity, protocol = PlacementSensitivity(model.mesh, electrodes), on_host(model.protocol)
+
+        def channels(impedances):
+            return np.stack([np.asarray(select_channels(protocol, one)) for one in impedances], axis=1)
+
+        there, here = (sensitivity(*map(np.asarray, model.fields(one))) for one in (conductivity, background))
+        drifted = _DRIFT * channels(there[-electrodes.num_electrodes :])
+        return np.concatenate([channels(there - here) @ self.factor, drifted], axis=1)
 
 
 class _Point(NamedTuple):
@@ -77,6 +105,7 @@ def place_electrodes(model: ForwardModel, voltages, *, deviation: float, mask=No
     problem = _Problem(model, np.asarray(voltages), mask, deviation)
     size, scale = len(problem.spread), 1.0
     found: Any = np.zeros(size)
+    covariance = np.eye(size)
     descent = Descent(rtol=_RTOL, damping=1e-2, history=_STEPS + 1)
     for _ in range(2):
         found, _ = descent.at_once(problem.expand, found, scale, _STEPS)
@@ -86,7 +115,7 @@ def place_electrodes(model: ForwardModel, voltages, *, deviation: float, mask=No
     shifts = slice(1, 1 + problem.directions.shape[0] * problem.directions.shape[1])
     values = (problem.spread @ found)[shifts], np.sqrt(np.diag(problem.spread @ covariance @ problem.spread.T))[shifts]
     shift, spread = (one.reshape(problem.directions.shape[:2]) for one in values)
-    return Placement(here.model, here.conductivity, shift, spread)
+    return Placement(here.model, here.conductivity, shift, spread, ModelError(problem.factor(covariance)))
 
 
 class _Problem:
@@ -96,10 +125,9 @@ class _Problem:
         self.given, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
         self.used = np.isfinite(measured) if mask is None else np.asarray(mask, bool) & np.isfinite(measured)
         self.measured = measured
-        self.noise = np.asarray(relative_noise(measured, self.used))
+        self.noise = np.asarray(relative_noise(as_array(measured), as_array(self.used)))
         electrodes: Any = model.electrodes
         self.directions = np.asarray(electrodes.directions(self.mesh))
-        self.step = _VARIED * float(np.ptp(np.asarray(self.mesh.points), axis=0).max())
         number, ways = self.directions.shape[:2]
         unit = np.asarray(model.voltages(1.0))[self.used]
         if not unit @ measured[self.used] > 0:
@@ -118,8 +146,9 @@ class _Problem:
         values = self.spread @ coefficients
         shift, contact = values[1 : 1 + number * ways].reshape(number, ways), values[1 + number * ways :]
         log_conductivity = self.first + values[0]
-        electrodes: Any = self._moved(self.given.electrodes, shift)
-        impedance = np.asarray(self.given.electrodes.contact_impedance) * np.exp(contact - values[0])
+        given: Any = self.given.electrodes
+        electrodes: Any = shifted(given, self.directions, shift)
+        impedance = np.asarray(given.contact_impedance) * np.exp(contact - values[0])
         try:
             model = self.given.with_electrodes(electrodes.with_contact_impedance(impedance))
         except ValueError:
@@ -161,26 +190,21 @@ class _Problem:
         scale = max(_LEAST_NOISE, float(np.sqrt(share * (residual @ residual) / freedom)))
         return scale, np.linalg.inv(rows.T @ rows / scale**2 + np.eye(len(hessian)))
 
+    def factor(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "q q"]:
+        """Factor of the covariance of shifts, metres, and of log z, from that of the coefficients."""
+        of_values = self.spread.copy()
+        of_values[1 + self.directions.shape[0] * self.directions.shape[1] :] -= self.spread[0]  # log z = log zσ - log σ
+        of_values = of_values[1:]
+        values, axes = np.linalg.eigh(of_values @ covariance @ of_values.T)
+        return axes * np.sqrt(np.maximum(values, 0))
+
     def _residual(self, here: _Point) -> Float[np.ndarray, " u"]:
         return ((here.voltages - self.measured) / self.noise)[self.used]
 
     def _jacobian(self, here: _Point) -> Float[np.ndarray, "u p"]:
         """Derivatives of the weighted voltages by the coefficients."""
-        given: Any = here.model.electrodes
-        contact = np.asarray(given.contact_impedance)
-        by_contact = ContactSensitivity(self.mesh, given)(here.fields, here.impedance, contact)
-        columns = [-here.impedance]  # of log σ at fixed zσ
-        for way in range(self.directions.shape[1]):
-            one_way = self.step * (np.arange(self.directions.shape[1]) == way)
-            ends = [self._moved(given, np.tile(sign * one_way, (len(contact), 1))) for sign in (1, -1)]
-            up, down = (ContactSensitivity(self.mesh, one)(here.fields, here.impedance, contact) for one in ends)
-            columns.append((down - up) / (2 * self.step))
-        shifts = np.stack(columns[1:], axis=1).reshape(-1, *here.impedance.shape)
-        every = np.concatenate([columns[0][None], shifts, by_contact])
+        electrodes: Any = here.model.electrodes
+        by_placement = PlacementSensitivity(self.mesh, electrodes)(here.fields, here.impedance)
+        every = np.concatenate([-here.impedance[None], by_placement])  # the first by log σ at fixed zσ
         rows = np.stack([np.asarray(select_channels(self.protocol, one)) for one in every], axis=1)
         return (rows / self.noise[:, None])[self.used] @ self.spread
-
-    def _moved(self, electrodes, shift: Float[np.ndarray, "L a"]):
-        """The electrodes shifted along their directions, metres."""
-        place = np.asarray(electrodes.position) + np.einsum("la,lad->ld", shift, self.directions)
-        return eqx.tree_at(lambda one: one.position, electrodes, as_array(place))

@@ -236,6 +236,21 @@ def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]
         "peak": inclusion.peak,
         "peak_unit": _unit(result),
         "peak_relative_to_background": inclusion.peak / float(np.real(result.calibration.conductivity)),
+        **_intervals(inclusion),
+    }
+
+
+def _intervals(inclusion: Inclusion) -> dict[str, Any]:
+    """68 % intervals of what was estimated of a body, None at an open end; nothing where none were estimated."""
+    if inclusion.contrast_interval is None:
+        return {}
+    return {
+        "contrast_interval": inclusion.contrast_interval,
+        "area_interval": inclusion.area_interval,
+        "strength": inclusion.strength,
+        "strength_interval": inclusion.strength_interval,
+        "strength_unit": "m²",
+        "intervals_hold": "68 %",
     }
 
 

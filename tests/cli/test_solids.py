@@ -73,13 +73,13 @@ def test_from_description_to_picture(body, run, tmp_path):
     assert ("volume" in told) == (body == "solid")
     assert ("area / mm²" in told) == (body == "mesh")
     assert ("outline" in told) == (body == "mesh")
-    assert "peak change" in told
-    assert "of back-" in told
+    assert ("peak change" if body == "solid" else "68 % interval") in told
+    assert ("of back-" if body == "solid" else "strength") in told
     assert (tmp_path / "out" / "image.png").stat().st_size > 10_000
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     (found,) = report["inclusions"]
     assert found["kind"] == "conductive"
-    size = {"volume", "volume_unit"} if body == "solid" else {"area", "area_unit"}
+    size = {"volume", "volume_unit"} if body == "solid" else {"area", "area_unit", "area_interval"}
     assert {key for key in found if key.startswith(("area", "volume"))} == size
     assert found.get("volume_unit", found.get("area_unit")) == ("m³" if body == "solid" else "m²")
     assert (tmp_path / "out" / "image.vtu").is_file() == (body == "solid")

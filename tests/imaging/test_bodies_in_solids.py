@@ -165,7 +165,7 @@ def test_what_is_asked_of_bodies_reaches_their_search(monkeypatch, dimension):
     data, _ = prepared(dimension, 0.1, 0.1)
     data.model, data.difference = SimpleNamespace(voltages=lambda background: np.zeros(2)), np.zeros(2)
     data.sharp_noise = data.mask = None
-    data.modelled_share = 0.5
+    data.modelled_share, data.accuracy = 0.5, None
     monkeypatch.setattr(method, "find_inclusions", lambda *_, **__: [])
     monkeypatch.setattr(method, "reconstruct_shapes", lambda *_, **searched: searched)
     smooth: Any = SimpleNamespace(conductivity=np.ones(2))

@@ -162,7 +162,7 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
     import numpy as np
 
     from jeit.arguments import counted, percent
-    from jeit.cli.console import inclusion_table, pairs, scaled
+    from jeit.cli.console import inclusion_table, pairs, quantity_table, scaled
     from jeit.inverse.nonlinear.reconstruct import Reconstruction
     from jeit_solvers import Status
 
@@ -213,7 +213,10 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
         rows.insert(0, ("frame", _which(result, asked)))
     console.print(pairs(result.measurement.name, rows))
     console.print()
-    table = inclusion_table(result.inclusions, unit, result.peak_ranges, background=background.real)
+    if any(one.contrast_interval is not None for one in result.inclusions):
+        table = quantity_table(result.inclusions, background.real)
+    else:
+        table = inclusion_table(result.inclusions, unit, result.peak_ranges, background=background.real)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()
 
@@ -228,7 +231,7 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
     strong = sum(not one.contrast_is_determined for one in shapes.bodies)
     upright = sum(isinstance(one, Ellipsoid) and one.column for one in shapes.bodies)
     columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
-    assumed = f"; {strong} taken for strong, with peaks at least about as given" if strong else ""
+    assumed = f"; {strong} so strong that the data give a limit of the change only" if strong else ""
     alike = any(isinstance(one, Ellipsoid) and one.alike for one in shapes.bodies)
     material = ", as of one material: the data do not contradict it" if alike else ""
     drift = f"the background has drifted by {percent(shapes.drift)}"

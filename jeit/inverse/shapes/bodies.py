@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 from jeit.arguments import describe, is_number
 
 # Fields of `Bodies` that hold one value per body, except `start`.
-_OF_EACH = ("sign", "other", "alike")
+_OF_EACH = ("sign", "other", "alike", "held")
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,8 @@ class Bodies(abc.ABC):
     longest side of the domain, metres; `start` (k, d): starting centres, metres; `sign` (k,): +1 for bodies more
     conductive than the bath, -1 for less; `other` (k,): whether a body is of the form's other kind (weak for stars, a
     column for ellipsoids); `alike` (k,): whether a body is of the same material as all other `alike` bodies of its
-    sign. Bodies of the same material share the contrast coefficient of the first; those of the others have no effect.
+    sign. Bodies of the same material share the contrast coefficient of the first; those of the others have no effect;
+    `held` (k,): contrast at which a body is held, whatever its coefficient, NaN where it is estimated.
     """
 
     prior: Any
@@ -128,6 +129,7 @@ class Bodies(abc.ABC):
     sign: Float[np.ndarray, " k"]
     other: Bool[np.ndarray, " k"]
     alike: Bool[np.ndarray, " k"]
+    held: Float[np.ndarray, " k"]
 
     @property
     @abc.abstractmethod
@@ -207,6 +209,8 @@ class Bodies(abc.ABC):
 
     def contrast(self, k: int, row: Float[np.ndarray, " q"]) -> tuple[float, float]:
         """Contrast of body k in log σ, without its sign, and its derivative with respect to the coefficient."""
+        if np.isfinite(self.held[k]):
+            return float(self.held[k]), 0.0
         return self.prior.contrast_of(row[self.dimension + 1], bool(self.other[k]))
 
     def shown(self, coefficients: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:

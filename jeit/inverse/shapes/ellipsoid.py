@@ -213,8 +213,11 @@ class Ellipsoids(Bodies):
         sampled = _SAMPLES @ points[np.asarray(mesh.cells)]
         start, total = np.reshape(np.asarray(start, float), (-1, 3)), float(volume.sum())
         sign, no = np.asarray(sign, float), np.zeros(len(start), bool)
+        free = np.full(len(start), np.nan)
         span, ends = float(np.ptp(points, axis=0).max()), (float(points[:, 2].min()), float(points[:, 2].max()))
-        return cls(prior, volume / total, span, start, sign, no, no, sampled, _BLUR * np.cbrt(volume), total, ends)
+        return cls(
+            prior, volume / total, span, start, sign, no, no, free, sampled, _BLUR * np.cbrt(volume), total, ends
+        )
 
     @property
     def odds(self) -> float:

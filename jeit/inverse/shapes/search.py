@@ -18,6 +18,7 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
 from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids, alternatives, contrast_deviations
 from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
+from jeit.inverse.shapes.quantities import Accuracy, quantified
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
 from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array
@@ -109,6 +110,7 @@ def reconstruct_shapes(
     prior: BodyPrior | None = None,
     least_rise: float = LEAST_RISE,
     smooth: Reconstruction | None = None,
+    accuracy: Accuracy | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ShapeReconstruction:
     """Estimate the bodies (star shapes in a sheet, ellipsoids in a solid) that explain measured `voltages` (M,), in
@@ -125,6 +127,8 @@ def reconstruct_shapes(
     - `smooth`: an image of the same channels with a smooth prior and no bounds. Changes of conductivity besides the
       bodies are then modelled as a `SmoothField`, whose level is chosen by the evidence, and only bodies that are
       detected beside that field are fitted.
+    - `accuracy`: for a sheet, the errors with which each body's `Star.quantities` are estimated, in place of `noise`;
+      without it they are not.
     - `progress`: called with the name of each stage as it begins. Stages take up to a minute in a solid.
 
     All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and the others
@@ -186,8 +190,13 @@ def reconstruct_shapes(
     others, deviations = alternatives(problem, fitted), contrast_deviations(problem, fitted, each)
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
     order = np.argsort(-np.asarray(rises), kind="stable")
+    found_bodies = [bodies.body(int(k), coefficients, rises[k]) for k in order]
+    if accuracy is not None and not solid:
+        report("bodies, how large and how strong")
+        data = independent_data(model, measured, used, accuracy.noise, at_once=True)[1]
+        found_bodies = quantified(replace(problem, data=data), fitted, accuracy, found_bodies, order)
     return ShapeReconstruction(
-        bodies=tuple(bodies.body(int(k), coefficients, rises[k]) for k in order),
+        bodies=tuple(found_bodies),
         conductivity=as_array(conductivity),
         voltages=as_array(predicted),
         misfit=as_array(np.sqrt(np.mean(excess**2))),

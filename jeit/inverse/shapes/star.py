@@ -68,6 +68,26 @@ class StarPrior(BodyPrior):
         return contrast, self.weak_spread * contrast
 
 
+Interval = tuple[float | None, float | None]
+
+
+@dataclass(frozen=True)
+class Quantities:
+    """What the data determine of a body: posterior medians, and 68 % intervals, None at an end that is left open.
+
+    **Fields**: `change`: change of conductivity relative to the background; `area`: m²; `strength`: area times
+    (σ/σ₀ - 1) / (σ/σ₀ + 1), m², negative for resistive bodies; and `change_interval`, `area_interval` and
+    `strength_interval`.
+    """
+
+    change: float
+    change_interval: Interval
+    area: float
+    area_interval: Interval
+    strength: float
+    strength_interval: Interval
+
+
 class Star(eqx.Module):
     """Body with a star-shaped outline, found in a sheet.
 
@@ -75,7 +95,7 @@ class Star(eqx.Module):
     `outline` (k, 2): points of the outline, metres, counter-clockwise; `contrast`: contrast in log σ, without its sign;
     `weak`: whether the body is weak, so that the data determine its contrast: for other bodies the contrast follows the
     prior and is roughly a lower limit; `rise`: factor by which the minimum of the objective increases without this
-    body, small for a ghost.
+    body, small for a ghost; `quantities`: posterior medians and intervals, if they were estimated.
     """
 
     sign: int
@@ -84,6 +104,7 @@ class Star(eqx.Module):
     contrast: float
     weak: bool
     rise: float
+    quantities: Quantities | None = None
 
     @property
     def area(self) -> float:
@@ -97,8 +118,8 @@ class Star(eqx.Module):
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether the data determine the contrast: True for weak bodies."""
-        return self.weak
+        """Whether the data determine the contrast: no end of its interval is open, or without one the body is weak."""
+        return self.weak if self.quantities is None else None not in self.quantities.change_interval
 
     @property
     def centroid(self) -> Float[np.ndarray, "2"]:
@@ -153,7 +174,8 @@ class Stars(Bodies):
         start = np.reshape(np.asarray(start, float), (-1, 2))
         width, weight = _BLUR * np.sqrt(area), area / area.sum()
         sign, no = np.asarray(sign, float), np.zeros(len(start), bool)
-        return cls(prior, weight, span, start, sign, no, no, corners @ _SAMPLES.T, width, edges)
+        free = np.full(len(start), np.nan)
+        return cls(prior, weight, span, start, sign, no, no, free, corners @ _SAMPLES.T, width, edges)
 
     @property
     def odds(self) -> float:

@@ -1,0 +1,96 @@
+"""Contrast, area and strength of bodies, with intervals: against tanks that differ from their description."""
+
+import numpy as np
+import pytest
+
+from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, image_difference, ring
+from jeit.cli.console import with_interval
+from jeit.data import Measurement
+from jeit.electrodes.body_mesh import body_mesh
+from jeit.image import Inclusion
+from jeit.inverse.shapes.quantities import _Held, _summary
+from jeit.mesh import centroids
+
+RADIUS, SIGMA = 0.1, 0.02
+DISK, PROTOCOL = Disk(RADIUS), adjacent(16, current=1e-3)
+DESCRIBED = BoundaryElectrodes(ring(RADIUS, 16), 0.02, 0.005)
+
+
+def imaged(change, radius, seed=0, degrees=1.5):
+    """The image of a round body in a tank whose electrodes are `degrees` off, contacts a factor of two apart."""
+    rng = np.random.default_rng(seed)
+    place = np.asarray(DESCRIBED.position)
+    angle = np.arctan2(place[:, 1], place[:, 0]) + np.deg2rad(degrees) * rng.normal(size=16)
+    place = RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    electrodes = BoundaryElectrodes(place, 0.02, 0.005 * np.exp(0.7 * rng.normal(size=16)))
+    model = ForwardModel(body_mesh(DISK, electrodes, 5000), electrodes, PROTOCOL)
+    middle = np.asarray(centroids(model.mesh))
+    inside = np.linalg.norm(middle - [0.02, 0.035], axis=1) < radius
+    frames = []
+    for conductivity in (np.full(len(middle), SIGMA), SIGMA * np.where(inside, 1 + change, 1.0)):
+        voltages = np.asarray(model.voltages(conductivity))
+        voltages = voltages * (1 + 0.003 * rng.normal(size=len(voltages)))
+        mask = np.ones(voltages.shape, bool)
+        frames.append(Measurement(voltages, mask, PROTOCOL, electrodes=DESCRIBED, domain=DISK))
+    return image_difference(frames[1], frames[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("change", "radius"), [(0.5, 0.027), (2.0, 0.025), (-0.5, 0.02), (9.0, 0.012)])
+def test_numbers_are_right_in_a_tank_that_is_not_as_described(change, radius):
+    """Within twice their intervals; they were wrong by up to two orders of magnitude."""
+    result = imaged(change, radius)
+    (one,) = result.inclusions
+    assert np.linalg.norm(np.array(one.centroid) - [0.02, 0.035]) < 0.02 * RADIUS
+    area = np.pi * radius**2
+    for value, interval in (
+        (change, one.contrast_interval),
+        (area, one.area_interval),
+        (area * change / (2 + change), one.strength_interval),
+    ):
+        low, high = (np.nan if end is None else end for end in interval)
+        middle = np.nanmean([low, high])
+        reach = np.nanmax([abs(high - low), 0.1 * abs(middle)])
+        assert not value < low - reach
+        assert not value > high + reach
+
+
+def held(contrast, unlikely, area=1e-3):
+    return _Held(float(np.log(contrast)), unlikely, float(np.log(area)), 0.05)
+
+
+def test_what_the_likelihood_says_is_summed_up():
+    """A parabola about a contrast of one, of deviation 0.1: half of its mass lies below, the prior aside."""
+    places = np.exp(np.linspace(-0.5, 0.5, 21))
+    found = _summary(1, [held(one, 0.5 * (np.log(one) / 0.1) ** 2) for one in places])
+    assert found.change == pytest.approx(np.expm1(1.0), rel=0.02)
+    low, high = found.change_interval
+    assert low == pytest.approx(np.expm1(np.exp(-0.1)), rel=0.03)
+    assert high == pytest.approx(np.expm1(np.exp(0.1)), rel=0.03)
+    assert found.area == pytest.approx(1e-3, rel=0.01)
+    assert found.area_interval == pytest.approx((0.95e-3, 1.05e-3), rel=0.01)
+    assert found.strength == pytest.approx(1e-3 * np.tanh(0.5), rel=0.02)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_ends_that_the_data_leave_open_are_none(sign):
+    strong = _summary(sign, [held(one, 40 / one if one < 3 else 0.2) for one in (0.5, 1.0, 2.0, 3.0, 4.5)])
+    assert strong.change_interval[sign > 0] is None
+    assert strong.change_interval[sign < 0] is not None
+    assert strong.area_interval[0] is None
+    assert None not in strong.strength_interval
+    weak = _summary(sign, [held(one, 40 * one**2) for one in (0.03, 0.05, 0.1, 0.3, 0.5)])
+    assert weak.change_interval[sign < 0] is None
+    assert weak.area_interval[1] is None
+
+
+def test_intervals_as_text():
+    def written(value):
+        return f"{value:g}"
+
+    assert with_interval(2.0, (1.0, 3.0), written) == "2\n1 to 3"
+    assert with_interval(2.0, (1.0, None), written) == "at least 1"
+    assert with_interval(2.0, (None, 3.0), written) == "at most 3"
+    assert with_interval(2.0, (None, None), written) == "not determined"
+    assert with_interval(2.0, None, written) == "2"
+    assert Inclusion(1, (0.0, 0.0), 1.0, 1.0).contrast_interval is None
