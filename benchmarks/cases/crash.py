@@ -19,7 +19,7 @@ from benchmarks.harness.timing import say
 from benchmarks.problems.killed_commands import Command, study, tank, unreadable, watch
 
 # Of a study; of another command; of any in a quick run.
-KILLS, FEWER, QUICK = 30, 10, 2
+KILLS, FEWER, QUICK = 30, 10, 1
 # A command that is not resumed is run to its end after so many kills.
 ANEW = 5
 HEADER = ["command", "kills", "while it wrote", "readable after", "runs that ended after", "equal to undisturbed"]
