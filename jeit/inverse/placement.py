@@ -98,7 +98,7 @@ def place_electrodes(model: ForwardModel, voltages, *, deviation: float, mask=No
 
     `voltages` (M,), volts; `mask` (M,): True for channels to use; `deviation`: standard deviation of the described
     positions, metres, in every direction in which an electrode can move. Raises `ValueError` for electrodes that cannot
-    move, or voltages that have the opposite sign of the model's.
+    move, voltages that have the opposite sign of the model's, and where nothing is found that explains them.
     """
     if not isinstance(model.electrodes, AbstractMovableElectrodes):
         raise ValueError(f"electrodes: {type(model.electrodes).__name__} have no position that can be estimated.")
@@ -111,11 +111,13 @@ def place_electrodes(model: ForwardModel, voltages, *, deviation: float, mask=No
         found, _ = descent.at_once(problem.expand, found, scale, _STEPS)
         scale, covariance = problem.noise_and_covariance(found, scale)
     here = problem.at(found)
-    assert here is not None
-    shifts = slice(1, 1 + problem.directions.shape[0] * problem.directions.shape[1])
-    values = (problem.spread @ found)[shifts], np.sqrt(np.diag(problem.spread @ covariance @ problem.spread.T))[shifts]
-    shift, spread = (one.reshape(problem.directions.shape[:2]) for one in values)
-    return Placement(here.model, here.conductivity, shift, spread, ModelError(problem.factor(covariance)))
+    if here is None or not np.isfinite(here.voltages).all():
+        raise ValueError("voltages: no electrode positions were found that explain them.")
+    factor, shape = problem.factor(covariance), problem.directions.shape[:2]
+    number = shape[0] * shape[1]
+    shift = (problem.spread @ found)[1 : 1 + number].reshape(shape)
+    left = np.linalg.norm(factor[:number], axis=1).reshape(shape)
+    return Placement(here.model, here.conductivity, shift, left, ModelError(factor))
 
 
 class _Problem:
@@ -188,7 +190,9 @@ class _Problem:
         fitted = np.trace(np.linalg.solve(hessian + np.eye(len(hessian)), hessian))
         freedom = max(independent - fitted, 0.3 * independent)
         scale = max(_LEAST_NOISE, float(np.sqrt(share * (residual @ residual) / freedom)))
-        return scale, np.linalg.inv(rows.T @ rows / scale**2 + np.eye(len(hessian)))
+        # The inverse of a matrix with eigenvalues from one upwards, computed so that it stays definite.
+        values, axes = np.linalg.eigh(rows.T @ rows / scale**2)
+        return scale, (axes / (1 + np.maximum(values, 0))) @ axes.T
 
     def factor(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "q q"]:
         """Factor of the covariance of shifts, metres, and of log z, from that of the coefficients."""
