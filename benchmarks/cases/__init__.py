@@ -27,6 +27,7 @@ NAMES = (
     "localisation_error",
     "skin_health",
     "mixed_tanks",
+    "unlike_tanks",
     "cut_tanks",
     "solid_tanks",
     "untuned_arrays",

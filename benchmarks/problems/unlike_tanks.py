@@ -1,0 +1,178 @@
+"""Sheets that are not as they are described: disks, rectangles and polygons with one to three round bodies.
+
+Voltages are computed on another, finer mesh, for electrodes that are not where they are described, with contacts that
+differ; some tanks have one more kind of error. The defaults of jeit were set on the first kinds, `SET_ON`; those
+`KEPT_BACK` are never looked at for that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from jeit.data import Measurement
+from jeit.electrodes import BoundaryElectrodes
+from jeit.electrodes.body_mesh import body_mesh
+from jeit.forward import ForwardModel
+from jeit.image import Inclusion
+from jeit.mesh import Disk, Domain, Polygon, Rectangle, centroids
+from jeit.protocol import adjacent, skip
+from jeit_solvers.engines import as_array
+
+SET_ON = ("exact description", "electrodes", "contacts", "electrodes and contacts")
+KEPT_BACK = ("drifting contacts", "size", "gains", "few digits")
+SIZE = 0.1
+"""Half of a body's width, metres."""
+REACH = 0.3
+"""Distance, in units of `SIZE`, within which an inclusion may be a body's."""
+_NODES = 7000
+
+
+class Body(NamedTuple):
+    """**Fields**: `centre` (2,) and `radius`, metres; `change` of conductivity relative to the background."""
+
+    centre: np.ndarray
+    radius: float
+    change: float
+
+    @property
+    def area(self) -> float:
+        """Area, m²."""
+        return np.pi * self.radius**2
+
+    @property
+    def strength(self) -> float:
+        """Area times (σ/σ₀ - 1) / (σ/σ₀ + 1), m²."""
+        return self.area * self.change / (2 + self.change)
+
+
+class Tank(NamedTuple):
+    """**Fields**: `frame`: the tank with its `bodies`; `reference`: without them; `kind` of its errors; `outline`;
+    `noise`: of each voltage, relative."""
+
+    frame: Measurement
+    reference: Measurement
+    bodies: tuple[Body, ...]
+    kind: str
+    outline: str
+    noise: float
+
+
+def draw(seed: int) -> Tank:
+    """A tank, the same for the same seed; its kind of error is `seed` modulo the number of kinds."""
+    rng = np.random.default_rng(seed)
+    kinds = SET_ON + KEPT_BACK
+    kind, outline = kinds[seed % len(kinds)], ("disk", "rectangle", "polygon")[seed // len(kinds) % 3]
+    while True:
+        try:
+            return _draw(rng, kind, outline)
+        except ValueError:  # electrodes overlap: draw others
+            continue
+
+
+def _draw(rng, kind: str, outline: str) -> Tank:
+    domain = _outline(outline, rng)
+    count = int(rng.choice([16, 16, 32]))
+    edge = domain.loops(2000)[0]
+    lengths = np.linalg.norm(np.roll(edge, -1, axis=0) - edge, axis=1)
+    perimeter = float(lengths.sum())
+    conductivity = np.exp(rng.uniform(np.log(1e-4), np.log(1e-1)))
+    width = rng.uniform(0.25, 0.5) * perimeter / count
+    impedance = np.exp(rng.uniform(np.log(1e-3), np.log(2e-2))) * SIZE / conductivity
+    middle = perimeter * (np.arange(count) + 0.5) / count
+    described = BoundaryElectrodes(_along(edge, lengths, middle), width, impedance)
+    off, spread = kind not in ("exact description", "contacts"), kind not in ("exact description", "electrodes")
+    shift = off * rng.uniform(0, 3) / 360 * perimeter * rng.normal(size=count)
+    contact = impedance * np.exp(spread * rng.uniform(0, np.log(3)) * rng.normal(size=count))
+    drifted = contact * np.exp((kind == "drifting contacts") * rng.uniform(0, 0.3) * rng.normal(size=count))
+    scale = 1 + (kind == "size") * rng.uniform(-0.03, 0.03)
+    noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.08))))
+    place = _along(edge, lengths, middle + shift)
+    truth = BoundaryElectrodes(place, width, contact)
+    mesh = body_mesh(domain, truth, _NODES)
+    truth.check(mesh)
+    current = np.exp(rng.uniform(np.log(1e-4), np.log(1e-2)))
+    protocol = (
+        skip(count, int(rng.integers(1, 4)), current=current)
+        if rng.random() < 0.3
+        else adjacent(count, current=current, driven_electrodes=bool(rng.integers(2)))
+    )
+    bodies = _bodies(rng, domain)
+    middles = np.asarray(centroids(mesh))
+    whole = np.full(len(middles), conductivity)
+    held = whole.copy()
+    for body in bodies:
+        held[np.linalg.norm(middles - body.centre, axis=1) < body.radius] *= 1 + body.change
+    gain = 1 + (kind == "gains") * rng.uniform(0, 0.05) * rng.normal(size=protocol.num_measurements)
+    measured = []
+    for values, impedances in ((whole, contact), (held, drifted)):
+        electrodes = BoundaryElectrodes(scale * place, width, impedances)
+        there = replace(mesh, points=as_array(scale * np.asarray(mesh.points)))
+        voltages = gain * np.asarray(ForwardModel(there, electrodes, protocol).voltages(values))
+        deviation = noise * np.hypot(voltages, 0.02 * np.median(np.abs(voltages)))
+        voltages = voltages + deviation * rng.normal(size=voltages.shape)
+        if kind == "few digits":
+            digits = rng.integers(2, 4) - 1 - np.floor(np.log10(np.abs(voltages)))
+            voltages = np.round(voltages * 10**digits) / 10**digits
+        measured.append(voltages)
+    frames = [
+        Measurement(one, np.ones(one.shape, bool), protocol, electrodes=described, domain=domain, name=name)
+        for one, name in zip(measured, ("reference", "frame"), strict=True)
+    ]
+    bodies = tuple(body._replace(centre=scale * body.centre, radius=scale * body.radius) for body in bodies)
+    return Tank(frames[1], frames[0], bodies, kind, outline, noise)
+
+
+def matched(tank: Tank, inclusions: Sequence[Inclusion]) -> tuple[list[Inclusion | None], int]:
+    """For each body its own inclusion, the nearest of its sign within `REACH`; and how many are no body's."""
+    found: list[Inclusion | None] = [None] * len(tank.bodies)
+    if not inclusions:
+        return found, 0
+    places = np.array([one.centroid for one in inclusions]) / SIZE
+    distance = np.linalg.norm(np.array([body.centre / SIZE for body in tank.bodies])[:, None] - places, axis=2)
+    same = np.array([[(body.change > 0) == (one.sign > 0) for one in inclusions] for body in tank.bodies])
+    distance = np.where(same & (distance < REACH), distance, 1e3)
+    for body, inclusion in zip(*linear_sum_assignment(distance), strict=True):
+        if distance[body, inclusion] < REACH:
+            found[body] = inclusions[inclusion]
+    return found, len(inclusions) - sum(one is not None for one in found)
+
+
+def _outline(name: str, rng) -> Domain:
+    if name == "disk":
+        return Disk(SIZE)
+    if name == "rectangle":
+        return Rectangle(2 * SIZE, 2 * SIZE * rng.uniform(0.6, 1.0))
+    angle = 2 * np.pi * np.arange(6) / 6
+    radius = SIZE * rng.uniform(0.85, 1.1, 6)
+    return Polygon(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
+
+
+def _along(edge: np.ndarray, lengths: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Points of a closed outline at these arc lengths."""
+    arc = np.append(0, np.cumsum(lengths))
+    closed = np.vstack([edge, edge[:1]])
+    places = places % arc[-1]
+    return np.stack([np.interp(places, arc, closed[:, axis]) for axis in range(2)], axis=1)
+
+
+def _bodies(rng, domain: Domain) -> tuple[Body, ...]:
+    """One to three bodies that lie apart and off the edge."""
+    number, (x_min, x_max, y_min, y_max) = int(rng.integers(1, 4)), domain.extent
+    while True:
+        bodies: list[Body] = []
+        for _ in range(300):
+            radius = SIZE * rng.uniform(0.12, 0.28)
+            centre = rng.uniform([x_min, y_min], [x_max, y_max])
+            inside = float(np.asarray(domain.signed_distance(centre[None]))[0]) > radius + 0.08 * SIZE
+            apart = all(np.linalg.norm(centre - one.centre) > radius + one.radius + 0.12 * SIZE for one in bodies)
+            if inside and apart:
+                contrast = np.exp(rng.uniform(np.log(0.35), np.log(4.6)))
+                change = -float(-np.expm1(-contrast)) if rng.random() < 0.5 else float(np.expm1(min(contrast, 2.4)))
+                bodies.append(Body(centre, radius, change))
+                if len(bodies) == number:
+                    return tuple(bodies)
