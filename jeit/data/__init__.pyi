@@ -1,8 +1,9 @@
 from .description import load_description
 from .export import write_table
 from .gesture_set import FrameRecording, GestureSet, join, read_frame_recording
-from .imageable import check_imageable, estimate_noise, impossible_signs, reciprocity_error
+from .imageable import check_imageable
 from .measurement import Measurement
+from .quality import estimate_noise, impossible_signs, reciprocity_error
 from .registry import read
 from .round_skin import RoundSkin, simulate_press
 from .screening import screen

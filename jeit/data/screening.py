@@ -9,8 +9,8 @@ from jaxtyping import Bool
 from numpy.typing import ArrayLike
 
 from jeit.arguments import readings
-from jeit.data.imageable import order_note
 from jeit.data.measurement import Measurement
+from jeit.data.quality import order_note
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol

@@ -14,7 +14,7 @@ from instrument_files import (
 
 from jeit import data, protocol
 from jeit.data.formats import table
-from jeit.data.imageable import impossible_signs
+from jeit.data.quality import impossible_signs
 from jeit.data.registry import FORMATS
 
 RING = (

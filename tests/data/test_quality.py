@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from jeit import data, protocol
-from jeit.data.imageable import assess, channel_reciprocity_error, expected_signs
+from jeit.data.imageable import assess
+from jeit.data.quality import channel_reciprocity_error, expected_signs
 from jeit.inverse import relative_noise
 from jeit.report.compared_rules import report_measurement
 

@@ -10,7 +10,8 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids, measures
 from jeit.protocol import adjacent
-from jeit.touch.health.cut_path import LocalChange, LossFit, finer_mesh, finer_model
+from jeit.touch.health.cut_path import LossFit
+from jeit.touch.health.local_change import LocalChange, finer_mesh, finer_model
 from jeit.touch.simulate.damage import Cut
 
 CENTRE, RADIUS = np.array([0.01, 0.012]), 0.02

@@ -1,0 +1,256 @@
+"""Quality of measurements, judged from the voltages alone, without a model of the body.
+
+These are reciprocity, noise, signs that no passive body can produce, and the order of electrodes along an edge.
+
+Electrodes may be numbered in any order. An order that does not follow the edge is nevertheless reported, because two
+exchanged rows in a table of positions spoil every image without being noticed. The report adds whether the signs of the
+voltages, which depend on the order, agree with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jeit.data.measurement import Measurement
+from jeit.electrodes import BoundaryElectrodes
+from jeit.mesh.topology import along
+from jeit.protocol import Protocol
+from jeit.protocol.reciprocity import transfer_between_drives
+
+# Maximum number of frames from which a recording is judged; a longer one is sampled evenly.
+_MOST_FRAMES = 32
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """Estimate of the noise in a single voltage.
+
+    - `standard_deviation`: standard deviation (root mean square) in volts.
+    - `relative`: standard deviation divided by the root mean square of the usable voltages.
+    - `method`: "reciprocity" or "repeated frames".
+    """
+
+    standard_deviation: float
+    relative: float
+    method: str
+
+
+def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M"] | None = None) -> float | None:
+    """Relative deviation from reciprocity: ‖T - Tᵀ‖ / ‖T‖, where T is the transfer between drives.
+
+    `deviation` (M,): expected errors of the channels, relative to each other; the entries of T are divided by the
+    errors that follow from them. By default all channels are weighted equally.
+
+    T_ij is the voltage that drive pattern i would read while drive j flows, combined from the measured channels (see
+    `jeit.protocol.reciprocity.transfer_between_drives`). It is symmetric for every body, so an asymmetry is due to
+    noise, drift, gain errors, or a wrong protocol. Independent noise of relative size ε yields about √2 ε.
+
+    Returns None if no two usable channels are related by reciprocity.
+    """
+    error, noise, signal = _asymmetry(measurement, deviation)
+    if error.size == 0:
+        return None
+    if deviation is not None:
+        error = error / noise
+    size = np.linalg.norm(signal)
+    return float(np.linalg.norm(error) / size) if size > 0 else 0.0
+
+
+def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F M"]:
+    """(F, M) volts: each voltage minus the value predicted by its reciprocal channel; NaN for channels without a
+    reciprocal one."""
+    pairs, ratio = measurement.protocol.reciprocal_pairs()
+    voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
+    result = np.full(voltages.shape, np.nan, dtype=voltages.dtype)
+    if len(pairs) == 0:
+        return np.abs(result)
+    first, second = pairs.T
+    both = mask[:, first] & mask[:, second]
+    error = voltages[:, first] - voltages[:, second] / ratio
+    result[:, first] = np.where(both, error, np.nan)
+    result[:, second] = np.where(both, -error * ratio, np.nan)
+    return np.real(result) if np.isrealobj(voltages) else np.abs(result)
+
+
+def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
+    """Estimate the noise of a single voltage, from reciprocity or else from repeated frames; None if neither is
+    available.
+
+    - Reciprocity: two channels that must be equal differ by √2 standard deviations; combinations of channels are
+      treated likewise. The estimate includes drift and gain errors, which cancel in a difference of two frames: to
+      obtain the noise of a difference, apply the function to the difference.
+    - Repeated frames (8 or more, without frame names): differences of successive frames.
+
+    The estimator is robust: 1.4826 times the median absolute value, unaffected by outliers in up to half of the
+    channels.
+    """
+    voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
+    size = float(np.sqrt(np.mean(np.abs(voltages[mask]) ** 2))) if mask.any() else 0.0
+    error, gain, _ = _asymmetry(measurement)
+    if error.size:
+        deviation = _robust_deviation(error / gain)
+        method = "reciprocity"
+    elif measurement.num_frames >= 8 and not measurement.frame_names:
+        step = np.diff(voltages, axis=0)[mask[1:] & mask[:-1]]
+        deviation = _robust_deviation(step / np.sqrt(2)) if step.size else 0.0
+        method = "repeated frames"
+    else:
+        return None
+    return NoiseEstimate(deviation, deviation / size if size > 0 else float("inf"), method)
+
+
+def expected_signs(protocol: Protocol, order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " M"]:
+    """(M,) sign that each voltage has on every passive body; 0 if the sign depends on the body.
+
+    On the boundary of a simply connected sheet the potential falls monotonically from source to sink along both arcs
+    between them: a local extremum elsewhere would contradict the maximum principle, whatever the (positive)
+    conductivity. The sign of a voltage between two electrodes of the same arc is therefore known. `order` lists the
+    electrodes as they follow each other along the boundary. Channels that do not drive and measure by pairs of
+    electrodes get 0.
+    """
+    count = protocol.num_electrodes
+    rank = np.empty(count, dtype=int)
+    rank[order] = np.arange(len(order))
+    drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
+    pairs = (np.count_nonzero(drive, axis=1) == 2) & (np.count_nonzero(measurement, axis=1) == 2)
+    source = rank[drive.argmax(axis=1)]
+    # Ranks counted from the source: the potential falls along the arc from 0 to sink, and rises along the arc from sink
+    # to count.
+    sink = (rank[drive.argmin(axis=1)] - source) % count
+    plus = (rank[measurement.argmax(axis=1)] - source) % count
+    minus = (rank[measurement.argmin(axis=1)] - source) % count
+    falling = (plus <= sink) & (minus <= sink)
+    signs = np.where(falling, np.sign(minus - plus), 0)
+    plus, minus = np.where(plus == 0, count, plus), np.where(minus == 0, count, minus)
+    rising = (plus >= sink) & (minus >= sink) & ~falling
+    return np.where(pairs, np.where(rising, np.sign(plus - minus), signs), 0)
+
+
+def impossible_signs(
+    measurement: Measurement, order: Int[np.ndarray, " L"] | None = None
+) -> Float[np.ndarray, " F"] | None:
+    """(F,) fraction of the usable voltages whose sign is impossible on a passive body (real part of complex voltages).
+
+    Voltages that are pure noise have the wrong sign half of the time, so the fraction of noisy channels is about twice
+    the value returned. `order` lists the electrodes as they follow each other along the boundary; by default it is
+    found from their positions. Returns None if the electrodes are not known to lie along the boundary of an outline, or
+    if no channel has a known sign. See `expected_signs`.
+    """
+    order = boundary_order(measurement) if order is None else order
+    if order is None:
+        return None
+    signs = expected_signs(measurement.protocol, order)
+    known = np.asarray(measurement.mask) & (signs != 0)
+    wrong = known & (np.sign(np.real(np.asarray(measurement.voltages))) == -signs)
+    count = known.sum(axis=1)
+    if not count.any():
+        return None
+    return wrong.sum(axis=1) / np.maximum(count, 1)
+
+
+def boundary_order(measurement: Measurement) -> Int[np.ndarray, " L"] | None:
+    """(L,) the electrodes in their order along the outer edge, from their positions; None if they are not known to lie
+    on it."""
+    electrodes, domain = measurement.electrodes, measurement.domain
+    if not isinstance(electrodes, BoundaryElectrodes) or domain is None:
+        return None
+    loops = domain.loops()
+    if not loops:
+        return None
+    return np.argsort(along(np.asarray(electrodes.position), np.asarray(loops[0])), kind="stable")
+
+
+def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M"]) -> float | None:
+    """Noise of the channels estimated from reciprocity, in units of `deviation` (M,), the expected errors of channels
+    relative to each other. Robust like `estimate_noise`. None if no two usable channels are related by reciprocity."""
+    error, noise, _ = _asymmetry(measurement, deviation)
+    return _robust_deviation(error / noise) if error.size else None
+
+
+def _asymmetry(
+    measurement: Measurement, deviation: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Asymmetry of the transfer T between drives. Returns the entries of T - Tᵀ (watts), their standard deviation for
+    noise of the given `deviation` (default: one volt per channel), and the entries of T with its diagonal, to which the
+    asymmetry is compared; the last are divided by their noise if `deviation` is given.
+
+    The diagonal is included because for the currents that show a change best (`jeit.protocol.optimal`) the change lies
+    in the diagonal alone.
+    """
+    protocol = measurement.protocol
+    frames = np.unique(np.linspace(0, measurement.num_frames - 1, _MOST_FRAMES).round().astype(int))
+    voltages = np.nan_to_num(np.asarray(measurement.voltages)[frames])
+    masks = np.asarray(measurement.mask)[frames]
+    parts = []
+    for mask in np.unique(masks, axis=0):
+        transfer, known, gain = transfer_between_drives(
+            np.asarray(protocol.drive),
+            np.asarray(protocol.measurement),
+            np.asarray(protocol.drive_index),
+            np.asarray(protocol.measurement_index),
+            voltages[np.all(masks == mask, axis=1)],
+            mask,
+            deviation,
+        )
+        row, column = np.nonzero(np.triu(known & known.T, k=1))
+        upper, lower = transfer[:, row, column], transfer[:, column, row]
+        noise = np.hypot(gain[row, column], gain[column, row])
+        size = np.sqrt((np.abs(upper) ** 2 + np.abs(lower) ** 2) / 2)
+        own = np.flatnonzero(np.diag(known))
+        # In ‖T‖² a diagonal entry counts once, and an off-diagonal pair, which is one entry here, counts twice.
+        diagonal = np.abs(transfer[:, own, own]) / np.sqrt(2)
+        if deviation is not None:
+            size, diagonal = size / noise, diagonal / (np.sqrt(2) * gain[own, own])
+        parts.append((upper - lower, np.broadcast_to(noise, upper.shape), np.concatenate([size, diagonal], axis=1)))
+    error, noise, signal = (np.concatenate([part[k].ravel() for part in parts]) for k in range(3))
+    return error, noise, signal
+
+
+def _robust_deviation(values: np.ndarray) -> float:
+    if np.iscomplexobj(values):
+        values = np.concatenate([np.real(values), np.imag(values)])
+    return float(1.4826 * np.median(np.abs(values)))
+
+
+# Maximum number of electrodes listed in a note.
+_MOST = 40
+# Maximum difference between the fractions of impossible signs of two orders that can be due to noise.
+_CHANCE = 0.01
+
+
+def order_note(measurement: Measurement) -> str | None:
+    """A sentence that reports electrodes not numbered in their order along the edge; None if they are, or do not lie on
+    an edge."""
+    order = boundary_order(measurement)
+    if order is None or len(order) < 4 or follows(order):
+        return None
+    listed = ", ".join(str(number + 1) for number in _from_the_first(order)[:_MOST])
+    more = " …" if len(order) > _MOST else ""
+    note = f"going round the edge, the positions of the electrodes come in the order {listed}{more}"
+    here, numbered = (impossible_signs(measurement, one) for one in (order, np.arange(len(order))))
+    if here is None or numbered is None or abs(here.mean() - numbered.mean()) <= _CHANCE:
+        return f"{note}. If they are not numbered so, rows of the positions are exchanged."
+    if here.mean() < numbered.mean():
+        return f"{note}; the signs of the voltages agree."
+    return (
+        f"{note}, and the voltages contradict it: {100 * here.mean():.0f} % of their signs are impossible at these "
+        f"positions, {100 * numbered.mean():.0f} % if the electrodes followed each other by their numbers. Rows of the "
+        "positions are exchanged: mend them, or every image is wrong."
+    )
+
+
+def follows(order: Int[np.ndarray, " L"]) -> bool:
+    """Whether the numbers of electrodes in this order increase, or decrease, by one all the way round."""
+    steps = (np.roll(order, -1) - order) % len(order)
+    return bool((steps == 1).all() or (steps == len(order) - 1).all())
+
+
+def _from_the_first(order: Int[np.ndarray, " L"]) -> Int[np.ndarray, " L"]:
+    """The order rotated to begin at the first electrode, in the direction in which most numbers increase."""
+    steps = (np.roll(order, -1) - order) % len(order)
+    if (steps == len(order) - 1).sum() > (steps == 1).sum():
+        order = order[::-1]
+    return np.roll(order, -int(np.flatnonzero(order == 0)[0]))
