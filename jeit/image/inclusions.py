@@ -61,7 +61,8 @@ class Inclusion(eqx.Module):
     """A region of raised or lowered conductivity.
 
     **Fields**: `sign`: +1 for conductive, -1 for resistive; `centroid` in metres, weighted by the change; `area` in m²
-    (in solids: volume in m³); `peak`: the strongest change in the region, in the unit of the image; `on_surface`:
+    (in solids: volume in m³); `peak`: the strongest change in the region, for a body fitted with intervals the
+    posterior median of its change, in the unit of the image; `on_surface`:
     whether the region lies on a surface in space, so that it has an area although its centroid has three coordinates;
     `form`: shape of an inclusion that was fitted to data as a body in a solid, else None. Where they were estimated:
     `contrast_interval`: 68 % interval of the change relative to the background; `area_interval`: of the area, m²;

@@ -24,10 +24,10 @@ from jeit.imaging.wiring import Wiring, exchanges_message, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channels import electrode_misfits
-from jeit.inverse.placement import place_electrodes
+from jeit.inverse.placement import Placement, place_electrodes
 from jeit.inverse.shapes.quantities import Accuracy
 from jeit.mesh import Body, Mesh, OwnMesh, Solid
-from jeit_solvers.engines import as_array, has_values
+from jeit_solvers.engines import as_array
 
 
 class Clock:
@@ -169,7 +169,11 @@ class PreparedDifference:
     def accuracy(self) -> Accuracy:
         """Errors of the difference, from which intervals are computed: noise, the unknown part of electrode positions
         and contacts, and the share of the difference that equals the misfit of the reference, at least 2 %."""
-        return Accuracy(self._off_by(1.0, _LEAST_OTHER), self.calibration.model_error)
+        error = self.calibration.model_error
+        if error is None:  # a reference that the described places explain still leaves them uncertain
+            placed = _placed(self.model, np.asarray(self.reference.voltages)[0], self.mask)
+            error = placed and placed.error
+        return Accuracy(self._off_by(1.0, _LEAST_OTHER), error)
 
     @property
     def modelled_share(self) -> float:
@@ -267,27 +271,31 @@ def calibrated_model(
 
 
 def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, contact: str) -> Calibration:
-    """The calibration with what is not known of electrode positions; these are estimated if that explains the reference
-    far better.
+    """The calibration with electrode positions estimated along, if that explains the reference far better.
 
     Described positions that explain the reference are kept. So are they where a misfit has other causes: estimated
     positions explain little of a deep tank under a two-dimensional model.
     """
-    movable = isinstance(model.electrodes, AbstractMovableElectrodes)
-    if not movable or np.iscomplexobj(voltages) or not has_values(model, voltages):
+    if not float(calibration.misfit) > _EXPLAINED or (placed := _placed(model, voltages, mask)) is None:
         return calibration
-    width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
     try:
-        placed = place_electrodes(model, voltages, deviation=_MISPLACED * width, mask=mask)
-        calibration = replace(calibration, model_error=placed.error)
-        if not float(calibration.misfit) > _EXPLAINED:
-            return calibration
         again = calibrate(placed.model, voltages, mask=mask, contact=contact)
     except ValueError:
         return calibration
     if not float(again.misfit) < _BETTER * float(calibration.misfit):
-        return calibration
+        return replace(calibration, model_error=placed.error)
     return replace(again, shift=as_array(placed.shift), model_error=placed.error)
+
+
+def _placed(model: ForwardModel, voltages, mask) -> Placement | None:
+    """Electrode positions estimated from a reference frame; None if they cannot be."""
+    if not isinstance(model.electrodes, AbstractMovableElectrodes) or np.iscomplexobj(voltages):
+        return None
+    width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+    try:
+        return place_electrodes(model, voltages, deviation=_MISPLACED * width, mask=mask)
+    except ValueError:
+        return None
 
 
 def select_frames(

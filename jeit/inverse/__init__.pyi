@@ -6,6 +6,7 @@ from .linear.greit import greit
 from .linear.one_step import back_projection, one_step
 from .nonlinear.parametrisation import Parametrisation
 from .nonlinear.reconstruct import reconstruct
+from .placement import place_electrodes
 from .prior.matern import Matern
 from .prior.priors import Gaussian, Laplace, Noser, Tikhonov
 from .prior.total_variation import TotalVariation
@@ -29,6 +30,7 @@ __all__ = [
     "compare_rules",
     "greit",
     "one_step",
+    "place_electrodes",
     "posterior",
     "reconstruct",
     "relative_noise",

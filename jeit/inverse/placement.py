@@ -69,7 +69,8 @@ class ModelError(NamedTuple):
     def voltages(self, model: ForwardModel, conductivity, background) -> Float[np.ndarray, "M q"]:
         """Errors (M, q) of the difference v(`conductivity`) - v(`background`), volts, for unit coefficients.
 
-        Both in S (3-D: S/m). The covariance of the difference is the product of the errors with their transpose.
+        `conductivity` and `background` per cell, S/m (2-D: S). The covariance of the difference is the product of the
+        errors with their transpose.
         """
         electrodes: Any = model.electrodes
         sensitivity, protocol = PlacementSensitivity(model.mesh, electrodes), on_host(model.protocol)
@@ -105,14 +106,15 @@ def place_electrodes(model: ForwardModel, voltages, *, deviation: float, mask=No
     problem = _Problem(model, np.asarray(voltages), mask, deviation)
     size, scale = len(problem.spread), 1.0
     found: Any = np.zeros(size)
-    covariance = np.eye(size)
+    here, covariance = None, np.eye(size)
     descent = Descent(rtol=_RTOL, damping=1e-2, history=_STEPS + 1)
     for _ in range(2):
         found, _ = descent.at_once(problem.expand, found, scale, _STEPS)
-        scale, covariance = problem.noise_and_covariance(found, scale)
-    here = problem.at(found)
-    if here is None or not np.isfinite(here.voltages).all():
-        raise ValueError("voltages: no electrode positions were found that explain them.")
+        here = problem.at(found)
+        if here is None or not np.isfinite(here.voltages).all():
+            raise ValueError("voltages: no electrode positions were found that explain them.")
+        scale, covariance = problem.noise_and_covariance(here, scale)
+    assert here is not None
     factor, shape = problem.factor(covariance), problem.directions.shape[:2]
     number = shape[0] * shape[1]
     shift = (problem.spread @ found)[1 : 1 + number].reshape(shape)
@@ -127,6 +129,7 @@ class _Problem:
         self.given, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
         self.used = np.isfinite(measured) if mask is None else np.asarray(mask, bool) & np.isfinite(measured)
         self.measured = measured
+        self.independent = len(IndependentChannels.create(self.protocol).index)
         self.noise = np.asarray(relative_noise(as_array(measured), as_array(self.used)))
         electrodes: Any = model.electrodes
         self.directions = np.asarray(electrodes.directions(self.mesh))
@@ -175,24 +178,22 @@ class _Problem:
 
         return cost, step
 
-    def noise_and_covariance(self, coefficients, scale: float) -> tuple[float, Float[np.ndarray, "p p"]]:
-        """κ estimated from the residual, and the posterior covariance of the coefficients with it.
+    def noise_and_covariance(self, here: _Point, scale: float) -> tuple[float, Float[np.ndarray, "p p"]]:
+        """κ estimated from the residual of a fit at `scale`, and the posterior covariance of the coefficients with it.
 
         Dependent channels count once: the residual has as many degrees of freedom as independent channels, less those
         that the fit has used.
         """
-        here = self.at(coefficients)
-        assert here is not None
         residual, rows = self._residual(here), self._jacobian(here)
-        independent = min(len(IndependentChannels.create(self.given.protocol).index), len(residual))
+        independent = min(self.independent, len(residual))
         share = independent / len(residual)
-        hessian = rows.T @ rows / scale**2
-        fitted = np.trace(np.linalg.solve(hessian + np.eye(len(hessian)), hessian))
+        # With eigenvalues, the covariance stays definite where the Hessian's inverse loses its sign to rounding.
+        values, axes = np.linalg.eigh(rows.T @ rows)
+        values = np.maximum(values, 0)
+        fitted = np.sum(values / (values + scale**2))
         freedom = max(independent - fitted, 0.3 * independent)
         scale = max(_LEAST_NOISE, float(np.sqrt(share * (residual @ residual) / freedom)))
-        # The inverse of a matrix with eigenvalues from one upwards, computed so that it stays definite.
-        values, axes = np.linalg.eigh(rows.T @ rows / scale**2)
-        return scale, (axes / (1 + np.maximum(values, 0))) @ axes.T
+        return scale, (axes / (1 + values / scale**2)) @ axes.T
 
     def factor(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "q q"]:
         """Factor of the covariance of shifts, metres, and of log z, from that of the coefficients."""

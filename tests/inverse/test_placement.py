@@ -5,10 +5,11 @@ import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, ring
 from jeit.data import Measurement
-from jeit.electrodes import NodeElectrodes
+from jeit.electrodes import NodeElectrodes, SheetDiscs
 from jeit.electrodes.body_mesh import body_mesh
+from jeit.forward.changes import PlacementSensitivity, shifted
 from jeit.imaging.preparation import prepare_difference
-from jeit.inverse.placement import place_electrodes
+from jeit.inverse.placement import ModelError, place_electrodes
 
 RADIUS, SIGMA, WIDTH = 0.1, 0.02, 0.02
 DISK, PROTOCOL = Disk(RADIUS), adjacent(16, current=1e-3)
@@ -81,3 +82,58 @@ def test_what_cannot_be_placed_is_refused(tank):
     nodes = NodeElectrodes(np.arange(16))
     with pytest.raises(ValueError, match="NodeElectrodes have no position that can be estimated"):
         place_electrodes(ForwardModel(model.mesh, nodes, PROTOCOL), voltages, deviation=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["arcs", "arcs that share an edge", "discs"])
+def test_sensitivity_to_places_and_contacts_is_the_derivative(kind):
+    """Against central differences of Z, also where electrodes share facets or cells."""
+    mesh = DISK.mesh(num_points=300)
+    angle = np.array([0.3, 1.9, 3.6, 5.0]) if kind != "arcs that share an edge" else np.array([0.3, 0.515, 3.6, 5.0])
+    place = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    impedance = np.array([2e-3, 5e-3, 1e-3, 3e-3])
+    if kind == "discs":
+        electrodes = SheetDiscs(0.06 * place, 0.01, 1e-2 * impedance)
+    else:
+        electrodes = BoundaryElectrodes(RADIUS * place, WIDTH, impedance)
+    model = ForwardModel(mesh, electrodes, adjacent(4))
+    sensitivity = PlacementSensitivity(mesh, electrodes)
+    found = sensitivity(*map(np.asarray, model.fields(SIGMA)))
+    shape = sensitivity.directions.shape[:2]
+    number = shape[0] * shape[1]
+
+    def impedance_at(one, step):
+        by_shift = (step * (np.arange(number) == one)).reshape(shape)
+        moved = shifted(electrodes, sensitivity.directions, by_shift)
+        contact = impedance_of(moved) * np.exp(step * (np.arange(4) == one - number))
+        return np.asarray(model.with_electrodes(moved.with_contact_impedance(contact)).transfer_impedance(SIGMA))
+
+    def impedance_of(given):
+        return np.asarray(given.contact_impedance)
+
+    for one in (0, number - 1, number, number + 1):
+        step = 1e-5 if one < number else 1e-4
+        expected = (impedance_at(one, step) - impedance_at(one, -step)) / (2 * step)
+        np.testing.assert_allclose(found[one], expected, rtol=0, atol=2e-3 * np.abs(expected).max())
+
+
+def test_the_error_of_a_difference_is_that_of_its_model(tank):
+    """Columns of the error against differences of voltages; the last, drifts of contacts, are of one frame alone."""
+    model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)
+    body = SIGMA * np.where(np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)].mean(axis=1)[:, 0] > 0.05, 3, 1)
+    rest = np.full(len(body), SIGMA)
+    found = ModelError(np.eye(32)).voltages(model, body, rest)
+    assert found.shape == (PROTOCOL.num_measurements, 32 + 16)
+
+    def difference(electrodes):
+        moved = model.with_electrodes(electrodes)
+        return np.asarray(moved.voltages(body)), np.asarray(moved.voltages(rest))
+
+    impedance = np.asarray(DESCRIBED.contact_impedance)
+    ends = []
+    for step in (1e-4, -1e-4):
+        changed = impedance * np.exp(step * (np.arange(16) == 3))
+        ends.append(difference(DESCRIBED.with_contact_impedance(changed)))
+    there, here = ((up - down) / 2e-4 for up, down in zip(*ends, strict=True))
+    scale = np.abs(there).max()
+    np.testing.assert_allclose(found[:, 16 + 3], there - here, rtol=0, atol=1e-4 * scale)
+    np.testing.assert_allclose(found[:, 32 + 3], 0.1 * there, rtol=0, atol=1e-4 * scale)

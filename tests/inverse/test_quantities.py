@@ -8,8 +8,10 @@ from jeit.cli.console import with_interval
 from jeit.data import Measurement
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.image import Inclusion
+from jeit.inverse.placement import ModelError
+from jeit.inverse.shapes import Accuracy, StarPrior, reconstruct_shapes
 from jeit.inverse.shapes.quantities import _Held, _summary
-from jeit.mesh import centroids
+from jeit.mesh import centroids, measures
 
 RADIUS, SIGMA = 0.1, 0.02
 DISK, PROTOCOL = Disk(RADIUS), adjacent(16, current=1e-3)
@@ -33,6 +35,30 @@ def imaged(change, radius, seed=0, degrees=1.5):
         mask = np.ones(voltages.shape, bool)
         frames.append(Measurement(voltages, mask, PROTOCOL, electrodes=DESCRIBED, domain=DISK))
     return image_difference(frames[1], frames[0])
+
+
+def test_a_fitted_body_has_its_quantities_and_wider_ones_where_the_model_is_in_doubt():
+    """On the mesh of the data, with no noise: the median is the truth, and errors of the model widen the interval."""
+    model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)
+    middle, radius = np.asarray(centroids(model.mesh)), 0.025
+    inside = np.linalg.norm(middle - [0.02, 0.035], axis=1) < radius
+    voltages = np.asarray(model.voltages(SIGMA * np.where(inside, 3.0, 1.0)))
+    noise = 0.003 * np.abs(voltages)
+    widths = []
+    for error in (None, ModelError(np.diag(np.repeat([1e-3, 0.3], 16)))):
+        found = reconstruct_shapes(
+            model, voltages, SIGMA, start=[(1, (0.02, 0.03), 0.02)], noise=noise, prior=StarPrior(modes=1),
+            accuracy=Accuracy(noise, error),
+        )  # fmt: skip
+        (one,) = found.bodies
+        area = float(np.asarray(measures(model.mesh))[inside].sum())
+        assert one.quantities.strength == pytest.approx(area / 2, rel=0.05)
+        assert one.quantities.change == pytest.approx(2.0, rel=0.25)
+        assert one.area == pytest.approx(one.quantities.area, rel=1e-6)
+        assert one.contrast == pytest.approx(np.log1p(one.quantities.change))
+        low, high = one.quantities.change_interval
+        widths.append(high - low)
+    assert widths[1] > 1.2 * widths[0]
 
 
 @pytest.mark.slow

@@ -1,12 +1,15 @@
 from .ellipsoid import KINDS, Ellipsoid, EllipsoidPrior
+from .quantities import Accuracy
 from .search import LEAST_RISE, ShapeReconstruction, reconstruct_shapes
-from .star import Star, StarPrior
+from .star import Quantities, Star, StarPrior
 
 __all__ = [
     "KINDS",
     "LEAST_RISE",
+    "Accuracy",
     "Ellipsoid",
     "EllipsoidPrior",
+    "Quantities",
     "ShapeReconstruction",
     "Star",
     "StarPrior",

@@ -82,10 +82,7 @@ class SmoothField:
 
     def beside(self, level: float) -> ShapeProblem:
         """The problem of bodies with the field of this level as additional noise."""
-        covariance = self.alone.data.covariance + level**2 * (self.jacobian @ self.jacobian.T)
-        changed = (covariance, np.linalg.inv(covariance))
-        data = eqx.tree_at(lambda data: (data.covariance, data.precision), self.alone.data, changed)
-        return replace(self.alone, data=data)
+        return self.alone.with_errors(level * self.jacobian)
 
     def likeliest(self, fit: Fit) -> float:
         """Level with the largest evidence, given the voltages that the bodies do not explain."""
@@ -133,6 +130,13 @@ class ShapeProblem:
     data: Data
     background: Float[np.ndarray, " m"]
     rtol: float = 3e-3
+
+    def with_errors(self, rows: Float[np.ndarray, "r q"]) -> ShapeProblem:
+        """The problem with further errors of the data: `rows` of the weighted voltages, for coefficients of unit
+        variance."""
+        covariance = np.asarray(self.data.covariance) + rows @ rows.T
+        changed = (covariance, np.linalg.inv(covariance))
+        return replace(self, data=eqx.tree_at(lambda data: (data.covariance, data.precision), self.data, changed))
 
     def linearise(self, coefficients: Float[np.ndarray, " n"], bodies: Bodies) -> tuple[Any, Any, Any, Any]:
         """Residual (r + p,), a function that returns its Jacobian (r + p, n), its covariance and its precision

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import PchipInterpolator
@@ -32,6 +31,8 @@ _STEP, _LONGER = (0.02, 0.35), 1.6
 _STEPS, _RTOL, _ENOUGH = 8, 1e-2, 5.0
 # Standard deviation of the logarithm of areas due to the described size of the whole body: 1 % of its width.
 _SIZE = 0.02
+# Area, m², of a body that has left the sheet.
+_TINY = 1e-30
 # Rise of the -log likelihood at an end of the grid below which the data leave that end open.
 _OPEN = 1.0
 # Probabilities of the ends of an interval, and numbers of contrasts and areas of the posterior's sample.
@@ -54,16 +55,12 @@ def quantified(problem: ShapeProblem, fit: Fit, accuracy: Accuracy, stars: Seque
     if accuracy.model_error is not None:
         conductivity = problem.background * np.exp(fit.bodies.image(fit.coefficients).image)
         rows = accuracy.model_error.voltages(problem.model, conductivity, problem.background)
-        rows = np.asarray(problem.data.weight)[:, None] * rows
-        covariance = np.asarray(problem.data.covariance) + rows @ rows.T
-        changed = (covariance, np.linalg.inv(covariance))
-        data = eqx.tree_at(lambda data: (data.covariance, data.precision), problem.data, changed)
-        problem = replace(problem, data=data)
+        problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
     fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
     found = []
     for k, star in zip(order, stars, strict=True):
         quantities = quantify(problem, fit, int(k))
-        outline = star.centroid + (star.outline - star.centroid) * np.sqrt(quantities.area / star.area)
+        outline = star.centroid + (star.outline - star.centroid) * np.sqrt(quantities.area / max(star.area, _TINY))
         contrast = float(np.abs(np.log1p(quantities.change)))
         found.append(replace(star, outline=outline, contrast=contrast, quantities=quantities))
     return found
@@ -119,7 +116,7 @@ def _held_at(problem: ShapeProblem, bodies: Stars, coefficients, k: int, before:
     deviation = 2 * bodies.prior.radius_spread * float(problem.deviations(found)[log_radius])
     deviation = float(np.hypot(deviation, _SIZE))
     area = found.bodies.body(k, found.coefficients).area
-    return _Held(at, problem.surprise(found), float(np.log(area)), deviation), found.coefficients
+    return _Held(at, problem.surprise(found), float(np.log(max(area, _TINY))), deviation), found.coefficients
 
 
 def _surprise(one: _Held) -> float:
