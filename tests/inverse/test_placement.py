@@ -9,7 +9,8 @@ from jeit.electrodes import NodeElectrodes, SheetDiscs
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward.changes import PlacementSensitivity, shifted
 from jeit.imaging.preparation import prepare_difference
-from jeit.inverse.placement import ModelError, place_electrodes
+from jeit.inverse import relative_noise
+from jeit.inverse.placement import ModelError, _Problem, place_electrodes
 
 RADIUS, SIGMA, WIDTH = 0.1, 0.02, 0.02
 DISK, PROTOCOL = Disk(RADIUS), adjacent(16, current=1e-3)
@@ -137,3 +138,14 @@ def test_the_error_of_a_difference_is_that_of_its_model(tank):
     scale = np.abs(there).max()
     np.testing.assert_allclose(found[:, 16 + 3], there - here, rtol=0, atol=1e-4 * scale)
     np.testing.assert_allclose(found[:, 32 + 3], 0.1 * there, rtol=0, atol=1e-4 * scale)
+
+
+def test_the_noise_is_estimated_from_the_residual():
+    """Of voltages of the described model with half of the expected noise, fitted or not."""
+    model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)
+    exact = np.asarray(model.voltages(SIGMA))
+    noise = 0.5 * np.asarray(relative_noise(exact)) * np.random.default_rng(0).normal(size=len(exact))
+    problem = _Problem(model, exact + noise, None, 1e-6)
+    here = problem.at(np.zeros(33))
+    assert here is not None
+    assert problem.noise_and_covariance(here, 0.5)[0] == pytest.approx(0.5, rel=0.15)
