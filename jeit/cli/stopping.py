@@ -1,5 +1,5 @@
-"""Handling of Ctrl-C and SIGTERM during streaming: the frames received are written, and the exit status tells which
-signal stopped the command."""
+"""Handling of Ctrl-C and SIGTERM during streaming: the frames received are written, and the exit status is that of the
+signal that stopped the command."""
 
 from __future__ import annotations
 

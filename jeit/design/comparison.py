@@ -74,7 +74,9 @@ def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
     if num_taxels is None:
         return min(NUM_TAXELS, len(grid.places))
     if not 1 <= num_taxels <= len(grid.places):
-        raise ValueError(f"num_taxels is {num_taxels}; give from 1 to the {len(grid.places)} places touched.")
+        raise ValueError(
+            f"num_taxels is {num_taxels}; it must be from 1 to {len(grid.places)}, the number of places touched."
+        )
     return num_taxels
 
 

@@ -115,7 +115,7 @@ def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
         ([None, "--contrast", 1e7], "up to 1e+06, where the limit is reached long before"),
         ([None, "--places", 100_000], "--places must be from 2 to 256"),
         ([None, "--taxels", 0], "--taxels must be at least 1"),
-        ([None, "--taxels", 101], "--taxels is 101; give from 1 to the"),
+        ([None, "--taxels", 101], "--taxels is 101; it must be from 1 to"),
         ([None, "--pairs", 16], "--pairs is 16; 'inside' has 6 electrodes, and they make 15 pairs"),
         ([None, "--seed", -1], "--seed must be at least 0"),
         (["grid-2x1"], "'grid-2x1' has 2 electrodes; give a layout of three or more"),

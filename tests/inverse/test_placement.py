@@ -141,9 +141,9 @@ def test_the_error_of_a_difference_is_that_of_its_model(tank):
 
 
 def test_the_noise_is_estimated_from_the_residual():
-    """Of voltages of the described model with half of the expected noise, fitted or not."""
+    """Of voltages of the described model, where the fit starts, with half of the expected noise."""
     model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)
-    exact = np.asarray(model.voltages(SIGMA))
+    exact = np.asarray(model.voltages(1.0))
     noise = 0.5 * np.asarray(relative_noise(exact)) * np.random.default_rng(0).normal(size=len(exact))
     problem = _Problem(model, exact + noise, None, 1e-6)
     here = problem.at(np.zeros(33))

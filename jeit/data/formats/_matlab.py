@@ -1,4 +1,4 @@
-"""Reader of numeric variables in MATLAB files, with error messages that tell the user what to do.
+"""Reader of numeric variables in MATLAB files, with error messages that say what to do.
 
 Numeric arrays of format 5 ("MAT-File Format" by The MathWorks) are decoded here instead of by SciPy, whose reader can
 be crashed by crafted files. Nothing is decompressed beyond the size that the file declares.

@@ -3,8 +3,8 @@
 Numbers are little-endian. Bytes 0-3 are the version of the format and bytes 4-7 the length of the header text; frames
 begin at byte 16 + this length. The text states the frame rate as "Framerate [Hz]:". A frame of version 50 and later has
 5,495 bytes, one of version 32 has 5,200. It begins with 600 numbers of eight bytes, of which the first 208 and the 208
-from number 322 on are the two parts of the adjacent voltages. The weights of the two parts are not published, but
-estimates by users.
+from number 322 on are the two parts of the adjacent voltages. The maker has not published
+the weights of the two parts; those used here are estimates by users.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _MARK, _BEFORE = b"---Draeger EIT-Software", 16
 _SECOND, _WEIGHTS = 322, (9.8242e-4, 1.9607e-4)
 _NOTES = (
     "the scale of the voltages is an estimate, not published: trust relative changes, not volts.",
-    "the electrodes are taken to be read in the sense that makes voltages positive.",
+    "electrode pairs are assumed to have the polarity that makes voltages positive.",
 )
 
 

@@ -28,7 +28,7 @@ _ROUND = 2**32
 _SCALE = 2.048 / (2**20 * 360 * 1000)
 _NOTES = (
     "neither the scale of the voltages nor the current is published (5 mA is assumed): trust relative changes alone.",
-    "the electrodes are taken to be read in the sense that makes voltages positive.",
+    "electrode pairs are assumed to have the polarity that makes voltages positive.",
     "voltages of driven electrodes are left out: they were not measured with care.",
 )
 

@@ -198,8 +198,8 @@ def _check_shares(number: int, parts: int, total: int, symmetry: str | None) -> 
 
 
 def balanced(scores: Scores) -> Float[Array, ""]:
-    """Default score of an `Objective`: log of the soft-worst sensitivity minus log of the mean variance, so that a
-    change of either by one per cent counts the same."""
+    """Default score of an `Objective`: log of the smooth minimum of the sensitivity minus log of the mean variance, so
+    that a change of either by one per cent counts the same."""
     return jnp.log(scores.soft_worst) - jnp.log(scores.mean_variance)
 
 

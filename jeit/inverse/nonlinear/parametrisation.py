@@ -42,8 +42,8 @@ class AbstractUnknown(eqx.Module):
     def apply(
         self, model: ForwardModel, estimate: Float[Array, " m"], values: Float[Array, " k"]
     ) -> tuple[ForwardModel, Float[Array, " m"]]:
-        """Model and image `estimate` (on the link's scale) changed by the values of the unknown, which are zero in the
-        model and image given."""
+        """Return the model and the image `estimate`, on the link's scale, with the unknown's `values` added. Values of
+        zero leave both unchanged."""
 
     def quantity(self, model: ForwardModel, values: Float[Array, " k"]) -> Float[Array, " k"]:
         """Estimated quantities in their unit, computed from the values; by default the values themselves."""

@@ -32,9 +32,9 @@ class StarPrior(BodyPrior):
 
     - `modes`: N, number of the highest mode of an outline; 1 gives disks.
     - `roughness`: standard deviation of a₂ and b₂; for aₙ and bₙ it is multiplied by 2/n.
-    - `contrast`, `contrast_spread`: mean and standard deviation of the contrast in log σ of a strong body. Data hardly
-      distinguish a body ten times as conductive or resistive as the bath from a stronger one, so these are best kept
-      close to a high value.
+    - `contrast`, `contrast_spread`: mean and standard deviation of the contrast in log σ of a strong body, ten times as
+      conductive or resistive as the bath or more. Data hardly distinguish its contrast from a higher one, so the mean
+      is high and the standard deviation small.
     - `weak_contrast`, `weak_spread`: median of the contrast in log σ of a weak body, and standard deviation of its
       logarithm.
     - `odds_against_weak`: prior odds of a strong body relative to a weak one.

@@ -132,8 +132,8 @@ def _sleeve(height: float, halves: np.ndarray, around: int) -> Mesh:
 
 
 def _between(low: np.ndarray, high: np.ndarray, ahead: int) -> np.ndarray:
-    """Triangles between two rings with equal numbers of nodes, offset by half the distance of nodes; `ahead` tells
-    whether the lower ring is ahead."""
+    """Triangles between two rings with equal numbers of nodes, offset by half the node spacing; `ahead`: whether the
+    lower ring is ahead."""
     after_low, after_high = np.roll(low, -1), np.roll(high, -1)
     if ahead:
         return np.concatenate([np.stack([low, after_low, after_high], 1), np.stack([low, after_high, high], 1)])

@@ -140,7 +140,7 @@ def fit(
 ) -> None:
     """Learn to name sounds from labelled clips; says how well, on clips that were held out.
 
-    Writes listener.jeit, report.json and learning.png, a picture of what was taken for what, to the folder MODEL.
+    Writes listener.jeit, report.json and learning.png, the confusion matrix, to the folder MODEL.
     Killed and called again, it goes on where it was.
     """
     import shutil

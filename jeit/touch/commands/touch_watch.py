@@ -44,7 +44,7 @@ def gestures(
 ) -> None:
     """Learn gestures from recordings of them; says how often those of people who were held out are named correctly.
 
-    Writes gestures.skops, report.json and gestures.png, what was taken for what, to the folder MODEL.
+    Writes gestures.skops, report.json and gestures.png, the confusion matrix, to the folder MODEL.
     """
     from jeit.arguments.extras import need_extra
     from jeit.cli.console import Steps, pairs, plain_console, say_written

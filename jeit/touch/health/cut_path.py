@@ -273,7 +273,7 @@ class LossFit:
         normal = np.column_stack([-along[:, 1], along[:, 0]])
         off = self.centres[:, None] - start  # (m, s, 2)
         place = np.sum(off * along, axis=-1)
-        # The path is shortened by the width of the band beyond it, so that the band ends at the ends of the path.
+        # The band reaches beyond the ends of its centre line, which is shortened so that the band ends with the path.
         pulled = np.minimum(self.band / _ENDS, 0.45 * lengths)
         first, last = np.zeros(len(lengths)), lengths.copy()
         first[0] += pulled[0]

@@ -27,8 +27,8 @@ from jeit.touch.training import Plan
 _ROUNDS, _LEAVES, _IN_A_LEAF = 100, 15, 10
 BATCHES = 1500
 """Default of the maximum number of training batches."""
-# Limits for small sets: maximum number of passes through the windows, unless these are fewer batches than the second
-# number.
+# Limits for small sets: maximum number of passes through the windows, and the number of batches that are allowed even
+# if they make more passes than that.
 _THROUGH, _FEWEST = 40, 100
 # One in this number of groups of each class is held out for early stopping of the network's training.
 _STOPPING = 6

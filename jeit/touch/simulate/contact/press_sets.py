@@ -162,7 +162,7 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
     """Open the set in a store as an `xarray.Dataset` with dimensions touch, channel and press, or, for indents, row and
     column instead of press.
 
-    Data are read on access; `finished` (touch,) tells which touches have been simulated. Raises as
+    Data are read on access; `finished` (touch,) marks the touches that have been simulated. Raises as
     `jeit.design.study.store.Store`.
     """
     need_extra("cluster", "a set of touches")
