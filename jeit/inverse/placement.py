@@ -21,7 +21,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
 
 from jeit.electrodes.electrodes import AbstractMovableElectrodes
 from jeit.forward import ForwardModel
@@ -93,7 +94,13 @@ class _Point(NamedTuple):
     voltages: Float[np.ndarray, " M"]
 
 
-def place_electrodes(model: ForwardModel, voltages, *, deviation: float, mask=None) -> Placement:
+def place_electrodes(
+    model: ForwardModel,
+    voltages: Float[ArrayLike, " M"],
+    *,
+    deviation: float,
+    mask: Bool[ArrayLike, " M"] | None = None,
+) -> Placement:
     """Estimate where the electrodes of a `model` are, and their contact impedances, from a frame of the homogeneous
     body.
 
