@@ -19,7 +19,7 @@ from jeit.electrodes import BoundaryElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion
-from jeit.mesh import Disk, Domain, Polygon, Rectangle, centroids
+from jeit.mesh import Disk, Domain, Polygon, Rectangle, centroids, measures
 from jeit.protocol import adjacent, skip
 from jeit_solvers.engines import as_array
 
@@ -33,16 +33,13 @@ _NODES = 7000
 
 
 class Body(NamedTuple):
-    """**Fields**: `centre` (2,) and `radius`, metres; `change` of conductivity relative to the background."""
+    """**Fields**: `centre` (2,) and `radius`, metres; `change` of conductivity relative to the background; `area` of
+    the cells that are the body, m²."""
 
     centre: np.ndarray
     radius: float
     change: float
-
-    @property
-    def area(self) -> float:
-        """Area, m²."""
-        return np.pi * self.radius**2
+    area: float = np.nan
 
     @property
     def strength(self) -> float:
@@ -105,8 +102,9 @@ def _draw(rng, kind: str, outline: str) -> Tank:
     middles = np.asarray(centroids(mesh))
     whole = np.full(len(middles), conductivity)
     held = whole.copy()
-    for body in bodies:
-        held[np.linalg.norm(middles - body.centre, axis=1) < body.radius] *= 1 + body.change
+    inside = [np.linalg.norm(middles - body.centre, axis=1) < body.radius for body in bodies]
+    for body, cells in zip(bodies, inside, strict=True):
+        held[cells] *= 1 + body.change
     gain = 1 + (kind == "gains") * rng.uniform(0, 0.05) * rng.normal(size=protocol.num_measurements)
     measured = []
     for values, impedances in ((whole, contact), (held, drifted)):
@@ -123,7 +121,11 @@ def _draw(rng, kind: str, outline: str) -> Tank:
         Measurement(one, np.ones(one.shape, bool), protocol, electrodes=described, domain=domain, name=name)
         for one, name in zip(measured, ("reference", "frame"), strict=True)
     ]
-    bodies = tuple(body._replace(centre=scale * body.centre, radius=scale * body.radius) for body in bodies)
+    areas = [scale**2 * float(np.asarray(measures(mesh))[cells].sum()) for cells in inside]
+    bodies = tuple(
+        Body(scale * body.centre, scale * body.radius, body.change, area)
+        for body, area in zip(bodies, areas, strict=True)
+    )
     return Tank(frames[1], frames[0], bodies, kind, outline, noise)
 
 

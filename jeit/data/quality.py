@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jeit.data.measurement import Measurement
 from jeit.electrodes import BoundaryElectrodes
@@ -22,6 +22,9 @@ from jeit.protocol.reciprocity import transfer_between_drives
 
 # Maximum number of frames from which a recording is judged; a longer one is sampled evenly.
 _MOST_FRAMES = 32
+# Rounding: largest number of significant digits, relative accuracy of multiples of a step (single precision), and
+# smallest number of voltages that can show it.
+_MOST_DIGITS, _EXACTLY, _LEAST_ROUNDED = 5, 1e-6, 16
 
 
 @dataclass(frozen=True)
@@ -168,6 +171,34 @@ def reciprocity_noise(measurement: Measurement, deviation: Float[np.ndarray, " M
     relative to each other. Robust like `estimate_noise`. None if no two usable channels are related by reciprocity."""
     error, noise, _ = _asymmetry(measurement, deviation)
     return _robust_deviation(error / noise) if error.size else None
+
+
+def rounding_deviation(voltages: Float[np.ndarray, " M"], mask: Bool[np.ndarray, " M"]) -> Float[np.ndarray, " M"]:
+    """Standard deviation (M,) of the rounding of voltages, volts; zero where none is found.
+
+    Voltages may be rounded to a number of significant digits, or to multiples of a step, such as that of a converter.
+    The coarsest rounding that agrees with all usable voltages is taken; its error is uniform within ± half a step.
+    Reciprocal voltages are rounded alike, so reciprocity does not show this error.
+    """
+    size, mask = np.abs(np.real(np.asarray(voltages))), np.asarray(mask)
+    values = size[mask & (size > 0)]
+    if len(values) < _LEAST_ROUNDED:
+        return np.zeros(len(size))
+    each = np.where(mask, np.maximum(size, values.min()), values.min())
+    steps = [10.0 ** (np.floor(np.log10(each) + _EXACTLY) - digits) for digits in range(_MOST_DIGITS)]
+    apart = np.diff(np.unique(np.append(0, values)))
+    least = apart[apart > _EXACTLY * values.max()].min()
+    steps += [np.full(len(size), least / part) for part in (1, 2, 3)]
+    rounded = [one for one in steps if _are_multiples(size[mask], one[mask])]
+    coarsest = max(rounded, key=lambda one: float(np.log(one[mask]).sum()), default=np.zeros(len(size)))
+    return coarsest / np.sqrt(12)
+
+
+def _are_multiples(values: np.ndarray, step: np.ndarray) -> bool:
+    """Whether values are multiples of their steps, of which none has more than `_MOST_DIGITS` digits."""
+    count = values / step
+    off = np.abs(count - np.round(count))
+    return bool((count < 10**_MOST_DIGITS).all() and (off <= _EXACTLY * np.maximum(count, 1)).all())
 
 
 def _asymmetry(

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jeit.arguments import check_kind
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality, assess
+from jeit.data.quality import rounding_deviation
 from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
@@ -145,15 +146,18 @@ class PreparedDifference:
 
     @property
     def noise(self) -> float | None:
-        """Estimated standard deviation of the noise of the difference, in units of `relative_noise`; None if not
-        known."""
-        return self.quality.trusted_noise
+        """Estimated standard deviation of the noise of the difference, that of rounding included, in units of
+        `relative_noise`; None if not known."""
+        if self.quality.trusted_noise is None:
+            return None
+        rounded = np.asarray(self._rounding)[self.mask] / np.asarray(self.relative_noise)[self.mask]
+        return float(np.hypot(self.quality.trusted_noise, np.sqrt(np.mean(rounded**2))))
 
     @property
     def modelled_noise(self) -> Float[Array, " M"]:
         """Expected deviation of the difference from the voltages of the model, volts: the root of the sum of squares of
-        the noise of the difference, and of the model error, which is the difference times the relative misfit of the
-        reference (at least 3 %).
+        the noise of the difference, of rounding, and of the model error, which is the difference times the relative
+        misfit of the reference (at least 3 %).
 
         If the noise is not known, 0.1 of the difference is used instead, at most 1 in units of `relative_noise`.
         """
@@ -179,14 +183,21 @@ class PreparedDifference:
     def modelled_share(self) -> float:
         """Share of the variance of `sharp_noise` that is due to the model error, from 0 to 1; 1 if the noise is not
         known."""
-        sharp = np.asarray(self.sharp_noise)[0] / np.asarray(self.relative_noise)[0]
-        return 1 - (0 if self.noise is None else self.noise / float(sharp)) ** 2
+        sharp = np.asarray(self.sharp_noise)[self.mask] / np.asarray(self.relative_noise)[self.mask]
+        return 1 - (0 if self.noise is None else self.noise**2 / float(np.mean(sharp**2)))
 
     def _off_by(self, times: float, least: float = _LEAST_MISFIT) -> Float[Array, " M"]:
         shape, used = np.asarray(self.relative_noise), np.asarray(self.mask)
         size = np.sqrt(np.mean(np.abs(np.asarray(self.difference)[used] / shape[used]) ** 2))
-        noise = min(1.0, 0.1 * size) if self.noise is None else self.noise
-        return as_array(shape * np.hypot(noise, times * max(float(self.calibration.misfit), least) * size))
+        noise = min(1.0, 0.1 * size) if self.noise is None else self.quality.trusted_noise
+        unmodelled = times * max(float(self.calibration.misfit), least) * size
+        return as_array(np.hypot(shape * np.hypot(noise, unmodelled), self._rounding))
+
+    @functools.cached_property
+    def _rounding(self) -> Float[np.ndarray, " M"]:
+        """Standard deviation of the rounding of the difference, volts."""
+        frames = [np.asarray(one.voltages)[0] for one in (self.measurement, self.reference)]
+        return np.hypot(*(rounding_deviation(one, np.asarray(self.mask)) for one in frames))
 
 
 def prepare_difference(

@@ -6,7 +6,7 @@ import pytest
 
 from jeit import data, protocol
 from jeit.data.imageable import assess
-from jeit.data.quality import channel_reciprocity_error, expected_signs
+from jeit.data.quality import channel_reciprocity_error, expected_signs, rounding_deviation
 from jeit.inverse import relative_noise
 from jeit.report.compared_rules import report_measurement
 
@@ -250,3 +250,25 @@ def test_a_measurement_is_a_pytree(tank, setup):
     measurement = data.screen(tank(chosen), chosen, **setup(8))
     doubled = jax.jit(lambda m: 2 * m.filled())(measurement)
     np.testing.assert_allclose(doubled, 2 * measurement.voltages)
+
+
+def rounded(voltages, digits):
+    return np.array([float(f"{one:.{digits - 1}e}") for one in voltages])
+
+
+@pytest.mark.parametrize("to", ["digits", "step", "single precision"])
+def test_the_deviation_of_rounding_is_that_of_the_rounded_voltages(to):
+    rng = np.random.default_rng(0)
+    voltages = 1e-3 * rng.lognormal(size=208) * rng.choice([-1, 1], 208)
+    seen = 1.7e-5 * np.round(voltages / 1.7e-5) if to == "step" else rounded(voltages, 3)
+    if to == "single precision":
+        seen = seen.astype(np.float32).astype(float)
+    error, deviation = seen - voltages, rounding_deviation(seen, np.ones(208, bool))
+    assert np.std(error / deviation) == pytest.approx(1, abs=0.1)
+    assert not rounding_deviation(voltages, np.ones(208, bool)).any()
+
+
+def test_masked_voltages_do_not_hide_rounding():
+    voltages = rounded(np.random.default_rng(1).normal(size=100), 2)
+    voltages[3], mask = np.pi, np.arange(100) != 3
+    assert rounding_deviation(voltages, mask)[mask].all()
