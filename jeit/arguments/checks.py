@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from numbers import Real
 from typing import Any
 
@@ -91,6 +91,27 @@ def percent(value: float | None) -> str:
     if 0 < abs(share) < _LEAST_PERCENT:
         return f"less than {_LEAST_PERCENT:g} %"
     return f"{share:.2g} %"
+
+
+Interval = tuple[float | None, float | None]
+"""Ends of a credible interval, None where the data leave an end open."""
+
+
+def interval_text(
+    value: float | None, interval: Interval | None, written: Callable[[float], str], parted: str = "\n{} to {}"
+) -> str:
+    """A value and its interval, `parted` from it, as text; "at least" or "at most" the known end where the other one is
+    open."""
+    if value is None or interval is None:
+        return "not known" if value is None else written(value)
+    low, high = interval
+    if low is None and high is None:
+        return "not determined"
+    if low is None:
+        return f"at most {written(high)}"  # pyright: ignore
+    if high is None:
+        return f"at least {written(low)}"
+    return written(value) + parted.format(written(low), written(high))
 
 
 # Maximum reading of any instrument, in volts or fractions of volts; squares of such numbers do not overflow.

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from jeit.arguments import percent
+from jeit.arguments import interval_text, percent
 
 if TYPE_CHECKING:
     from jeit.image import Inclusion
-    from jeit.image.inclusions import Interval
 
 
 # Maximum width of a table, in characters.
@@ -111,80 +110,67 @@ def in_one_unit(values: list[float], unit: str) -> tuple[str, list[str]]:
     return f"{prefix}{unit}", [f"{value / 10.0**exponent:.3g}" for value in values]
 
 
-def inclusion_table(
-    inclusions: "Sequence[Inclusion]",
-    unit: str,
-    ranges: Sequence[tuple[float, float]] = (),
-    *,
-    background: float | None = None,
-) -> Table:
+def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background: float | None = None) -> Table:
     """Create a table with a row for each inclusion: kind, place, size, and peak change of conductivity.
 
-    `unit`: unit of conductivity. `ranges`: range of each peak, if known. `background`: conductivity of the reference,
-    if known.
+    `unit`: unit of conductivity. `background`: conductivity of the reference, if known.
     """
-    ends = [end for both in ranges for end in both]
-    unit, said = in_one_unit([*(one.peak for one in inclusions), *ends], unit)
-    peaks, ends = said[: len(inclusions)], said[len(inclusions) :]
-    dimension = max((len(one.centroid) for one in inclusions), default=2)
-    solid = any(one.is_solid for one in inclusions)
-    places = [f"{axis} / mm" for axis in "xyz"[:dimension]]
-    # The same factor 1e6 converts square metres to mm² and cubic metres to cm³.
-    size, digits = ("volume\n/ cm³", 2) if solid else ("area / mm²", 0)
-    more = [*(["± 1 σ"] if ranges else []), *(["of back-\nground"] if background else [])]
-    # Narrow columns let all properties of a solid body fit into 80 characters.
-    close = {"box": None, "padding": (0, 1 if ranges else 2), "collapse_padding": True, "pad_edge": not ranges}
-
+    unit, peaks = in_one_unit([one.peak for one in inclusions], unit)
+    size, digits = _size(inclusions)
+    more = ["of back-\nground"] if background else []
     rows = []
-    for k, (inclusion, peak) in enumerate(zip(inclusions, peaks, strict=True)):
-        place = [f"{1e3 * value:.1f}" for value in inclusion.centroid]
-        after = [" to ".join(ends[2 * k : 2 * k + 2])] if ranges else []
-        after += [percent(inclusion.peak / background)] if background else []
-        rows.append([*place, f"{1e6 * inclusion.area:.{digits}f}", peak, *after])
+    for inclusion, peak in zip(inclusions, peaks, strict=True):
+        share = [percent(inclusion.peak / background)] if background else []
+        rows.append([f"{1e6 * inclusion.area:.{digits}f}", peak, *share])
+    return _with_places(inclusions, [size, f"peak change\n/ {unit}", *more], rows)
+
+
+def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Table:
+    """Create a table of fitted bodies with 68 % intervals of their size, change of conductivity and strength.
+
+    `background`: conductivity of the reference, S/m (2-D: S). If the data leave an end of an interval open, only the
+    other end is given.
+    """
+    size, _ = _size(inclusions)
+    unit = size.split("/")[-1].strip()
+    rows = []
+    for one in inclusions:
+        measure = interval_text(one.area, one.area_interval, lambda value: _three_digits(1e6 * value))
+        share = one.peak / background
+        change = interval_text(share, one.contrast_interval, lambda value: _three_digits(100 * value, "+"))
+        strength = interval_text(one.strength, one.strength_interval, lambda value: _three_digits(1e6 * value))
+        rows.append([measure, change, strength])
+    table = _with_places(inclusions, [size, "change\n/ %", f"strength\n/ {unit}"], rows)
+    table.caption, table.caption_justify = "below each value its 68 % interval", "left"
+    return table
+
+
+def _three_digits(value: float, sign: str = "") -> str:
+    """A number with three significant digits, and no exponent below a million."""
+    return f"{float(f'{value:.3g}'):{sign}g}"
+
+
+def _size(inclusions: "Sequence[Inclusion]") -> tuple[str, int]:
+    """Heading of sizes, and their number of decimals. The same factor 1e6 converts square metres to mm² and cubic
+    metres to cm³."""
+    return ("volume\n/ cm³", 2) if any(one.is_solid for one in inclusions) else ("area / mm²", 0)
+
+
+def _with_places(inclusions: "Sequence[Inclusion]", columns: list[str], rows: list[list[str]]) -> Table:
+    """Create a table of inclusions by kind and place, with more `columns`, in 80 characters."""
+    dimension = max((len(one.centroid) for one in inclusions), default=2)
+    close = {"box": None, "padding": (0, 2), "collapse_padding": True}
 
     def table_of(parted: str) -> Table:
         """Create the table; `parted` separates the kind of a body from the word "column"."""
-        table = Table("inclusion", *places, size, f"peak change\n/ {unit}", *more, **close)
+        table = Table("inclusion", *(f"{axis} / mm" for axis in "xyz"[:dimension]), *columns, **close)
         table.columns[0].min_width = max((len(one.kind) for one in inclusions), default=0)
         for column in table.columns[1:]:
             column.justify = "right"
         for inclusion, row in zip(inclusions, rows, strict=True):
-            table.add_row(f"{inclusion.kind}{parted}column" if inclusion.is_column else inclusion.kind, *row)
+            kind = f"{inclusion.kind}{parted}column" if inclusion.is_column else inclusion.kind
+            table.add_row(kind, *(f"{1e3 * value:.1f}" for value in inclusion.centroid), *row)
         return table
 
     whole = table_of(" ")
     return whole if Console(width=_WIDTH + 1).measure(whole).maximum <= _WIDTH else table_of("\n")
-
-
-def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Table:
-    """Create a table of fitted bodies with 68 % intervals of their area, change of conductivity and strength.
-
-    `background`: conductivity of the reference, S. If the data leave an end of an interval open, only the other end is
-    given.
-    """
-    close = {"box": None, "padding": (0, 2), "collapse_padding": True}
-    columns = ["x / mm", "y / mm", "area / mm²", "change of con-\nductivity / %", "strength / mm²"]
-    table = Table("inclusion", *columns, **close, caption="below each value its 68 % interval", caption_justify="left")
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for one in inclusions:
-        area = with_interval(one.area, one.area_interval, lambda value: f"{1e6 * value:.0f}")
-        change = with_interval(one.peak / background, one.contrast_interval, lambda value: f"{100 * value:+.3g}")
-        strength = with_interval(one.strength, one.strength_interval, lambda value: f"{1e6 * value:.0f}")
-        place = [f"{1e3 * value:.1f}" for value in one.centroid]
-        table.add_row(one.kind, *place, area, change, strength)
-    return table
-
-
-def with_interval(value: float | None, interval: "Interval | None", written: Callable[[Any], str]) -> str:
-    """A value above its interval as text; "at least" or "at most" the known end where the other one is open."""
-    if value is None or interval is None:
-        return "not known" if value is None else written(value)
-    low, high = interval
-    if low is None and high is None:
-        return "not determined"
-    if high is None:
-        return f"at least {written(low)}"
-    if low is None:
-        return f"at most {written(high)}"
-    return f"{written(value)}\n{written(low)} to {written(high)}"

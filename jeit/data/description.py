@@ -25,6 +25,9 @@ Sections of a description (`tank6cm.toml` in this folder is an example; only `[p
   `polarity`, `unit`, `saturation`; `frame_names`; `keys`: variables to read from a .mat or .npz file; `axes`: order of
   the axes of a three-dimensional array (default: electrodes, patterns, frames); `frames` = "all", or "mean" for their
   average; `frame_rate` in frames per second.
+- `[uncertainty]`: standard deviations of what is described: `position` of electrodes in metres, or `position_degrees`
+  on a disk or cylinder; `contact_drift_percent`, from the reference to a frame; `size_percent` of the body;
+  `other_percent` of the difference. See `jeit.inverse.Uncertainty`.
 - `[notes]`: `text`, a list of sentences that are copied to the notes of the measurement.
 """
 
@@ -36,17 +39,20 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from jeit.data.described_body import described_body, described_electrodes
 from jeit.data.described_protocol import described_protocol
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.files import read_toml
 from jeit.forward import ForwardModel
-from jeit.mesh import Body
+from jeit.inverse import Uncertainty
+from jeit.mesh import Body, Disk, Solid
 from jeit.protocol import Protocol
 
 if TYPE_CHECKING:
-    from jeit.data.description_tables import DataTable, ProtocolTable
+    from jeit.data.description_tables import DataTable, ProtocolTable, UncertaintyTable
     from jeit.protocol.all_at_once import Reading
 
 BUNDLED = ("tank6cm",)
@@ -82,6 +88,7 @@ class Description:
     layout: TableLayout
     notes: tuple[str, ...]
     protocol_section: ProtocolTable | None = field(repr=False)
+    uncertainty: Uncertainty | None = None
 
     def protocol(self, path: str | Path) -> Protocol | None:
         """The protocol of the file at `path`, or None if none is described. The name of the file may state the current.
@@ -168,7 +175,22 @@ def parse_description(table: dict[str, Any], origin: str, folder: str | Path = "
         layout=_layout(tables.data),
         notes=tuple(tables.notes.text),
         protocol_section=tables.protocol,
+        uncertainty=None if tables.uncertainty is None else _uncertainty(tables.uncertainty, domain, origin),
     )
+
+
+def _uncertainty(table: UncertaintyTable, domain: Body | None, origin: str) -> Uncertainty:
+    """Uncertainty from its table. Raises `ValueError` for degrees of a body that is not round."""
+    position = table.position
+    if table.position_degrees is not None:
+        outline = domain.outline if isinstance(domain, Solid) else domain
+        if not isinstance(outline, Disk):
+            raise ValueError(
+                f"{origin}: [uncertainty] position_degrees is of a disk or a cylinder; give position, in metres."
+            )
+        position = float(np.deg2rad(table.position_degrees) * np.asarray(outline.radius))
+    shares = (table.contact_drift_percent, table.size_percent, table.other_percent)
+    return Uncertainty(position, *(one / 100 for one in shares))
 
 
 def _layout(data: DataTable) -> TableLayout:

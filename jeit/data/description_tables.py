@@ -10,6 +10,7 @@ from pydantic import FailFast, Field, model_validator
 
 from jeit.files import MOST_ELECTRODES
 from jeit.files.schema import Number, Numbers, OneOf, Table, Word, Words, fault
+from jeit.inverse import Uncertainty
 
 # Maximum numbers of vertices of a polygon and of its holes: each side is compared with every other side, and each hole
 # with every other hole.
@@ -390,6 +391,23 @@ class NotesTable(Table):
     text: Annotated[list[Annotated[str, Field(max_length=10_000)]], FailFast()] = Field(default=[])
 
 
+class UncertaintyTable(Table):
+    """Table of how accurately the sensor is described."""
+
+    what = "[uncertainty]"
+    position: Annotated[float, Number(0, 1e3, "m")] | None = None
+    position_degrees: Annotated[float, Number(0, 90, "degrees")] | None = None
+    contact_drift_percent: Annotated[float, Number(0, 1000, "%")] = 100 * Uncertainty().drift
+    size_percent: Annotated[float, Number(0, 100, "%")] = 100 * Uncertainty().size
+    other_percent: Annotated[float, Number(0, 100, "%")] = 100 * Uncertainty().other
+
+    @model_validator(mode="after")
+    def _check_position(self) -> "UncertaintyTable":
+        if self.position is not None and self.position_degrees is not None:
+            raise fault("says the same as position; give one of the two.", "position_degrees")
+        return self
+
+
 GeometryTable = DiskTable | RectangleTable | PolygonTable | BoxTable | CylinderTable | MeshTable
 ElectrodesTable = BoundaryTable | DiscTable | PatchTable | PointTable | FacetsTable
 ConstructedTable = (
@@ -424,3 +442,4 @@ class DescriptionTable(Table):
     protocol: Annotated[ProtocolTable, _PROTOCOL] | None = None
     data: DataTable = DataTable()
     notes: NotesTable = NotesTable()
+    uncertainty: UncertaintyTable | None = None

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import counted, describe, did_you_mean, is_number
 from jeit.electrodes import AbstractElectrodes
+from jeit.inverse.placement import Uncertainty
 from jeit.mesh import Body, Mesh
 from jeit.mesh.solid_body import as_body
 from jeit.protocol import Protocol
@@ -36,6 +37,8 @@ class Measurement(eqx.Module):
     - `name`, `source`: name and origin of the data; `frame_names`: one name per frame, or empty.
     - `notes`: one sentence for each assumption, and for each reason why voltages were masked.
     - `times`: (F,) increasing times of the frames in seconds; None if they are not known.
+    - `uncertainty`: how accurately electrodes and domain are known; None for the defaults of
+      `jeit.inverse.Uncertainty`.
     """
 
     voltages: Inexact[Array, "F M"]
@@ -48,6 +51,7 @@ class Measurement(eqx.Module):
     frame_names: tuple[str, ...] = eqx.field(static=True)
     notes: tuple[str, ...] = eqx.field(static=True)
     times: Float[Array, " F"] | None
+    uncertainty: Uncertainty | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -62,6 +66,7 @@ class Measurement(eqx.Module):
         frame_names: tuple[str, ...] = (),
         notes: tuple[str, ...] = (),
         times: ArrayLike | None = None,
+        uncertainty: Uncertainty | None = None,
     ):
         """`voltages` and `mask`: (F, M), or (M,) for one frame; `times`: (F,). Raises `ValueError` if shapes disagree,
         if times do not increase, and if `domain` is not a body."""
@@ -75,6 +80,7 @@ class Measurement(eqx.Module):
         self.frame_names = tuple(frame_names)
         self.notes = tuple(notes)
         self.times = None if times is None else as_array(np.asarray(times, float))
+        self.uncertainty = uncertainty
         if not jnp.issubdtype(self.voltages.dtype, jnp.inexact):
             raise ValueError(f"voltages are {self.voltages.dtype}; give real or complex volts.")
         if self.voltages.ndim != 2 or self.voltages.shape[1] != protocol.num_measurements:
@@ -232,6 +238,7 @@ class Measurement(eqx.Module):
             domain=self.domain,
             name=self.name,
             source=self.source,
+            uncertainty=self.uncertainty,
             **kept,
         )
 

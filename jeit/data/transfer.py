@@ -104,4 +104,5 @@ def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
         frame_names=measurement.frame_names,
         notes=(*measurement.notes, note),
         times=measurement.times,
+        uncertainty=measurement.uncertainty,
     )

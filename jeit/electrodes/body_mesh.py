@@ -12,10 +12,10 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import IN_MILLIMETRES
-from jeit.electrodes.discs import facet_normals, nearest_facets, seen_flat
+from jeit.electrodes.discs import facet_normals, seen_flat, tangent_frames
 from jeit.electrodes.electrodes import (
     AbstractElectrodes,
-    AbstractPlacedElectrodes,
+    AbstractMovableElectrodes,
     Contact,
     ElectrodePen,
     as_electrode_values,
@@ -147,7 +147,7 @@ def check_size(name: str, sizes: Float[np.ndarray, " L"], most: float, of: str) 
         )
 
 
-def check_placed(electrodes: AbstractPlacedElectrodes, mesh: Mesh) -> None:
+def check_placed(electrodes: AbstractMovableElectrodes, mesh: Mesh) -> None:
     """Raise `ValueError` for patches that lie off the surface of the mesh, or are larger than it."""
     sizes = {name: np.asarray(one) for name, one in electrodes.geometry().items() if name in ("width", "height")}
     points = np.asarray(mesh.points)
@@ -171,7 +171,7 @@ _MOST_AT_ONCE = 8
 _UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
 
-class FacePatches(AbstractPlacedElectrodes):
+class FacePatches(AbstractMovableElectrodes):
     """Complete electrodes that are rectangles on the surface of a 3-D mesh, independent of its nodes.
 
     A patch lies in the tangent plane at its position: its width is horizontal (perpendicular to z), its height runs up
@@ -216,6 +216,10 @@ class FacePatches(AbstractPlacedElectrodes):
         """Empty, because the electrodes do not lie on a plane mesh."""
         return ()
 
+    def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 3"]:
+        """Unit vectors along width and height of each patch."""
+        return np.stack(tangent_frames(on_host(mesh), np.asarray(self.position))[1:], axis=1)
+
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The boundary triangles of `mesh`."""
         return (mesh.facets,)
@@ -226,7 +230,7 @@ class FacePatches(AbstractPlacedElectrodes):
         normals; exact."""
         xp = namespace(self, mesh)
         area, half_size = facet_measures(mesh), xp.stack([self.width, self.height], axis=-1) / 2
-        normal, across, up = _frames(mesh, self.position)
+        normal, across, up = tangent_frames(mesh, self.position)
         corners = mesh.points[mesh.facets]
         near, reached = _reaching_patches(mesh, self.position, half_size, (normal, across, up))
         some = reached.any(axis=1).nonzero()[0] if xp is np else np.arange(len(area))
@@ -294,15 +298,3 @@ def _reaching_patches(mesh: Mesh, position, half_size, frames):
     else:
         near = jax.lax.top_k(-distance, count)[1]
     return near, xp.take_along_axis(reaches, near, axis=1)
-
-
-def _frames(mesh: Mesh, position):
-    """Unit vectors (L, 3) at each electrode: normal of the nearest facet, horizontal and upward direction. Not
-    differentiated."""
-    xp = namespace(mesh, position)
-    normal = facet_normals(mesh)[nearest_facets(mesh, position)]
-    horizontal = abs(normal[:, 2:]) > 0.9
-    upward = xp.where(horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
-    across = xp.cross(upward, normal)
-    across = across / xp.linalg.norm(across, axis=1, keepdims=True)
-    return tuple(map(undifferentiated, (normal, across, xp.cross(normal, across))))

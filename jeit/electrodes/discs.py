@@ -154,7 +154,7 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         check_discs(self, mesh, measures(mesh))
 
 
-class FaceDiscs(AbstractDiscs):
+class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
     """Complete electrodes that are discs on flat or curved faces of a 3-D mesh, independent of its nodes.
 
     On a curved face a disc covers the points within a straight distance `radius` of its position, as cut out by a ball.
@@ -177,6 +177,10 @@ class FaceDiscs(AbstractDiscs):
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Empty, because the electrodes do not lie on a plane mesh."""
         return ()
+
+    def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 3"]:
+        """Unit vectors in the face at each disc: horizontal and upward; on a horizontal face along x and y."""
+        return np.stack(tangent_frames(on_host(mesh), np.asarray(self.position))[1:], axis=1)
 
     def contact_nodes(self, mesh: Mesh) -> tuple[Int[Array, "q k"], ...]:
         """The boundary triangles of `mesh`."""
@@ -274,6 +278,18 @@ def nearest_facets(
     apart = xp.sum((position[:, None] - centres) ** 2, axis=-1) + handicap
     # A tolerance for ties, so that the result does not depend on rounding in the unit of length.
     return xp.argmax(apart <= (1 + 1e-9) * apart.min(axis=1, keepdims=True), axis=1)
+
+
+def tangent_frames(mesh: Mesh, position):
+    """Unit vectors (L, 3) at each electrode: normal of the nearest facet, horizontal and upward direction. Not
+    differentiated."""
+    xp = namespace(mesh, position)
+    normal = facet_normals(mesh)[nearest_facets(mesh, position)]
+    horizontal = abs(normal[:, 2:]) > 0.9
+    upward = xp.where(horizontal, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])).astype(normal.dtype)
+    across = xp.cross(upward, normal)
+    across = across / xp.linalg.norm(across, axis=1, keepdims=True)
+    return tuple(map(undifferentiated, (normal, across, xp.cross(normal, across))))
 
 
 def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:

@@ -129,11 +129,11 @@ class AbstractPlacedElectrodes(AbstractCompleteElectrodes):
 
 
 class AbstractMovableElectrodes(AbstractPlacedElectrodes):
-    """Base of complete electrodes that can slide on a plane mesh."""
+    """Base of complete electrodes that can slide on a mesh."""
 
     @abc.abstractmethod
-    def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a 2"]:
-        """Unit vectors (L, a, 2) along the a directions in which each electrode can move on `mesh`."""
+    def directions(self, mesh: Mesh) -> Float[np.ndarray, "L a d"]:
+        """Unit vectors (L, a, d) along the a directions in which each electrode can move on `mesh`."""
 
 
 class AbstractPointElectrodes(AbstractElectrodes):

@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jeit.arguments.checks import Interval
 from jeit.image.segmentation import basins, shared_facets
 from jeit.mesh import Mesh, centroids, measures
 
@@ -53,10 +54,6 @@ class SolidForm(eqx.Module):
 _LEAST_AREA = {2: 0.004, 3: 0.001}
 
 
-Interval = tuple[float | None, float | None]
-"""Ends of a 68 % credible interval, None where the data leave an end open."""
-
-
 class Inclusion(eqx.Module):
     """A region of raised or lowered conductivity.
 
@@ -65,8 +62,8 @@ class Inclusion(eqx.Module):
     posterior median of its change, in the unit of the image; `on_surface`:
     whether the region lies on a surface in space, so that it has an area although its centroid has three coordinates;
     `form`: shape of an inclusion that was fitted to data as a body in a solid, else None. Where they were estimated:
-    `contrast_interval`: 68 % interval of the change relative to the background; `area_interval`: of the area, m²;
-    `strength`: area times (σ/σ₀ - 1) / (σ/σ₀ + 1), m², and `strength_interval`.
+    `contrast_interval`: 68 % interval of the change relative to the background; `area_interval`: of the area, m²,
+    or volume, m³; `strength` and `strength_interval`: see `jeit.inverse.shapes.Quantities`.
     """
 
     sign: int

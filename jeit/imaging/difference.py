@@ -93,20 +93,12 @@ class ImagedDifference:
 
     @property
     def peak_ranges(self) -> tuple[tuple[float, float], ...]:
-        """Range of the change in each inclusion, S/m (2-D: S): plus or minus one standard deviation. If the data do not
-        distinguish an ellipsoid from a column, the range covers both. Empty without shapes, or if the data do not
-        determine the contrast of one of them."""
-        if self.shapes is None or not all(one.contrast_is_determined for one in self.shapes.bodies):
-            return ()
-        background, bodies = float(self.calibration.conductivity), self.shapes.bodies
-        others = zip(self.shapes.alternatives, self.shapes.alternative_deviations, strict=True)
-        ranges = []
-        for one, deviation, (other, its) in zip(bodies, self.shapes.contrast_deviations, others, strict=True):
-            contrasts = [(one.contrast, deviation), *([(other.contrast, its)] if other else [])]
-            ends = [contrast + side * spread for contrast, spread in contrasts for side in (-1, 1)]
-            changes = [float(background * np.expm1(one.sign * end)) for end in ends]
-            ranges.append((min(changes), max(changes)))
-        return tuple(ranges)
+        """68 % interval of the change in each inclusion, S/m (2-D: S). Empty without fitted bodies, and where the data
+        leave an end open."""
+        background = float(np.real(self.calibration.conductivity))
+        known = [one.contrast_interval or (None, None) for one in self.inclusions]
+        ranges = [(background * low, background * high) for low, high in known if low is not None and high is not None]
+        return tuple(ranges) if len(ranges) == len(known) else ()
 
     @property
     def mesh(self) -> Mesh:
@@ -293,14 +285,15 @@ def _inclusions(
 def _of_body(body: Star | Ellipsoid, background: float) -> Inclusion:
     """The inclusion that a fitted body is, with its intervals if they were estimated."""
     place = tuple(body.centroid.tolist())
-    if isinstance(body, Star) and (known := body.quantities) is not None:
+    if (known := body.quantities) is not None:
         return Inclusion(
             body.sign,
             place,
-            known.area,
+            known.measure,
             background * known.change,
+            form=_form(body),
             contrast_interval=known.change_interval,
-            area_interval=known.area_interval,
+            area_interval=known.measure_interval,
             strength=known.strength,
             strength_interval=known.strength_interval,
         )

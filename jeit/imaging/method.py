@@ -270,7 +270,7 @@ def shapes_in(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked
         # In a solid, model errors are represented by a smooth field instead.
         least_rise=1 if solid else 1 + (LEAST_RISE - 1) * prepared.modelled_share,
         smooth=smooth if solid else None,
-        accuracy=None if solid else prepared.accuracy,
+        accuracy=prepared.accuracy,
         progress=asked.progress,
     )
 

@@ -25,7 +25,7 @@ from jeit.imaging.wiring import Wiring, exchanges_message, find_wiring
 from jeit.inverse import calibrate, relative_noise
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.channels import electrode_misfits
-from jeit.inverse.placement import Placement, place_electrodes
+from jeit.inverse.placement import Placement, Uncertainty, place_electrodes
 from jeit.inverse.shapes.quantities import Accuracy
 from jeit.mesh import Body, Mesh, OwnMesh, Solid
 from jeit_solvers.engines import as_array
@@ -72,8 +72,6 @@ def naming_frame(measurement: Measurement, number: int) -> Iterator[None]:
 SOLID_POINTS, SHEET_POINTS = 10_000, 2000
 # Minimum share of a difference that is assumed to remain unexplained by any model.
 _LEAST_MISFIT = 0.03
-# The same besides errors of electrode positions and contacts.
-_LEAST_OTHER = 0.02
 # Factor by which this share is larger for images with sharp outlines.
 _SHARP = 3.0
 # Misfit of an electrode, relative to that of the others, above which it counts as unlike them. In sound tanks the ratio
@@ -121,6 +119,11 @@ class PreparedDifference:
     def mesh(self) -> Mesh:
         """Mesh of the calibrated model, on which images are computed."""
         return self.calibration.model.mesh
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """How accurately the sensor is described."""
+        return self.reference.uncertainty or Uncertainty()
 
     @property
     def relative_noise(self) -> Float[Array, " M"]:
@@ -175,9 +178,11 @@ class PreparedDifference:
         and contacts, and the share of the difference that equals the misfit of the reference, at least 2 %."""
         error = self.calibration.model_error
         if error is None:  # a reference that the described places explain still leaves them uncertain
-            placed = _placed(self.model, np.asarray(self.reference.voltages)[0], self.mask)
+            placed = _placed(self.model, np.asarray(self.reference.voltages)[0], self.mask, self.uncertainty.position)
             error = placed and placed.error
-        return Accuracy(self._off_by(1.0, _LEAST_OTHER), error)
+        known = self.uncertainty
+        error = error and error._replace(drift=known.drift)
+        return Accuracy(self._off_by(1.0, known.other), error, known.size)
 
     @property
     def modelled_share(self) -> float:
@@ -238,6 +243,7 @@ def prepare_difference(
         if not quality.imageable:
             with naming_frame(measurement, number):
                 raise ValueError(f"'{one.name}' cannot be imaged: {quality.reason}")
+    base = base if one.uncertainty is None else replace(base, uncertainty=one.uncertainty)
     calibration, chosen = calibrated_model(model, base, contact=contact, clock=clock)
     return PreparedDifference(
         one, base, quality, domain, chosen, wiring, calibration, difference, both, number, measurement.num_frames
@@ -271,7 +277,8 @@ def calibrated_model(
         if contact is None and chosen == "each" and not calibration.distinguishes_contacts:
             chosen = "common"  # the data do not determine one impedance per electrode
             calibration = calibrate(model, voltages, mask=mask, contact=chosen)
-        calibration = _with_places(calibration, model, voltages, mask, chosen)
+        position = (base.uncertainty or Uncertainty()).position
+        calibration = _with_places(calibration, model, voltages, mask, chosen, position)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
             raise ValueError(
@@ -281,13 +288,15 @@ def calibrated_model(
     return calibration, chosen
 
 
-def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, contact: str) -> Calibration:
+def _with_places(
+    calibration: Calibration, model: ForwardModel, voltages, mask, contact: str, deviation: float | None
+) -> Calibration:
     """The calibration with electrode positions estimated along, if that explains the reference far better.
 
     Described positions that explain the reference are kept. So are they where a misfit has other causes: estimated
     positions explain little of a deep tank under a two-dimensional model.
     """
-    if not float(calibration.misfit) > _EXPLAINED or (placed := _placed(model, voltages, mask)) is None:
+    if not float(calibration.misfit) > _EXPLAINED or (placed := _placed(model, voltages, mask, deviation)) is None:
         return calibration
     try:
         again = calibrate(placed.model, voltages, mask=mask, contact=contact)
@@ -298,13 +307,15 @@ def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, 
     return replace(again, shift=as_array(placed.shift), model_error=placed.error)
 
 
-def _placed(model: ForwardModel, voltages, mask) -> Placement | None:
-    """Electrode positions estimated from a reference frame; None if they cannot be."""
+def _placed(model: ForwardModel, voltages, mask, deviation: float | None) -> Placement | None:
+    """Electrode positions estimated from a reference frame; None if they cannot be. `deviation` of their description,
+    metres, or None for the default."""
     if not isinstance(model.electrodes, AbstractMovableElectrodes) or np.iscomplexobj(voltages):
         return None
-    width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+    if deviation is None:
+        deviation = _MISPLACED * float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
     try:
-        return place_electrodes(model, voltages, deviation=_MISPLACED * width, mask=mask)
+        return place_electrodes(model, voltages, deviation=deviation, mask=mask)
     except ValueError:
         return None
 

@@ -6,7 +6,7 @@ from .linear.greit import greit
 from .linear.one_step import back_projection, one_step
 from .nonlinear.parametrisation import Parametrisation
 from .nonlinear.reconstruct import reconstruct
-from .placement import place_electrodes
+from .placement import Uncertainty, place_electrodes
 from .prior.matern import Matern
 from .prior.priors import Gaussian, Laplace, Noser, Tikhonov
 from .prior.total_variation import TotalVariation
@@ -24,6 +24,7 @@ __all__ = [
     "Parametrisation",
     "Tikhonov",
     "TotalVariation",
+    "Uncertainty",
     "back_projection",
     "calibrate",
     "choose_hyperparameter",

@@ -35,12 +35,26 @@ from jeit_solvers.engines import as_array, on_host
 # Standard deviations of the logarithms of contact impedances: of each electrode's own part, and of the common one. And
 # of the logarithm of the conductivity, about that which fits the described model best.
 _OWN_CONTACT, _COMMON_CONTACT, _CONDUCTIVITY = 1.0, 4.0, 2.0
-# Steps of the two fits, before and after κ is estimated; the tolerance of their cost.
-_STEPS, _RTOL = 15, 3e-3
-# Standard deviation of the logarithm of each contact impedance's drift between two frames.
-_DRIFT = 0.1
+# Steps of the two fits, before and after κ is estimated, in sheets and in solids, where each takes a second; the
+# tolerance of their cost.
+_STEPS, _RTOL = {2: (15, 15), 3: (5, 3)}, 3e-3
 # κ in units of `relative_noise`: 0.1 % of a voltage at least.
 _LEAST_NOISE = 0.1
+
+
+class Uncertainty(NamedTuple):
+    """How accurately a sensor is described, as standard deviations.
+
+    **Fields**: `position`: of electrode positions, metres, in every direction in which they can move; default: 0.0175
+    of the width of the body, 2° of a disk. `drift`: of the logarithm of each contact impedance, from the reference to
+    the frame. `size`: of the lengths of the body, relative. `other`: of whatever else differs from the model, as a
+    share of the difference of the two frames; the misfit of the reference, if that is larger.
+    """
+
+    position: float | None = None
+    drift: float = 0.1
+    size: float = 0.01
+    other: float = 0.02
 
 
 class Placement(NamedTuple):
@@ -60,12 +74,14 @@ class ModelError(NamedTuple):
     model, of a difference as well.
 
     **Fields**: `factor` (p, p): F with the posterior covariance F Fᵀ of the shifts, metres, and of the logarithms of
-    the contact impedances. These also drift between the two frames, by 10 %.
+    the contact impedances; `drift`: standard deviation of the logarithm of each contact impedance, from the reference
+    to the frame.
 
     Kaipio and Somersalo, Journal of Computational and Applied Mathematics 198 (2007) 493.
     """
 
     factor: Float[np.ndarray, "p p"]
+    drift: float = Uncertainty().drift
 
     def voltages(self, model: ForwardModel, conductivity, background) -> Float[np.ndarray, "M q"]:
         """Errors (M, q) of the difference v(`conductivity`) - v(`background`), volts, for unit coefficients.
@@ -80,7 +96,7 @@ class ModelError(NamedTuple):
             return np.stack([np.asarray(select_channels(protocol, one)) for one in impedances], axis=1)
 
         there, here = (sensitivity(*map(np.asarray, model.fields(one))) for one in (conductivity, background))
-        drifted = _DRIFT * channels(there[-electrodes.num_electrodes :])
+        drifted = self.drift * channels(there[-electrodes.num_electrodes :])
         return np.concatenate([channels(there - here) @ self.factor, drifted], axis=1)
 
 
@@ -114,9 +130,9 @@ def place_electrodes(
     size, scale = len(problem.spread), 1.0
     found: Any = np.zeros(size)
     here, covariance = None, np.eye(size)
-    descent = Descent(rtol=_RTOL, damping=1e-2, history=_STEPS + 1)
-    for _ in range(2):
-        found, _ = descent.at_once(problem.expand, found, scale, _STEPS)
+    for steps in _STEPS[model.mesh.dimension]:
+        descent = Descent(rtol=_RTOL, damping=1e-2, history=steps + 1)
+        found, _ = descent.at_once(problem.expand, found, scale, steps)
         here = problem.at(found)
         if here is None or not np.isfinite(here.voltages).all():
             raise ValueError("voltages: no electrode positions were found that explain them.")

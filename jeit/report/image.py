@@ -246,10 +246,10 @@ def _intervals(inclusion: Inclusion) -> dict[str, Any]:
         return {}
     return {
         "contrast_interval": inclusion.contrast_interval,
-        "area_interval": inclusion.area_interval,
+        "volume_interval" if inclusion.is_solid else "area_interval": inclusion.area_interval,
         "strength": inclusion.strength,
         "strength_interval": inclusion.strength_interval,
-        "strength_unit": "m²",
+        "strength_unit": "m³" if inclusion.is_solid else "m²",
         "intervals_hold": "68 %",
     }
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from jeit.arguments import percent
 from jeit.cli.commands.reconstruct import bodies_text
-from jeit.cli.console import inclusion_table
+from jeit.cli.console import inclusion_table, quantity_table
 from jeit.image import Inclusion, SolidForm
 
 SAID = {
@@ -35,23 +35,19 @@ def test_what_is_not_known():
     assert percent(None) == "not known"
 
 
-def printed(bodies, *ranges, **known):
+def printed(bodies, **known):
     console = Console(width=80, file=io.StringIO(), record=True)
-    console.print(inclusion_table(bodies, "S/m", *ranges, **known))
+    console.print(inclusion_table(bodies, "S/m", **known))
     return [line.split() for line in console.export_text().splitlines()]
 
 
 BODIES = [Inclusion(1, (0.01, 0.02, 0.03), 2e-5, 0.2), Inclusion(-1, (0.0, 0.0, 0.0), 1e-5, -0.004)]
 
 
-def test_a_peak_is_told_with_what_it_may_lie_between():
-    """In one unit, each beside its own body; nothing where it is not known."""
-    known = printed(BODIES, [(0.1, 0.4), (-0.005, -0.002)])
-    assert [line[0] for line in known] == ["volume", "inclusion", "conductive", "resistive"]
-    assert known[1][-3:] == ["±", "1", "σ"]
-    assert known[2][-4:] == ["200", "100", "to", "400"]
-    assert known[3][-4:] == ["-4", "-5", "to", "-2"]
-    assert [line[-1] for line in printed(BODIES)] == ["change", "mS/m", "200", "-4"]
+def test_a_peak_is_in_one_unit():
+    lines = printed(BODIES)
+    assert [line[0] for line in lines] == ["volume", "inclusion", "conductive", "resistive"]
+    assert [line[-1] for line in lines] == ["change", "mS/m", "200", "-4"]
 
 
 def test_a_peak_is_told_as_a_change_and_with_the_share_of_the_background_that_it_is():
@@ -61,11 +57,21 @@ def test_a_peak_is_told_as_a_change_and_with_the_share_of_the_background_that_it
     assert [line[-3:] for line in lines[2:]] == [["200", "400", "%"], ["-4", "-8", "%"]]
 
 
-def test_all_that_is_known_of_a_large_body_goes_on_a_line():
-    bodies = [Inclusion(1, (-0.2595, -0.1297, 0.1477), 0.0123456, 0.999), Inclusion(-1, (0.0,) * 3, 1e-5, -0.25)]
-    lines = printed(bodies, [(0.529, 0.9999), (-0.4567, -0.111)], background=0.205)
-    assert len(lines) == 4
-    assert lines[3][-6:] == ["-0.25", "-0.457", "to", "-0.111", "-122", "%"]
+def body_with_intervals(kind, **more):
+    place, strength = (-0.2595, -0.1297, 0.1477), (0.0098765, 0.0098765)
+    known = {"contrast_interval": (110.1, 130.1), "area_interval": (0.0109, 0.0135), "strength_interval": strength}
+    return Inclusion(kind, place, 0.0123456, 0.205 * 120.5, strength=strength[0], **known, **more)
+
+
+def quantities(bodies):
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(quantity_table(bodies, 0.205))
+    return [line.split() for line in console.export_text().splitlines()]
+
+
+def test_numbers_of_a_large_body_have_three_digits_and_no_exponents():
+    words = {word for line in quantities([body_with_intervals(1)]) for word in line}
+    assert {"12300", "10900", "13500", "9880", "+11000", "+13000"} <= words
 
 
 def test_columns_are_called_so():
@@ -74,8 +80,13 @@ def test_columns_are_called_so():
     column = Inclusion(1, (-0.2595, -0.1297, 0.1477), 0.0123456, 0.999, form=form)
     first = [line[:2] for line in printed([column, BODIES[1]]) if line]
     assert [first[-2], first[-1][0]] == [["conductive", "column"], "resistive"]
-    lines = printed([column, BODIES[1]], [(0.529, 0.9999), (-0.4567, -0.111)], background=0.205)
-    assert [line[0] for line in lines if line][-3:] == ["conductive", "column", "resistive"]
+    lines = quantities([body_with_intervals(1, form=form), body_with_intervals(-1)])
+    assert [line[0] for line in lines if line and line[0].isalpha()][-4:] == [
+        "conductive",
+        "column",
+        "resistive",
+        "below",
+    ]
 
 
 @pytest.mark.parametrize(("dimension", "edge"), [(2, "outlines"), (3, "surfaces")])

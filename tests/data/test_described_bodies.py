@@ -6,6 +6,7 @@ import pytest
 from jeit.data import Measurement, read, screen, write_table
 from jeit.data.description import parse_description
 from jeit.electrodes import BoundaryElectrodes, FaceDiscs, FacePatches, FacetElectrodes, PointElectrodes
+from jeit.inverse import Uncertainty
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Mesh, OwnMesh, Polygon, Rectangle, Solid, cylinder, write
 from jeit.protocol import adjacent
@@ -285,3 +286,47 @@ def test_a_radius_in_millimetres_is_told_in_metres():
     said = r"^d\.toml: geometry\.radius: 150 m is large .* If the lengths are millimetres, give 0\.15, "
     with pytest.warns(UserWarning, match=said):
         described({"shape": "disk", "radius": 150}, {"kind": "point", "positions": [[0, 150]]})
+
+
+SHEET = {
+    "geometry": {"shape": "disk", "radius": 0.1},
+    "electrodes": {"layout": "ring", "number": 8, "width": 0.01, "contact_impedance": 0.01},
+    "protocol": {"kind": "adjacent", "current": 1e-3},
+}
+
+
+def test_an_uncertainty_is_described_in_degrees_and_per_cent_and_stays_with_the_measurement(tmp_path):
+    known = parse_description(
+        {**SHEET, "uncertainty": {"position_degrees": 1, "size_percent": 3}}, "d.toml"
+    ).uncertainty
+    assert known == Uncertainty(position=pytest.approx(np.deg2rad(1) * 0.1), size=0.03)
+    np.savetxt(tmp_path / "frames.csv", np.random.default_rng(0).normal(size=(3, 40)), delimiter=",")
+    (tmp_path / "frames.toml").write_text(
+        '[geometry]\nshape = "disk"\nradius = 0.1\n[electrodes]\nlayout = "ring"\nnumber = 8\nwidth = 0.01\n'
+        'contact_impedance = 0.01\n[protocol]\nkind = "adjacent"\ncurrent = 1e-3\n'
+        "[uncertainty]\nposition_degrees = 1\nsize_percent = 3\n"
+    )
+    measurement = read(tmp_path / "frames.csv")
+    one = measurement.frame(0).masked(np.arange(40) != 3, "for a test.").mean_frame()
+    assert measurement.uncertainty == one.uncertainty == known
+    assert parse_description(SHEET, "d.toml").uncertainty is None
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"position": 1e-3, "position_degrees": 1}, "the same"),
+        ({"position": -1}, "from 0"),
+        ({"positions": 1}, "did you mean 'position'"),
+    ],
+)
+def test_a_faulty_uncertainty_is_named(given, said):
+    with pytest.raises(ValueError, match=said):
+        parse_description({**SHEET, "uncertainty": given}, "d.toml")
+
+
+def test_degrees_need_a_round_body():
+    square = {"geometry": {"shape": "rectangle", "width": 0.1, "height": 0.1}}
+    electrodes = {"electrodes": {**SHEET["electrodes"], "layout": "perimeter"}}
+    with pytest.raises(ValueError, match="position_degrees is of a disk"):
+        parse_description({**SHEET, **square, **electrodes, "uncertainty": {"position_degrees": 1}}, "d.toml")

@@ -15,7 +15,8 @@ from jeit.image import Raster
 from jeit.image.segmentation import CONDUCTIVE
 from jeit.imaging import ImagedDifference, ImagingSettings, automatic, difference, method
 from jeit.inverse import Laplace
-from jeit.inverse.shapes import Ellipsoid, ShapeReconstruction
+from jeit.inverse.shapes import Ellipsoid, Quantities, ShapeReconstruction
+from jeit.inverse.shapes.quantities import including
 from jeit.mesh import Disk, Rectangle, Solid, centroids
 from jeit.protocol import opposite, skip
 from jeit.report import image as image_report
@@ -71,10 +72,14 @@ def test_a_ball_is_fitted_beside_a_smooth_field(monkeypatch):
     assert np.shape(result.change) == (result.mesh.num_cells,)
     in_ball = np.linalg.norm(np.asarray(centroids(result.mesh)) - BALL, axis=1) < 0.5 * RADIUS
     assert np.asarray(result.change)[in_ball].mean() > 0.8 * result.inclusions[0].peak  # the image is of the body
-    (deviation,) = result.shapes.contrast_deviations
-    assert deviation > 0.1  # what the mesh adds, and noise more
     background = float(result.calibration.conductivity)
-    np.testing.assert_allclose([low, high], background * np.expm1(body.contrast + np.array([-1, 1]) * deviation))
+    deviation = np.diff(np.log1p(np.array([low, high]) / background)) / 2
+    assert deviation > 0.1  # what the mesh adds, and noise more
+    known, (one,) = body.quantities, result.inclusions
+    np.testing.assert_allclose([low, high], background * np.array(known.change_interval))
+    assert (one.area, one.area_interval) == (body.volume, known.measure_interval)
+    ratio = 1 + known.change
+    assert known.strength == pytest.approx(body.volume * (ratio - 1) / (ratio + 2), rel=0.05)
 
 
 def prepared(dimension, strongest, noise):
@@ -201,7 +206,7 @@ def test_bodies_of_a_sound_linear_image_are_told_in_a_cylinder():
     assert body.sign == -1
 
 
-def test_where_electrodes_do_not_tell_the_kind_of_a_body_it_is_doubted_and_the_range_is_of_both():
+def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_and_intervals_are_of_both():
     def body(column, contrast):
         return Ellipsoid(1, BALL, 0.02 * np.eye(3), 3e-5, BALL, contrast, column, column, 2.0)
 
@@ -220,9 +225,12 @@ def test_where_electrodes_do_not_tell_the_kind_of_a_body_it_is_doubted_and_the_r
     calibration = SimpleNamespace(conductivity=BATH)
     whole = SimpleNamespace(measurement=SimpleNamespace(mask=np.ones((1, 2), bool)), mesh=SimpleNamespace(dimension=3))
     image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration, **vars(whole))
-    low, high = np.transpose(ImagedDifference.peak_ranges.fget(image))  # pyright: ignore
-    np.testing.assert_allclose(low, BATH * (np.array([3, 4]) * np.exp([-0.1, -0.2]) - 1))
-    np.testing.assert_allclose(high, BATH * (np.array([6, 4]) * np.exp([0.5, 0.2]) - 1))
+    own = Quantities(2.0, (1.7, 2.3), 3e-5, (2e-5, None), 1.5e-5, (1.4e-5, 1.6e-5))
+    known = including(own, body(False, np.log(6)), 0.5)
+    np.testing.assert_allclose(known.change_interval, (1.7, 6 * np.exp(0.5) - 1))
+    assert known.measure_interval == (2e-5, None)
+    np.testing.assert_allclose(known.strength_interval, (1.4e-5, 3e-5 * 5 / 8))
+    assert including(own, None, np.nan) == own
     (doubt,) = ImagedDifference.doubts.fget(image)  # pyright: ignore
     assert "x 12 mm, y -25 mm may as well be no column but an ellipsoid, of 6 times the background and 30 cm³" in doubt
     told = image_report._shapes(image)["bodies"]  # pyright: ignore

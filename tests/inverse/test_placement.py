@@ -5,12 +5,13 @@ import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, ring
 from jeit.data import Measurement
-from jeit.electrodes import NodeElectrodes, SheetDiscs
+from jeit.electrodes import FaceDiscs, FacePatches, NodeElectrodes, SheetDiscs
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward.changes import PlacementSensitivity, shifted
 from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import relative_noise
 from jeit.inverse.placement import ModelError, _Problem, place_electrodes
+from jeit.mesh import cylinder
 
 RADIUS, SIGMA, WIDTH = 0.1, 0.02, 0.02
 DISK, PROTOCOL = Disk(RADIUS), adjacent(16, current=1e-3)
@@ -85,14 +86,21 @@ def test_what_cannot_be_placed_is_refused(tank):
         place_electrodes(ForwardModel(model.mesh, nodes, PROTOCOL), voltages, deviation=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["arcs", "arcs that share an edge", "discs"])
+@pytest.mark.parametrize("kind", ["arcs", "arcs that share an edge", "discs", "patches", "discs on a wall"])
 def test_sensitivity_to_places_and_contacts_is_the_derivative(kind):
     """Against central differences of Z, also where electrodes share facets or cells."""
     mesh = DISK.mesh(num_points=300)
     angle = np.array([0.3, 1.9, 3.6, 5.0]) if kind != "arcs that share an edge" else np.array([0.3, 0.515, 3.6, 5.0])
     place = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     impedance = np.array([2e-3, 5e-3, 1e-3, 3e-3])
-    if kind == "discs":
+    if kind in ("patches", "discs on a wall"):
+        place, mesh = np.column_stack([0.05 * place, np.full(4, 0.02)]), cylinder(0.05, 0.04, cell_size=0.012)
+        at = mesh.points[mesh.facets].mean(axis=1)
+        place = at[np.argmin(np.linalg.norm(np.asarray(at) - place[:, None], axis=-1), axis=1)]
+        electrodes = FacePatches(place, 0.015, 0.018, 1e-2 * impedance)
+        if kind != "patches":
+            electrodes = FaceDiscs(place, 0.01, 1e-2 * impedance)
+    elif kind == "discs":
         electrodes = SheetDiscs(0.06 * place, 0.01, 1e-2 * impedance)
     else:
         electrodes = BoundaryElectrodes(RADIUS * place, WIDTH, impedance)

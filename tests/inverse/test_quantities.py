@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, image_difference, ring
-from jeit.cli.console import with_interval
+from jeit.arguments import interval_text
 from jeit.data import Measurement
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.image import Inclusion
@@ -54,7 +54,7 @@ def test_a_fitted_body_has_its_quantities_and_wider_ones_where_the_model_is_in_d
         area = float(np.asarray(measures(model.mesh))[inside].sum())
         assert one.quantities.strength == pytest.approx(area / 2, rel=0.05)
         assert one.quantities.change == pytest.approx(2.0, rel=0.25)
-        assert one.area == pytest.approx(one.quantities.area, rel=1e-6)
+        assert one.area == pytest.approx(one.quantities.measure, rel=1e-6)
         assert one.contrast == pytest.approx(np.log1p(one.quantities.change))
         low, high = one.quantities.change_interval
         widths.append(high - low)
@@ -88,35 +88,35 @@ def held(contrast, unlikely, area=1e-3):
 def test_what_the_likelihood_says_is_summed_up():
     """A parabola about a contrast of one, of deviation 0.1: half of its mass lies below, the prior aside."""
     places = np.exp(np.linspace(-0.5, 0.5, 21))
-    found = _summary(1, [held(one, 0.5 * (np.log(one) / 0.1) ** 2) for one in places])
+    found = _summary(1, 2, [held(one, 0.5 * (np.log(one) / 0.1) ** 2) for one in places])
     assert found.change == pytest.approx(np.expm1(1.0), rel=0.02)
     low, high = found.change_interval
     assert low == pytest.approx(np.expm1(np.exp(-0.1)), rel=0.03)
     assert high == pytest.approx(np.expm1(np.exp(0.1)), rel=0.03)
-    assert found.area == pytest.approx(1e-3, rel=0.01)
-    assert found.area_interval == pytest.approx((0.95e-3, 1.05e-3), rel=0.01)
+    assert found.measure == pytest.approx(1e-3, rel=0.01)
+    assert found.measure_interval == pytest.approx((0.95e-3, 1.05e-3), rel=0.01)
     assert found.strength == pytest.approx(1e-3 * np.tanh(0.5), rel=0.02)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_ends_that_the_data_leave_open_are_none(sign):
-    strong = _summary(sign, [held(one, 40 / one if one < 3 else 0.2) for one in (0.5, 1.0, 2.0, 3.0, 4.5)])
+    strong = _summary(sign, 2, [held(one, 40 / one if one < 3 else 0.2) for one in (0.5, 1.0, 2.0, 3.0, 4.5)])
     assert strong.change_interval[sign > 0] is None
     assert strong.change_interval[sign < 0] is not None
-    assert strong.area_interval[0] is None
+    assert strong.measure_interval[0] is None
     assert None not in strong.strength_interval
-    weak = _summary(sign, [held(one, 40 * one**2) for one in (0.03, 0.05, 0.1, 0.3, 0.5)])
+    weak = _summary(sign, 2, [held(one, 40 * one**2) for one in (0.03, 0.05, 0.1, 0.3, 0.5)])
     assert weak.change_interval[sign < 0] is None
-    assert weak.area_interval[1] is None
+    assert weak.measure_interval[1] is None
 
 
 def test_intervals_as_text():
     def written(value):
         return f"{value:g}"
 
-    assert with_interval(2.0, (1.0, 3.0), written) == "2\n1 to 3"
-    assert with_interval(2.0, (1.0, None), written) == "at least 1"
-    assert with_interval(2.0, (None, 3.0), written) == "at most 3"
-    assert with_interval(2.0, (None, None), written) == "not determined"
-    assert with_interval(2.0, None, written) == "2"
+    assert interval_text(2.0, (1.0, 3.0), written) == "2\n1 to 3"
+    assert interval_text(2.0, (1.0, None), written) == "at least 1"
+    assert interval_text(2.0, (None, 3.0), written) == "at most 3"
+    assert interval_text(2.0, (None, None), written) == "not determined"
+    assert interval_text(2.0, None, written) == "2"
     assert Inclusion(1, (0.0, 0.0), 1.0, 1.0).contrast_interval is None

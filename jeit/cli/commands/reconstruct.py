@@ -216,7 +216,7 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
     if any(one.contrast_interval is not None for one in result.inclusions):
         table = quantity_table(result.inclusions, background.real)
     else:
-        table = inclusion_table(result.inclusions, unit, result.peak_ranges, background=background.real)
+        table = inclusion_table(result.inclusions, unit, background=background.real)
     console.print(table if result.inclusions else "  no inclusion found")
     console.print()
 

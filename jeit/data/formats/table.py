@@ -98,6 +98,7 @@ def _description_like(like: Measurement) -> Description:
         layout=layout,
         notes=(f"described as '{like.name}' is, for it has no description of its own.",),
         protocol_section=None,
+        uncertainty=like.uncertainty,
     )
 
 
@@ -138,6 +139,7 @@ def measurement_from(
         frame_names=names,
         notes=notes,
     )
+    measurement = replace(measurement, uncertainty=described.uncertainty)
     if described.layout.averaged:
         note = f"the mean of {measurement.num_frames} frames."
         return replace(measurement.mean_frame(), notes=(*measurement.notes, note))

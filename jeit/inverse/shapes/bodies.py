@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jeit.arguments import describe, is_number
+from jeit.arguments.checks import Interval
 
 # Fields of `Bodies` that hold one value per body, except `start`.
 _OF_EACH = ("sign", "other", "alike", "held")
@@ -81,6 +82,30 @@ class BodyPrior(abc.ABC):
 
         `other`: whether the body is of the form's other kind.
         """
+
+
+@dataclass(frozen=True)
+class Quantities:
+    """What the data determine of a body: posterior medians, and 68 % intervals, None at an end that is left open.
+
+    **Fields**: `change`: change of conductivity relative to the background; `measure`: area, m², or volume, m³;
+    `strength`: that times (ρ - 1) / (ρ + n - 1), where ρ is the conductivity relative to the background and n the
+    number of axes along which the body is bounded (2 in a sheet and for a column, else 3), negative for resistive
+    bodies; and `change_interval`, `measure_interval` and `strength_interval`.
+    """
+
+    change: float
+    change_interval: Interval
+    measure: float
+    measure_interval: Interval
+    strength: float
+    strength_interval: Interval
+
+
+def polarisation(contrast, axes: int):
+    """(ρ - 1) / (ρ + n - 1) for ρ = e^`contrast` and n bounded `axes`: the strength of a round body per area or volume.
+    Ammari and Kang, Polarization and Moment Tensors (2007), chapter 4."""
+    return np.expm1(contrast) / (np.exp(contrast) + axes - 1)
 
 
 class BodyImage(NamedTuple):
@@ -167,6 +192,10 @@ class Bodies(abc.ABC):
     def dimension(self) -> int:
         """Spatial dimension d."""
         return self.start.shape[1]
+
+    def bounded_axes(self, k: int) -> int:
+        """Number of axes along which body k is bounded."""
+        return self.dimension
 
     @property
     def first(self) -> Int[np.ndarray, " k"]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.arguments import check_name
-from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered
+from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered, Quantities, polarisation
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh, measures
 
@@ -30,16 +30,22 @@ _BY_THE_MESH = 0.1
 
 
 def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> list[float]:
-    """Standard deviations of the contrasts of bodies, in log σ.
+    """Standard deviations of the contrasts of bodies, in log σ: those that the problem explains, and `besides`."""
+    return np.hypot(_contrasts(problem, fitted)[1], besides(problem, fitted, each)).tolist()
 
-    `each`: fit in which every body has its own material. If the data do not rule it out, the standard deviations are
-    enlarged to include its contrasts.
+
+def besides(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> Float[np.ndarray, " k"]:
+    """Standard deviations of the contrasts of bodies, in log σ, that Laplace's approximation of the problem lacks: in a
+    solid that of the mesh, and that of the materials.
+
+    `each`: fit in which every body has its own material. If the data do not rule it out, its contrasts are included.
     """
-    contrast, deviation = _contrasts(problem, fitted)
+    variance = np.full(len(fitted.bodies.sign), (_BY_THE_MESH * (fitted.bodies.dimension == 3)) ** 2)
     if each and problem.surprise(each) - each.bodies.odds < problem.surprise(fitted) - fitted.bodies.odds + _UNDECIDED:
+        contrast, deviation = _contrasts(problem, fitted)
         own, its = _contrasts(problem, each)
-        deviation = np.maximum(deviation, np.abs(own - contrast) + its)
-    return [float(one) for one in np.hypot(deviation, _BY_THE_MESH * (fitted.bodies.dimension == 3))]
+        variance += np.maximum((np.abs(own - contrast) + its) ** 2 - deviation**2, 0)
+    return np.sqrt(variance)
 
 
 def _contrasts(problem: ShapeProblem, fitted: Fit) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
@@ -94,6 +100,8 @@ _STRETCHES = np.array(
         np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]]) / np.sqrt(2),
     ]
 )
+# Volume, m³, below which a body counts as being of this volume.
+_TINY = 1e-30
 # 1 for the elements of that basis that stretch a column: those within the x-y plane and without trace there.
 _LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 
@@ -161,7 +169,7 @@ class Ellipsoid(eqx.Module):
     inside the domain; `contrast`: contrast in log σ, without its sign; `column`: whether the body is a column, one of
     whose half axes is half the domain's height; `alike`: whether the body is assumed to be of the same material as
     others of its sign; `rise`: factor by which the minimum of the objective increases without this body, small for a
-    ghost.
+    ghost; `quantities`: posterior medians and intervals, if they were estimated.
     """
 
     sign: int
@@ -173,6 +181,7 @@ class Ellipsoid(eqx.Module):
     column: bool
     alike: bool
     rise: float
+    quantities: Quantities | None = None
 
     @property
     def measure(self) -> float:
@@ -181,8 +190,21 @@ class Ellipsoid(eqx.Module):
 
     @property
     def contrast_is_determined(self) -> bool:
-        """Whether the data determine the contrast: True for all ellipsoids and columns."""
-        return True
+        """Whether the data determine the contrast: no end of its interval is open."""
+        return self.quantities is None or None not in self.quantities.change_interval
+
+    def with_quantities(self, known: Quantities) -> Ellipsoid:
+        """The body with its quantities; its volume and contrast become the medians."""
+        bounded = 2 if self.column else 3
+        scale = (known.measure / max(self.volume, _TINY)) ** (1 / bounded)
+        upright = self.column & (np.abs(self.axes[:, 2]) > 0.5 * np.linalg.norm(self.axes, axis=1))
+        return replace(
+            self,
+            axes=self.axes * np.where(upright, 1.0, scale)[:, None],
+            volume=known.measure,
+            contrast=float(np.abs(np.log1p(known.change))),
+            quantities=known,
+        )
 
     def holds(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
         """Whether each of `points`, in metres, lies inside the body."""
@@ -219,6 +241,10 @@ class Ellipsoids(Bodies):
             prior, volume / total, span, start, sign, no, no, free, sampled, _BLUR * np.cbrt(volume), total, ends
         )
 
+    def bounded_axes(self, k: int) -> int:
+        """2 for a column, else 3."""
+        return 2 if self.other[k] else 3
+
     @property
     def odds(self) -> float:
         """Logarithm of the prior odds against the bodies' kinds and materials; negative for columns and for bodies
@@ -249,20 +275,17 @@ class Ellipsoids(Bodies):
     def of_one_material(self, sign: int, coefficients) -> tuple[Ellipsoids, Float[np.ndarray, " n"]]:
         """The bodies with all those of a sign made of one material, and their coefficients.
 
-        The contrast coefficient becomes the mean. Radii are adjusted to keep the effect on the voltages, which is taken
-        as proportional to volume times (ρ - 1) / (ρ + 2), for a column (ρ - 1) / (ρ + 1), where ρ is the ratio of the
-        body's conductivity to the bath's.
+        The contrast coefficient becomes the mean. Radii are adjusted to keep the strengths.
         """
         rows, some, contrast = self.rows(coefficients), np.flatnonzero(self.sign == sign), self.dimension + 1
         before = rows[:, contrast].copy()
         rows[some, contrast] = before[some].mean()
-        for k in some:
+        for k in some.tolist():
             after, past = (
-                np.exp(sign * self.prior.contrast_of(one, False)[0]) for one in (rows[k, contrast], before[k])
+                polarisation(sign * self.prior.contrast_of(one, False)[0], self.bounded_axes(k))
+                for one in (rows[k, contrast], before[k])
             )
-            ends = 1.0 if self.other[k] else 2.0
-            larger = (past - 1) * (after + ends) / ((past + ends) * (after - 1))
-            rows[k, 3] += np.log(larger) / (ends + 1) / self.prior.radius_spread
+            rows[k, 3] += np.log(past / after) / self.bounded_axes(k) / self.prior.radius_spread
         return replace(self, alike=self.alike | (self.sign == sign)), np.append(coefficients[0], rows)
 
     def mixture(self, share, contrast):

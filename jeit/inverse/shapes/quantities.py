@@ -1,11 +1,12 @@
-"""Contrast, area and strength of bodies in a sheet, with credible intervals.
+"""Contrast, area or volume, and strength of bodies, with credible intervals.
 
-To first order a small body's voltages depend on its area times tanh(c / 2), c being the contrast of log σ: its
-strength. Contrast and area are determined separately by the second order alone, so errors of the model overrule them
-first. Each body's contrast is therefore explored: with the contrast held at several values everything else is fitted
-again, and the evidence gives the posterior (Laplace's approximation for the other coefficients). The prior of the
-contrast is log-normal. Tierney and Kadane, Journal of the American Statistical Association 81 (1986) 82; Ammari and
-Kang, Polarization and Moment Tensors (2007), chapter 4, strength.
+To first order a small body's voltages depend on its strength alone: its area times (ρ - 1) / (ρ + 1), ρ being its
+conductivity relative to the background, or in a solid its volume times (ρ - 1) / (ρ + 2). Contrast and size are
+determined separately by the second order alone, so errors of the model overrule them first. Each body's contrast is
+therefore explored: with the contrast held at several values everything else is fitted again, and the evidence gives the
+posterior (Laplace's approximation for the other coefficients). The prior of the contrast is log-normal. Tierney and
+Kadane, Journal of the American Statistical Association 81 (1986) 82; Ammari and Kang, Polarization and Moment Tensors
+(2007), chapter 4, strength.
 """
 
 from __future__ import annotations
@@ -19,36 +20,41 @@ from jaxtyping import Array, Float
 from scipy.interpolate import PchipInterpolator
 from scipy.special import ndtri
 
-from jeit.inverse.placement import ModelError
+from jeit.arguments.checks import Interval
+from jeit.inverse.placement import ModelError, Uncertainty
+from jeit.inverse.shapes.bodies import Bodies, Quantities, polarisation
+from jeit.inverse.shapes.ellipsoid import Ellipsoid
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
-from jeit.inverse.shapes.star import Quantities, Star, Stars
 
 # Median and spread of the logarithm of the contrast before the data, and bounds of that logarithm: 4.5 is 90 times.
 _MEDIAN, _SPREAD, _BOUNDS = 0.9, 1.2, (float(np.log(0.03)), float(np.log(4.5)))
-# First step along the logarithm of the contrast, at least and at most, and the factor by which the next is longer.
-_STEP, _LONGER = (0.02, 0.35), 1.6
-# Steps of each fit, its tolerance, and the drop of the log posterior at which the exploration ends.
-_STEPS, _RTOL, _ENOUGH = 8, 1e-2, 5.0
-# Standard deviation of the logarithm of areas due to the described size of the whole body: 1 % of its width.
-_SIZE = 0.02
-# Area, m², of a body that has left the sheet.
+# Steps of the first fit; first step along the logarithm of the contrast, at least and at most; and the factor by which
+# the next is longer.
+_STEPS, _STEP, _LONGER = 8, (0.02, 0.35), 1.6
+# In sheets and in solids, where each step takes a second: steps of each fit and its tolerance; and the drop of the log
+# posterior at which the exploration ends.
+_EFFORT, _ENOUGH = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
+# Measure, m² or m³, of a body that has left the domain.
 _TINY = 1e-30
 # Rise of the -log likelihood at an end of the grid below which the data leave that end open.
 _OPEN = 1.0
-# Probabilities of the ends of an interval, and numbers of contrasts and areas of the posterior's sample.
-_ENDS, _CONTRASTS, _AREAS = (0.16, 0.84), 240, 31
+# Probabilities of the ends of an interval, and numbers of contrasts and measures of the posterior's sample.
+_ENDS, _CONTRASTS, _MEASURES = (0.16, 0.84), 240, 31
 
 
 class Accuracy(NamedTuple):
     """How accurately a difference is known. **Fields**: `noise` (M,): standard deviation of the channels, volts, of all
-    errors but those of `model_error`, the unknown part of electrode positions and contact impedances, if any."""
+    errors but those of `model_error`, the unknown part of electrode positions and contact impedances, if any; `size`:
+    relative standard deviation of the lengths of the described domain."""
 
     noise: Float[Array, " M"]
     model_error: ModelError | None = None
+    size: float = Uncertainty().size
 
 
-def quantified(problem: ShapeProblem, fit: Fit, accuracy: Accuracy, stars: Sequence[Any], order) -> list[Star]:
-    """The `stars`, bodies `order` of a `fit`, with their quantities; contrasts and areas of outlines are the medians.
+def quantified(problem: ShapeProblem, fit: Fit, accuracy: Accuracy, besides: Any, order: Any) -> list[Quantities]:
+    """The quantities of bodies `order` of a `fit`; `besides`: for each body of the fit, the standard deviation of its
+    contrast due to errors that the problem does not contain.
 
     `problem` has the noise of `accuracy` alone; its model error is that at the conductivity of the fit.
     """
@@ -57,66 +63,86 @@ def quantified(problem: ShapeProblem, fit: Fit, accuracy: Accuracy, stars: Seque
         rows = accuracy.model_error.voltages(problem.model, conductivity, problem.background)
         problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
     fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
-    found = []
-    for k, star in zip(order, stars, strict=True):
-        quantities = quantify(problem, fit, int(k))
-        outline = star.centroid + (star.outline - star.centroid) * np.sqrt(quantities.area / max(star.area, _TINY))
-        contrast = float(np.abs(np.log1p(quantities.change)))
-        found.append(replace(star, outline=outline, contrast=contrast, quantities=quantities))
-    return found
+    return [quantify(problem, fit, int(k), float(besides[k]), accuracy.size) for k in order]
+
+
+def including(known: Quantities, other: Ellipsoid | None, deviation: float) -> Quantities:
+    """The quantities with intervals that reach to those of an `other` description of the body, if there is one, whose
+    contrast has this standard deviation."""
+    if other is None:
+        return known
+    changes = np.expm1(other.sign * (other.contrast + deviation * np.array([-1, 1]))).tolist()
+    strength = float(other.volume * polarisation(other.sign * other.contrast, 2 if other.column else 3))
+    return replace(
+        known,
+        change_interval=_hull(known.change_interval, changes),
+        measure_interval=_hull(known.measure_interval, [other.volume]),
+        strength_interval=_hull(known.strength_interval, [strength]),
+    )
+
+
+def _hull(interval: Interval, values: Sequence[float]) -> Interval:
+    low, high = interval
+    return None if low is None else min(low, *values), None if high is None else max(high, *values)
 
 
 class _Held(NamedTuple):
     """A fit with a contrast held: `log_contrast`; `unlikely`: -log likelihood, with all other coefficients integrated
-    out; `log_area` and its standard `deviation`."""
+    out; `log_measure` and its standard `deviation`."""
 
     log_contrast: float
     unlikely: float
-    log_area: float
+    log_measure: float
     deviation: float
 
 
-def quantify(problem: ShapeProblem, fit: Fit, k: int) -> Quantities:
-    """Explore the contrast of body k of a `fit` in both directions, until it is improbable or at a bound."""
+def quantify(problem: ShapeProblem, fit: Fit, k: int, besides: float, size: float) -> Quantities:
+    """Explore the contrast of body k of a `fit` in both directions, until it is improbable or at a bound.
+
+    `besides`: standard deviation of the contrast due to errors that the problem does not contain; the likelihood is
+    flattened by the share of the whole variance that the problem explains. `size` as in `Accuracy`.
+    """
     bodies = fit.bodies
-    assert isinstance(bodies, Stars)
     contrast, slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
     first = float(np.clip(np.log(contrast), *_BOUNDS))
     deviation = problem.deviations(fit)[_place(bodies, k)[1]] * abs(slope) / contrast
-    middle, start = _held_at(problem, bodies, fit.coefficients, k, np.log(contrast), first)
-    known = [middle]
+    whole = float(np.hypot(deviation, besides / contrast))
+    flattened = (deviation / whole) ** 2
+    middle, start = _held_at(problem, bodies, fit.coefficients, k, np.log(contrast), first, size)
+    known, enough = [middle._replace(unlikely=flattened * middle.unlikely)], _ENOUGH[bodies.dimension]
     for way in (-1, 1):
-        at, coefficients, step = first, start, float(np.clip(deviation, *_STEP))
-        while known[-1 if way > 0 else 0].unlikely + _prior(at) < min(map(_surprise, known)) + _ENOUGH:
+        at, coefficients, step = first, start, float(np.clip(whole, *_STEP))
+        while known[-1 if way > 0 else 0].unlikely + _prior(at) < min(map(_surprise, known)) + enough:
             before, at = at, float(np.clip(at + way * step, *_BOUNDS))
             if at == before:
                 break
-            one, coefficients = _held_at(problem, bodies, coefficients, k, before, at)
-            known.insert(len(known) if way > 0 else 0, one)
+            one, coefficients = _held_at(problem, bodies, coefficients, k, before, at, size)
+            known.insert(len(known) if way > 0 else 0, one._replace(unlikely=flattened * one.unlikely))
             step *= _LONGER
-    return _summary(int(bodies.sign[k]), known)
+    return _summary(int(bodies.sign[k]), bodies.bounded_axes(k), known)
 
 
-def _place(bodies: Stars, k: int) -> tuple[int, int]:
-    """Indices of the log radius and of the contrast of body k among the coefficients."""
-    first = 1 + k * bodies.prior.size
-    return first + 2, first + 3
+def _place(bodies: Bodies, k: int) -> tuple[int, int]:
+    """Indices of the log radius of body k, and of its contrast, among the coefficients."""
+    d, size = bodies.dimension, bodies.prior.size
+    return 1 + k * size + d, 1 + int(bodies.first[k]) * size + d + 1
 
 
-def _held_at(problem: ShapeProblem, bodies: Stars, coefficients, k: int, before: float, at: float):
-    """The fit with the log contrast of body k held at `at`, started from one of `before` with equal strength; and its
-    coefficients."""
-    log_radius, value = _place(bodies, k)
-    ratio = np.tanh(np.exp(before) / 2) / np.tanh(np.exp(at) / 2)
-    start = coefficients.copy()
-    start[log_radius] += 0.5 * np.log(ratio) / bodies.prior.radius_spread
-    start[value] = 0.0
-    held = np.where(np.arange(len(bodies.sign)) == k, np.exp(at), bodies.held)
-    found = problem.fit(replace(bodies, held=held), start, _STEPS, _RTOL)
-    deviation = 2 * bodies.prior.radius_spread * float(problem.deviations(found)[log_radius])
-    deviation = float(np.hypot(deviation, _SIZE))
-    area = found.bodies.body(k, found.coefficients).area
-    return _Held(at, problem.surprise(found), float(np.log(max(area, _TINY))), deviation), found.coefficients
+def _held_at(problem: ShapeProblem, bodies: Bodies, coefficients, k: int, before: float, at: float, size: float):
+    """The fit with the log contrast of body k, and of all others of its material, held at `at`, started from one of
+    `before` with equal strengths; and its coefficients. `size` as in `Accuracy`."""
+    start, alike, sign = coefficients.copy(), bodies.first == bodies.first[k], bodies.sign[k]
+    for one in np.flatnonzero(alike).tolist():
+        axes = bodies.bounded_axes(one)
+        ratio = polarisation(sign * np.exp(before), axes) / polarisation(sign * np.exp(at), axes)
+        start[_place(bodies, one)[0]] += np.log(ratio) / axes / bodies.prior.radius_spread
+    start[_place(bodies, k)[1]] = 0.0
+    held = np.where(alike, np.exp(at), bodies.held)
+    found = problem.fit(replace(bodies, held=held), start, *_EFFORT[bodies.dimension])
+    deviation = bodies.prior.radius_spread * float(problem.deviations(found)[_place(bodies, k)[0]])
+    deviation = bodies.bounded_axes(k) * float(np.hypot(deviation, size))
+    measure = found.bodies.body(k, found.coefficients).measure
+    return _Held(at, problem.surprise(found), float(np.log(max(measure, _TINY))), deviation), found.coefficients
 
 
 def _surprise(one: _Held) -> float:
@@ -129,34 +155,34 @@ def _prior(log_contrast):
     return 0.5 * ((log_contrast - np.log(_MEDIAN)) / _SPREAD) ** 2
 
 
-def _summary(sign: int, known: Sequence[_Held]) -> Quantities:
-    """Medians and intervals of the posterior, interpolated between the contrasts that were held."""
-    place, unlikely, log_area, spread = np.array(known).T
+def _summary(sign: int, axes: int, known: Sequence[_Held]) -> Quantities:
+    """Medians and intervals of the posterior, interpolated between the contrasts that were held; `axes`: number of axes
+    along which the body is bounded."""
+    place, unlikely, log_measure, spread = np.array(known).T
     dense = np.linspace(place[0], place[-1], _CONTRASTS)
-    likely, area, deviation = (PchipInterpolator(place, one)(dense) for one in (unlikely, log_area, spread))
+    likely, measure, deviation = (PchipInterpolator(place, one)(dense) for one in (unlikely, log_measure, spread))
     surprise = likely + _prior(dense)
     weight = np.exp(surprise.min() - surprise)
-    normal = ndtri((np.arange(_AREAS) + 0.5) / _AREAS)
-    areas = np.exp(area[:, None] + deviation[:, None] * normal)
-    strength = np.tanh(np.exp(dense) / 2)[:, None] * areas
-    weights = np.repeat(weight, _AREAS)
+    normal = ndtri((np.arange(_MEASURES) + 0.5) / _MEASURES)
+    measures = np.exp(measure[:, None] + deviation[:, None] * normal)
+    strength = polarisation(sign * np.exp(dense), axes)[:, None] * measures
+    weights = np.repeat(weight, _MEASURES)
     least = unlikely.min()
     strong = place[-1] == _BOUNDS[1] and unlikely[-1] < least + _OPEN
     weak = place[0] == _BOUNDS[0] and unlikely[0] < least + _OPEN
-    # The contrast decides which end of the area is open: the stronger, the smaller.
+    # The contrast decides which end of the measure is open: the stronger, the smaller.
     low, middle, high = _quantiles(np.exp(dense), weight)
     changes = [float(np.expm1(sign * one)) for one in (low, middle, high)]
     ends: list[float | None] = [None if weak else changes[0], None if strong else changes[2]]
-    area_low, area_middle, area_high = _quantiles(areas.ravel(), weights)
-    strength_ends = _quantiles(strength.ravel(), weights)
-    strengths = sorted(sign * one for one in strength_ends)
+    least_measure, middle_measure, most_measure = _quantiles(measures.ravel(), weights)
+    weakest, middle_strength, strongest = _quantiles(strength.ravel(), weights)
     return Quantities(
         changes[1],
         (ends[0], ends[1]) if sign > 0 else (ends[1], ends[0]),
-        area_middle,
-        (None if strong else area_low, None if weak else area_high),
-        sign * strength_ends[1],
-        (strengths[0], strengths[2]),
+        middle_measure,
+        (None if strong else least_measure, None if weak else most_measure),
+        middle_strength,
+        (weakest, strongest),
     )
 
 

@@ -13,12 +13,20 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_has_values, check_kind, describe, is_number
 from jeit.forward import ForwardModel
+from jeit.inverse.channels import Data
 from jeit.inverse.nonlinear.problem import check_background, check_frame, check_noise, independent_data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies, BodyPrior
-from jeit.inverse.shapes.ellipsoid import Ellipsoid, EllipsoidPrior, Ellipsoids, alternatives, contrast_deviations
+from jeit.inverse.shapes.ellipsoid import (
+    Ellipsoid,
+    EllipsoidPrior,
+    Ellipsoids,
+    alternatives,
+    besides,
+    contrast_deviations,
+)
 from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
-from jeit.inverse.shapes.quantities import Accuracy, quantified
+from jeit.inverse.shapes.quantities import Accuracy, including, quantified
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
 from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array
@@ -127,8 +135,8 @@ def reconstruct_shapes(
     - `smooth`: an image of the same channels with a smooth prior and no bounds. Changes of conductivity besides the
       bodies are then modelled as a `SmoothField`, whose level is chosen by the evidence, and only bodies that are
       detected beside that field are fitted.
-    - `accuracy`: for a sheet, the errors with which each body's `Star.quantities` are estimated, in place of `noise`;
-      without it they are not.
+    - `accuracy`: the errors with which the `quantities` of each body are estimated, in place of `noise`; without it
+      they are not.
     - `progress`: called with the name of each stage as it begins. Stages take up to a minute in a solid.
 
     All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and the others
@@ -191,10 +199,16 @@ def reconstruct_shapes(
     excess = ((predicted - np.asarray(measured)) / np.asarray(deviation))[used]
     order = np.argsort(-np.asarray(rises), kind="stable")
     found_bodies = [bodies.body(int(k), coefficients, rises[k]) for k in order]
-    if accuracy is not None and not solid:
+    if accuracy is not None:
         report("bodies, how large and how strong")
-        data = independent_data(model, measured, used, accuracy.noise, at_once=True)[1]
-        found_bodies = quantified(replace(problem, data=data), fitted, accuracy, found_bodies, order)
+        exact = independent_data(model, measured, used, accuracy.noise, at_once=True)[1]
+        moved = setting.alone.data.voltages - data.voltages  # by the finer mesh
+        exact = eqx.tree_at(lambda one: one.voltages, exact, exact.voltages + moved)
+        known = quantified(
+            setting.weighted(exact).problem(level), fitted, accuracy, besides(problem, fitted, each), order
+        )
+        known = [including(one, others[k][0], others[k][1]) for one, k in zip(known, order, strict=True)]
+        found_bodies = [body.with_quantities(one) for body, one in zip(found_bodies, known, strict=True)]
     return ShapeReconstruction(
         bodies=tuple(found_bodies),
         conductivity=as_array(conductivity),
@@ -242,6 +256,14 @@ class _Setting(NamedTuple):
     def on(self, alone: ShapeProblem) -> _Setting:
         """The setting with the problem `alone` on another mesh."""
         return _Setting(alone, self.beside and replace(self.beside, alone=alone))
+
+    def weighted(self, data: Data) -> _Setting:
+        """The setting with other weights and errors of the data."""
+        alone, beside = replace(self.alone, data=data), self.beside
+        if beside is not None:
+            relative = np.asarray(data.weight) / np.asarray(self.alone.data.weight)
+            beside = replace(beside, jacobian=relative[:, None] * beside.jacobian, alone=alone)
+        return _Setting(alone, beside)
 
     def settled(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
         """Alternate between fitting the bodies and lowering the field's level, until the level is the likeliest.

@@ -14,7 +14,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered
+from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered, Quantities
 from jeit.mesh import Mesh, measures
 
 # Barycentric weights of the six points at which a cell is sampled.
@@ -24,6 +24,8 @@ _BLUR = 0.2
 # Distance from an outline, in widths of the blur, beyond which the covered share of a cell is less than 1e-12.
 _REACH = 30
 _OUTLINE = 128
+# Area, m², below which a body counts as being of this area.
+_TINY = 1e-30
 
 
 @dataclass(frozen=True)
@@ -68,26 +70,6 @@ class StarPrior(BodyPrior):
         return contrast, self.weak_spread * contrast
 
 
-Interval = tuple[float | None, float | None]
-
-
-@dataclass(frozen=True)
-class Quantities:
-    """What the data determine of a body: posterior medians, and 68 % intervals, None at an end that is left open.
-
-    **Fields**: `change`: change of conductivity relative to the background; `area`: m²; `strength`: area times
-    (σ/σ₀ - 1) / (σ/σ₀ + 1), m², negative for resistive bodies; and `change_interval`, `area_interval` and
-    `strength_interval`.
-    """
-
-    change: float
-    change_interval: Interval
-    area: float
-    area_interval: Interval
-    strength: float
-    strength_interval: Interval
-
-
 class Star(eqx.Module):
     """Body with a star-shaped outline, found in a sheet.
 
@@ -120,6 +102,11 @@ class Star(eqx.Module):
     def contrast_is_determined(self) -> bool:
         """Whether the data determine the contrast: no end of its interval is open, or without one the body is weak."""
         return self.weak if self.quantities is None else None not in self.quantities.change_interval
+
+    def with_quantities(self, known: Quantities) -> Star:
+        """The body with its quantities; its area and contrast become the medians."""
+        outline = self.centroid + (self.outline - self.centroid) * np.sqrt(known.measure / max(self.area, _TINY))
+        return replace(self, outline=outline, contrast=float(np.abs(np.log1p(known.change))), quantities=known)
 
     @property
     def centroid(self) -> Float[np.ndarray, "2"]:

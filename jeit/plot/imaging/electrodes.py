@@ -12,6 +12,7 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
+from jeit.arguments.checks import Interval
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes
 from jeit.image import Inclusion
@@ -47,12 +48,16 @@ def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *,
 
 def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
     """Draw the outlines of bodies in a sheet, see `jeit.inverse.shapes`, on axes in metres; outlines of resistive
-    bodies are dashed."""
-    ax = axes_or_new(ax)
+    bodies are dashed. Below each stands the 68 % interval of its change of conductivity, if it is known."""
+    ax, halo = axes_or_new(ax), [withStroke(linewidth=2.5, foreground="white")]
     for sign, _, style, name in _STYLES:
         for number, one in enumerate(one for one in stars if one.sign == sign):
             closed = np.concatenate([one.outline, one.outline[:1]])
             ax.plot(*closed.T, color=INK, linewidth=1.4, linestyle=style, label=None if number else name)
+            if one.quantities is not None:
+                place, text = (one.centroid[0], closed[:, 1].min()), _interval_label(one.quantities.change_interval)
+                beside = {"xytext": (0, -3), "textcoords": "offset points", "ha": "center", "va": "top"}
+                ax.annotate(text, place, fontsize=8, color=INK, zorder=4, path_effects=halo, **beside)
     return ax
 
 
@@ -69,6 +74,14 @@ def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) 
         marker = "+" if inclusion.sign > 0 else "_"
         ax.plot(x, y, marker=marker, color=INK, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=halo)
     return ax
+
+
+def _interval_label(interval: Interval) -> str:
+    """An interval of a relative change, in per cent: "+180 to +220 %"."""
+    low, high = (None if end is None else f"{float(f'{100 * end:.2g}'):+g}" for end in interval)
+    if low is None or high is None:
+        return "change not determined" if low is high else f"at least {low} %" if low else f"at most {high} %"
+    return f"{low} to {high} %"
 
 
 METAL = "#b8860b"
