@@ -76,6 +76,8 @@ _DIAGONALS = np.logspace(-6, 0, 13)
 _MOST_DEAD = 0.34
 # Number of consecutive frames with a unique set of missing channels after which frames are processed one by one.
 _ALONE = 8
+# Number of standard deviations, those of the mean square of normal residuals, by which a frame's must exceed 1.
+_SIGNIFICANT = 2.0
 # Novelty of a frame whose distance from the nearest press is the usual distance between presses.
 _NEAR = 2 / 1.75
 
@@ -147,11 +149,12 @@ class Channels:
         near = Neighbourhood.learn(every)
         return cls(used, scale, far, patterns, spread, noise, farthest, directions, weight, unpredicted, usual, near)
 
-    def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def complete(self, changes: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Replace changes of dead or missing channels by their prediction from the other channels.
 
-        Returns the changes (n, m) of the channels used; whether each is alive (n, m); and the novelty (n,) of the
-        frames, 1 for a frame that is as far from the training set as the farthest frame in it.
+        Returns the changes (n, m) of the channels used; whether each is alive (n, m); the novelty (n,) of the frames, 1
+        for a frame that is as far from the training set as the farthest frame in it; and the standard deviation (n, m)
+        of errors of the readings that residuals show beyond those of the training set, in the unit of changes.
         """
         whole = changes[:, self.used] / self.scale
         given, far = ~np.isnan(whole), (whole < self.range[0]) | (whole > self.range[1])
@@ -175,7 +178,8 @@ class Channels:
             whole[np.ix_(rows, ~pattern)] = self._predicted(whole[np.ix_(rows, pattern)], pattern)
             left = np.setdiff1d(left, rows, assume_unique=True)
         novelty = _novelty(scores, residual, alive, self.spread) / self.usual
-        return whole * self.scale, alive, np.maximum(novelty, _NEAR * self.neighbourhood(scores))
+        novelty = np.maximum(novelty, _NEAR * self.neighbourhood(scores))
+        return whole * self.scale, alive, novelty, self._excess(residual, alive)
 
     def _alive(self, frame: np.ndarray, given: np.ndarray) -> np.ndarray:
         """Determine which channels of a frame agree with the prediction from the others.
@@ -233,6 +237,19 @@ class Channels:
             for way in range(min(len(found), len(channels))):
                 found[np.ix_(np.array([way]), frames, channels)] = columns[:, way] * self.scale[channels]
         return found
+
+    def _excess(self, residual: np.ndarray, alive: np.ndarray) -> Float[np.ndarray, "n m"]:
+        """Estimate the standard deviation (n, m) of errors of readings that frames show beyond those of the presses.
+
+        The mean square of a frame's residuals, relative to the noise, is about 1 for the presses; what exceeds it
+        significantly, as after a drift, is attributed to independent errors of all channels `alive`. The k patterns
+        explain a fraction k/m of such errors.
+        """
+        number = np.maximum(alive.sum(axis=1), 1)
+        free = np.maximum(number - self.patterns.shape[1], 1)
+        usual = 1 + _SIGNIFICANT * np.sqrt(2 / free)
+        beyond = np.maximum(np.sum(np.where(alive, residual, 0.0) ** 2, axis=1) / number - usual, 0.0)
+        return np.sqrt(beyond * number / free)[:, None] * np.where(alive, self.noise * self.scale, 0.0)
 
     def _explain_all(self, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute scores and residuals of frames (n, m) whose channels are all alive."""

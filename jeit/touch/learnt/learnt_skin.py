@@ -39,8 +39,9 @@ from jeit.touch.learnt.presses import (
 # of channels that are alive.
 _UNLIKE, _FEWEST = 2.0, 0.66
 _AT_ONCE = 256
-# Number of principal directions of the error of predicted readings that are propagated to predictions.
-_UNSURE = 4
+# Number of principal directions of the error of predicted readings that are propagated to predictions; number of random
+# errors of all readings that are.
+_UNSURE, _DRAWS = 4, 4
 # Minimum number of touched frames for the detection of stuck channels.
 _MANY = 20
 # Minimum cosine similarity of a reference to that of the training set; maximum ratio of their norms. Beyond these
@@ -116,7 +117,7 @@ class LearntSkin:
             notes.append(
                 f"{counted(len(silent), 'channel')} of {len(channels.used)} without changes, not used: {_few(silent)}."
             )
-        whole, alive, _ = channels.complete(changes)
+        whole, alive, *_ = channels.complete(changes)
         if not alive.all():
             notes.append(
                 f"{100 * (1 - alive.mean()):.2g} % of the readings were not borne out by the others: replaced."
@@ -181,7 +182,7 @@ class LearntSkin:
 
     def _predict(self, changes: Float[np.ndarray, "n M"], reference: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
         """Predict the fields of `Touches` that were learnt, for frames with these changes."""
-        whole, alive, novelty = self.channels.complete(changes)
+        whole, alive, novelty, excess = self.channels.complete(changes)
         touching = np.sqrt(np.mean((whole / self.channels.scale) ** 2, axis=1)) > self.quiet
         # Small changes mean that the skin is untouched, but frames with too many missing channels always count as
         # unlike.
@@ -195,10 +196,10 @@ class LearntSkin:
             touching &= label != NO_TOUCH
         shown = (touching & ~unlike)[:, None]
         if self.place is not None:
-            said, std = self._numbers(self.place, whole, reference, alive)
+            said, std = self._numbers(self.place, whole, reference, alive, excess)
             found |= {"position": np.where(shown, said, np.nan), "position_std": np.where(shown, std, np.nan)}
         if self.force is not None:
-            said, std = self._numbers(self.force, whole, reference, alive)
+            said, std = self._numbers(self.force, whole, reference, alive, excess)
             still = ~touching & ~unlike
             pressed = np.where(shown, np.maximum(said, 0.0), np.nan)[:, 0]
             found |= {"force": np.where(still, 0.0, pressed), "force_std": np.where(shown, std, np.nan)[:, 0]}
@@ -208,17 +209,26 @@ class LearntSkin:
             found["key_probability"] = np.where(unlike[:, None], np.nan, np.where(touching[:, None], probability, 0.0))
         return found
 
-    def _numbers(self, learnt: LearntNumbers, whole, reference, alive) -> tuple[np.ndarray, np.ndarray]:
+    def _numbers(self, learnt: LearntNumbers, whole, reference, alive, excess) -> tuple[np.ndarray, np.ndarray]:
         """Predict targets (n, d) and their standard deviations.
 
-        The standard deviations include the uncertainty of the readings predicted for dead channels.
+        The standard deviations include the uncertainty of the readings predicted for dead channels, and errors of all
+        readings, where these deviate more from the patterns of the training set than its presses do.
         """
-        said, std = learnt.predict(whole, reference)
+        noisy = np.flatnonzero(excess.any(axis=1))
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, 1, whole.shape[1]))
+        moved = (whole[noisy] + signs * excess[noisy]).reshape(-1, whole.shape[1])
+        # One call for all: with few frames, calls take longer than predictions.
+        every = np.concatenate([whole, moved]), np.concatenate([reference, np.tile(reference[noisy], (_DRAWS, 1))])
+        said, off = np.split(learnt.predict(*every), [len(whole)])
+        std = learnt.spread(said, whole)
+        off = off.reshape(_DRAWS, len(noisy), said.shape[1]) - said[noisy]
+        std[noisy] = np.hypot(std[noisy], np.sqrt(np.mean(off**2, axis=0)))
         lacking = np.flatnonzero(~alive.all(axis=1))
         if not lacking.size:
             return said, std
         for moved in self.channels.unsure(alive[lacking], _UNSURE):
-            off = learnt.predict(whole[lacking] + moved, reference[lacking])[0] - said[lacking]
+            off = learnt.predict(whole[lacking] + moved, reference[lacking]) - said[lacking]
             std[lacking] = np.hypot(std[lacking], off)
         return said, std
 

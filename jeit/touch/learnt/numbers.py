@@ -137,13 +137,14 @@ class LearntNumbers:
     scale: float
     spread: Spread
 
-    def predict(self, changes, reference) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-        """Predict targets (n, d) and their standard deviations (n, d)."""
+    def predict(
+        self, changes: Float[np.ndarray, "n m"], reference: Float[np.ndarray, "n m"]
+    ) -> Float[np.ndarray, "n d"]:
+        """Predict targets (n, d) from changes (n, m) and their reference."""
         said = 0.0
         for features, model in self.members:
             said = said + np.asarray(model.predict(features(changes, reference))).reshape(len(changes), -1)
-        values = self.mean + self.scale * said / len(self.members)
-        return values, self.spread(values, changes)
+        return self.mean + self.scale * said / len(self.members)
 
 
 def learn_numbers(

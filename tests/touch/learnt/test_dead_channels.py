@@ -17,7 +17,7 @@ def test_dead_channels_are_found_and_replaced():
     channels, fresh = Channels.learn(changes(200, 0)), changes(50, 1)
     broken = fresh.copy()
     broken[:, 4], broken[:, 11] = 0.0, 3.0
-    whole, alive, novelty = channels.complete(broken)
+    whole, alive, novelty, _ = channels.complete(broken)
     assert np.mean(~alive[:, [4, 11]]) > 0.9
     assert np.delete(alive, [4, 11], axis=1).mean() > 0.99
     found = ~alive
@@ -32,7 +32,7 @@ def test_healthy_channels_that_were_left_out_beside_a_dead_one_are_taken_back():
     channels = Channels.learn(given + 0.01 * rng.normal(size=given.shape))
     dead = rng.integers(0, 12, len(fresh))
     fresh[np.arange(len(fresh)), dead] += 3 * given.std(axis=0)[dead]
-    _, alive, _ = channels.complete(fresh)
+    _, alive, *_ = channels.complete(fresh)
     assert not alive[np.arange(len(fresh)), dead].any()
     assert np.count_nonzero(~alive) < 1.05 * len(fresh)
 
@@ -40,7 +40,7 @@ def test_healthy_channels_that_were_left_out_beside_a_dead_one_are_taken_back():
 def test_readings_that_are_missing_are_foretold():
     channels, fresh = Channels.learn(changes(200, 0)), changes(50, 1)
     holed = np.where(np.random.default_rng(0).random(fresh.shape) < 0.1, np.nan, fresh)
-    whole, alive, _ = channels.complete(holed)
+    whole, alive, *_ = channels.complete(holed)
     assert not alive[np.isnan(holed)].any()
     np.testing.assert_allclose(whole, fresh, atol=0.06)
 
@@ -59,7 +59,7 @@ def test_a_channel_is_foretold_by_the_one_that_reads_the_same(reading):
     for channel in range(20):
         broken = fresh.copy()
         broken[:, channel] = reading
-        whole, alive, _ = channels.complete(broken)
+        whole, alive, *_ = channels.complete(broken)
         assert not alive[:, channel].any()
         assert np.delete(alive, channel, axis=1).mean() > 0.995
         assert np.abs(whole - fresh)[:, channel].max() < 0.02
@@ -69,7 +69,7 @@ def test_channels_that_are_alive_are_not_held_for_dead_beside_four_that_are():
     channels, fresh = Channels.learn(changes(200, 0)), changes(200, 1)
     broken = fresh.copy()
     broken[:, [4, 11, 7, 15]] = [8.0, -8.0, 8.0, 8.0]
-    _, alive, _ = channels.complete(broken)
+    _, alive, *_ = channels.complete(broken)
     assert not alive[:, [4, 11, 7, 15]].any()
     assert np.delete(alive, [4, 11, 7, 15], axis=1).mean() > 0.99
 
@@ -102,9 +102,8 @@ def test_frames_that_lack_different_channels_are_mended_as_each_alone():
 
 def test_frames_of_another_kind_are_told():
     channels = Channels.learn(changes(200, 0))
-    *_, usual = channels.complete(changes(300, 2))
-    *_, strange = channels.complete(np.random.default_rng(3).normal(size=(30, 20)) * 3)
-    *_, great = channels.complete(100 * changes(30, 2))
+    frames = changes(300, 2), np.random.default_rng(3).normal(size=(30, 20)) * 3, 100 * changes(30, 2)
+    usual, strange, great = (channels.complete(one)[2] for one in frames)
     assert np.mean(usual > 2) == 0
     assert (great > 2).all()
     assert (strange > 2).mean() > 0.9

@@ -1,8 +1,17 @@
 """Standard deviations of what is learnt hold as often as they say."""
 
 import numpy as np
+import pytest
+from made_skins import record
 
+from jeit.touch import LearntSkin, Presses
 from jeit.touch.learnt.numbers import Spread
+
+
+@pytest.fixture(scope="module")
+def fine():
+    """A skin whose places depend on all channels: it errs little, and more with the noise."""
+    return LearntSkin.fit(Presses.create(**record(200)), method="gaussian-process")
 
 
 def test_deviations_hold_for_errors_of_which_few_are_large():
@@ -24,3 +33,18 @@ def test_deviations_are_in_the_units_of_what_is_told():
         for unit in (1.0, 1000.0)
     )
     np.testing.assert_allclose(thousand, 1000 * one, rtol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03, 0.06], ids=["as learnt from", "three times", "six times"])
+def test_deviations_hold_where_readings_are_noisier_than_those_learnt_from(fine, noise):
+    """Only the residuals of the frames show the noise: their predictions look like any others."""
+    fresh = record(200, seed=7, noise=noise)
+    touches = fine.predict(fresh["frames"], fresh["reference"])
+    within = np.abs(touches.position - fresh["positions"]) <= touches.position_std
+    assert 0.6 < within.mean() < 0.95
+
+
+def test_deviations_of_a_frame_do_not_depend_on_other_frames(fine):
+    fresh = record(5, seed=7, noise=0.06)
+    together, first = (fine.predict(fresh["frames"][:n], fresh["reference"][:n]).position_std for n in (5, 1))
+    np.testing.assert_allclose(together[:1], first, rtol=1e-6)
