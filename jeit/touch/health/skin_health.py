@@ -41,6 +41,9 @@ _GONE, _REFUSED = 0.6, 0.5
 # that may be beyond it at once.
 _SPANS, _FEW = 3.0, 0.34
 
+# Appended to the reason of an event that the first window shows.
+_SINCE = "It was there from the first frame: gains or contacts that changed since the healthy recording do the same."
+
 _OF_CHANNELS = (EventKind.NOISY, EventKind.STUCK)
 
 
@@ -199,8 +202,10 @@ class SkinHealth:
     def repaired(self, frames: ArrayLike) -> "SkinHealth":
         """Return the state after the user has repaired the skin; all open events become mended.
 
-        The median of the frames (n, M), volts, of the repaired, untouched skin is the new reference. Raises
-        `ValueError` for frames with another number of channels, or without a reading in half of them.
+        The median of the frames (n, M), volts, of the repaired, untouched skin is the new reference. Before the first
+        frame of a later day, untouched frames of that day replace the healthy reference likewise: what has changed
+        since, such as gains, is then no event. Raises `ValueError` for frames with another number of channels, or
+        without a reading in half of them.
         """
         read = _frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
         if read.shape[1] != self.reference.size:
@@ -232,6 +237,7 @@ class SkinHealth:
             skin=None if self.skin is None else self.skin.healed(),
             _window=(),
             _part=(),
+            _settled=True,
             _pending=None,
         )
 
@@ -326,6 +332,7 @@ class SkinHealth:
         change = Change(change, size / healthy.level_limit * healthy.limit, time, frame, self.time)
         frames = np.array([one for _, _, one in self._window])
         found = findings(change.vector, frames, healthy.reference, healthy, self.touching, self.skin)
+        found = [one if one.own is not None else replace(one, reason=f"{one.reason} {_SINCE}") for one in found]
         return replace(begun, reference=healthy.reference)._add_events(change, found, EventStatus.LASTING)
 
     def _update_pending(self, latest: np.ndarray) -> "SkinHealth":

@@ -195,6 +195,20 @@ def test_repair_is_told_and_the_reference_is_new(health):
     assert watch(mended, frames[620:], 1000 + np.arange(280.0)).events == mended.events
 
 
+def test_a_fresh_reference_before_the_first_frame_is_what_frames_are_compared_with(health):
+    """A day later gains differ, and the skin is whole; damage after that is told."""
+    gains = 1 + 0.05 * np.random.default_rng(2).normal(size=NUMBER)
+    later = recording(57) * gains
+    (event,) = watch(health, later).events
+    assert "gains or contacts" in event.reason
+    fresh = health.repaired(np.tile(REST * gains, (10, 1)))
+    assert [event.kind for event in watch(fresh, later).events] == [EventKind.REPAIRED]
+    later[301:] += damage()
+    event = watch(fresh, later).events[-1]
+    assert event.kind == EventKind.CHANGED
+    assert abs(event.frame - 301) <= 2
+
+
 def test_a_recording_that_begins_damaged_says_so(health):
     (event,) = watch(health, recording(58) + 4 * damage()).events
     assert event.frame == 0
