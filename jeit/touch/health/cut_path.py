@@ -199,11 +199,12 @@ class LossFit:
         return np.array([*low, -0.5]), np.array([*high, 0.5]), np.array([*scale, _FACTOR])
 
     def _deviation(self, found: _FittedUnknowns) -> float:
-        """Standard deviation of a path's length, metres: that of its ends, combined with half an edge of the mesh."""
+        """Standard deviation of a path's length, metres: that of both ends, each combined with half an edge of the
+        mesh."""
         least = found.misfit * self.energy
         each = least / max(len(self.change) - len(found.unknowns), 1)
         path = found.unknowns[:-2].reshape(-1, 2)
-        square = (0.5 * self.edge) ** 2
+        square = 2 * (0.5 * self.edge) ** 2
         for end, next_one in ((0, 1), (-1, -2)):
             way = path[end] - path[next_one]
             way = self.edge * way / max(float(np.linalg.norm(way)), 1e-12)
