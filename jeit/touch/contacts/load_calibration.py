@@ -117,9 +117,10 @@ class LoadCalibration(eqx.Module):
     def load(self, contact: Contact) -> Load:
         """Estimate the load of a contact, newtons, and its standard deviation.
 
-        The standard deviation includes the uncertainty of the parameters and the scatter of peaks about the curve.
-        Raises `ValueError` for a peak above the calibrated ones, where the curve does not determine the load, for a
-        peak of the other sign, and for a contact farther from the centre than the calibrated ones.
+        The standard deviation includes the uncertainty of the parameters and the scatter of peaks about the curve, but
+        no change of the skin since calibration: if all gains are g times as large, so are peaks. Raises `ValueError`
+        for a peak above the calibrated ones, where the curve does not determine the load, for a peak of the other sign,
+        and for a contact farther from the centre than the calibrated ones.
         """
         check_kind("contact", contact, Contact, "a Contact, as of find_contacts")
         if contact.peak * self.sign <= 0:
