@@ -16,7 +16,7 @@ from benchmarks.problems.unlike_tanks import KEPT_BACK, SET_ON, SIZE, Tank, draw
 from jeit import image_difference
 from jeit.image import Inclusion
 
-TANKS, FIRST = 240, 900_000
+TANKS, FIRST = 270, 900_000
 HEADER = [
     "kind of error", "tanks", "bodies", "median place / R", "worst", "missed", "spurious", "with intervals",
     "hold change", "hold area", "hold strength", "median width of change", "median error of the peak",

@@ -1,8 +1,9 @@
 """Sheets that are not as they are described: disks, rectangles and polygons with one to three round bodies.
 
 Voltages are computed on another, finer mesh, for electrodes that are not where they are described, with contacts that
-differ; some tanks have one more kind of error. The defaults of jeit were set on the first kinds, `SET_ON`; those
-`KEPT_BACK` are never looked at for that.
+differ; some tanks have one more kind of error. Tanks of the kind "in space" have a height, upright bodies, and strips
+that cover part of the height, and are described as sheets. The defaults of jeit were set on the first kinds, `SET_ON`;
+those `KEPT_BACK` are never looked at for that.
 """
 
 from __future__ import annotations
@@ -15,21 +16,21 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from jeit.data import Measurement
-from jeit.electrodes import BoundaryElectrodes
+from jeit.electrodes import BoundaryElectrodes, FacePatches
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion
-from jeit.mesh import Disk, Domain, Polygon, Rectangle, centroids, measures
+from jeit.mesh import Disk, Domain, Polygon, Rectangle, Solid, centroids, measures
 from jeit.protocol import adjacent, skip
 from jeit_solvers.engines import as_array
 
 SET_ON = ("exact description", "electrodes", "contacts", "electrodes and contacts")
-KEPT_BACK = ("drifting contacts", "size", "gains", "few digits")
+KEPT_BACK = ("drifting contacts", "size", "gains", "few digits", "in space")
 SIZE = 0.1
 """Half of a body's width, metres."""
 REACH = 0.3
 """Distance, in units of `SIZE`, within which an inclusion may be a body's."""
-_NODES = 7000
+_NODES, _NODES_IN_SPACE = 7000, 14_000
 
 
 class Body(NamedTuple):
@@ -89,8 +90,10 @@ def _draw(rng, kind: str, outline: str) -> Tank:
     scale = 1 + (kind == "size") * rng.uniform(-0.03, 0.03)
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.08))))
     place = _along(edge, lengths, middle + shift)
-    truth = BoundaryElectrodes(place, width, contact)
-    mesh = body_mesh(domain, truth, _NODES)
+    height, covered = (rng.uniform(0.3, 1.5) * SIZE, rng.uniform(0.3, 0.99)) if kind == "in space" else (None, 1.0)
+    truth = _electrodes(place, width, contact, height, covered)
+    body, nodes = (domain, _NODES) if height is None else (Solid(domain, height), _NODES_IN_SPACE)
+    mesh = body_mesh(body, truth, nodes)
     truth.check(mesh)
     current = np.exp(rng.uniform(np.log(1e-4), np.log(1e-2)))
     protocol = (
@@ -99,8 +102,8 @@ def _draw(rng, kind: str, outline: str) -> Tank:
         else adjacent(count, current=current, driven_electrodes=bool(rng.integers(2)))
     )
     bodies = _bodies(rng, domain)
-    middles = np.asarray(centroids(mesh))
-    whole = np.full(len(middles), conductivity)
+    middles = np.asarray(centroids(mesh))[:, :2]
+    whole = np.full(len(middles), conductivity / (height or 1.0))
     held = whole.copy()
     inside = [np.linalg.norm(middles - body.centre, axis=1) < body.radius for body in bodies]
     for body, cells in zip(bodies, inside, strict=True):
@@ -108,7 +111,7 @@ def _draw(rng, kind: str, outline: str) -> Tank:
     gain = 1 + (kind == "gains") * rng.uniform(0, 0.05) * rng.normal(size=protocol.num_measurements)
     measured = []
     for values, impedances in ((whole, contact), (held, drifted)):
-        electrodes = BoundaryElectrodes(scale * place, width, impedances)
+        electrodes = _electrodes(scale * place, width, impedances, height, covered)
         there = replace(mesh, points=as_array(scale * np.asarray(mesh.points)))
         voltages = gain * np.asarray(ForwardModel(there, electrodes, protocol).voltages(values))
         deviation = noise * np.hypot(voltages, 0.02 * np.median(np.abs(voltages)))
@@ -121,7 +124,7 @@ def _draw(rng, kind: str, outline: str) -> Tank:
         Measurement(one, np.ones(one.shape, bool), protocol, electrodes=described, domain=domain, name=name)
         for one, name in zip(measured, ("reference", "frame"), strict=True)
     ]
-    areas = [scale**2 * float(np.asarray(measures(mesh))[cells].sum()) for cells in inside]
+    areas = [scale**2 * float(np.asarray(measures(mesh))[cells].sum()) / (height or 1.0) for cells in inside]
     bodies = tuple(
         Body(scale * body.centre, scale * body.radius, body.change, area)
         for body, area in zip(bodies, areas, strict=True)
@@ -142,6 +145,15 @@ def matched(tank: Tank, inclusions: Sequence[Inclusion]) -> tuple[list[Inclusion
         if distance[body, inclusion] < REACH:
             found[body] = inclusions[inclusion]
     return found, len(inclusions) - sum(one is not None for one in found)
+
+
+def _electrodes(place, width, contact, height: float | None, covered: float) -> BoundaryElectrodes | FacePatches:
+    """Arcs on the edge of a sheet; in a tank with a `height`, strips half way up that cover a part of it. `contact` is
+    that of the sheet, ohm·m."""
+    if height is None:
+        return BoundaryElectrodes(place, width, contact)
+    place = np.column_stack([place, np.full(len(place), height / 2)])
+    return FacePatches(place, width, covered * height, contact * height)
 
 
 def _outline(name: str, rng) -> Domain:
