@@ -31,6 +31,8 @@ SIZE = 0.1
 REACH = 0.3
 """Distance, in units of `SIZE`, within which an inclusion may be a body's."""
 _NODES, _NODES_IN_SPACE = 7000, 14_000
+# Least distance of the two ends of a strip, in units of its width.
+_STRAIGHT = 0.98
 
 
 class Body(NamedTuple):
@@ -91,6 +93,9 @@ def _draw(rng, kind: str, outline: str) -> Tank:
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.08))))
     place = _along(edge, lengths, middle + shift)
     height, covered = (rng.uniform(0.3, 1.5) * SIZE, rng.uniform(0.3, 0.99)) if kind == "in space" else (None, 1.0)
+    ends = [_along(edge, lengths, middle + shift + side * width / 2) for side in (-1, 1)]
+    if height is not None and (np.linalg.norm(ends[1] - ends[0], axis=1) < _STRAIGHT * width).any():
+        raise ValueError("a strip bends round a corner.")
     truth = _electrodes(place, width, contact, height, covered)
     body, nodes = (domain, _NODES) if height is None else (Solid(domain, height), _NODES_IN_SPACE)
     mesh = body_mesh(body, truth, nodes)
