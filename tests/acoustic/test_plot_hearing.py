@@ -54,7 +54,8 @@ def fitted(number=9, reasons=(), outliers=()):
         if reason == DEAD:
             power[:, index], usable[:, index] = np.nan, False
     told = np.where(outlier, np.nan, strength)
-    return CalibrationFit(known, distance, power, usable, told, outlier, np.ones(number), ~known.usable)
+    still = np.zeros(known.microphone_array.microphones.shape)
+    return CalibrationFit(known, distance, power, usable, told, outlier, np.ones(number), ~known.usable, still)
 
 
 def recorded(position, statuses=None, *, spread=1e-6, rejected=(), touches=None, used=None, number=9, second=None):

@@ -23,7 +23,7 @@ from jeit.acoustic.signal.faults import describe_faults, intensity_faults
 from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, tap_intensities
 from jeit.acoustic.signal.recording import Taps
 from jeit.acoustic.surface import AbstractSurface, make_surface
-from jeit.arguments import check_kind
+from jeit.arguments import check_kind, describe, is_number
 from jeit_solvers.engines import as_array, host, on_device
 
 # Value of `decay` that selects the decay model by cross-validation.
@@ -37,13 +37,15 @@ _MUCH = 0.23
 # Minimum fraction of the microphones with enough taps that must agree with the model, unless left-out taps are located
 # well. Otherwise the given positions are rejected.
 _LEAST_SHARE = 0.5
+# Default standard deviation of each coordinate of the microphones' given positions, in metres.
+PLACE_ERROR = 2e-3
 
 
 class CalibrationFit(eqx.Module):
     """A calibration, with the T taps to which it was fitted.
 
     - `calibration`: the fitted calibration.
-    - `distance`: (T, M) distance of each tap from each microphone in metres.
+    - `distance`: (T, M) distance of each tap from the estimated position of each microphone in metres.
     - `power`: (T, M) intensities minus the noise floor.
     - `usable`: (T, M) mask of the intensities to which the models were fitted before unusable microphones were
       excluded.
@@ -52,6 +54,8 @@ class CalibrationFit(eqx.Module):
     - `explained`: (M,) fraction of the variance of a microphone's levels that its model explains.
     - `shared`: (M,) mask of microphones whose own taps do not determine the decay of the response with distance, which
       is then taken from the other microphones.
+    - `displacement`: (M, d) estimated displacement of each microphone from its given position in metres. The
+      `calibration` has the estimated positions.
     - `left_out`: name of each decay model with its median localisation error in metres for taps left out of the fit;
       infinite if it located none. The selected model is first.
     """
@@ -64,6 +68,7 @@ class CalibrationFit(eqx.Module):
     outlier: Bool[np.ndarray, " T"]
     explained: Float[np.ndarray, " M"]
     shared: Bool[np.ndarray, " M"]
+    displacement: Float[np.ndarray, "M d"]
     left_out: tuple[tuple[str, float], ...] = ()
 
     @property
@@ -103,6 +108,7 @@ def calibrate_microphones(
     taps: Taps,
     *,
     decay: str | type[AbstractDecay] = AUTO,
+    place_error: float = PLACE_ERROR,
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationFit:
@@ -110,17 +116,19 @@ def calibrate_microphones(
 
     `decay`: "inverse-square", a / (r² + b) as in Park 2022; "exponential", a exp(−r / l); "attenuated", a exp(−r / l) /
     (r² + b); a subclass of `AbstractDecay`; or "auto", which selects among the three the model with the smallest median
-    localisation error of left-out taps (four-fold cross-validation over the positions). `intensity`: band and windows,
-    for taps given as samples. `progress` is called with the name of each step when it begins.
+    localisation error of left-out taps (four-fold cross-validation over the positions). `place_error`: standard
+    deviation in metres of each coordinate of the given positions of the microphones, whose displacements are estimated
+    too; 0 if the positions are exact. `intensity`: band and windows, for taps given as samples. `progress` is called
+    with the name of each step when it begins.
 
     The command `jeit calibrate-microphones` calls this function; `jeit.acoustic.reports.write_calibration` writes its
     output files. Raises `ValueError` if fewer than three microphones can be calibrated, if most microphones disagree
-    with the given positions, for an unknown `decay`, for `intensity` given with taps that are intensities, and for
-    arguments of the wrong type.
+    with the given positions, for an unknown `decay`, a `place_error` that is negative or not finite, for `intensity`
+    given with taps that are intensities, and for arguments of the wrong type.
     """
     every = isinstance(decay, str) and decay == AUTO
     kinds = () if every else (find_decay(decay),)
-    fits, refused = calibrate_each(taps, kinds, intensity=intensity, progress=progress)
+    fits, refused = calibrate_each(taps, kinds, place_error=place_error, intensity=intensity, progress=progress)
     return choose(fits, refused)
 
 
@@ -139,6 +147,7 @@ def calibrate_each(
     taps: Taps,
     decays: Sequence[type[AbstractDecay]] = (),
     *,
+    place_error: float = PLACE_ERROR,
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[dict[str, CalibrationFit], dict[str, str]]:
@@ -150,12 +159,14 @@ def calibrate_each(
     """
     check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
     check_settings("intensity", intensity)
+    if not (is_number(place_error) and place_error >= 0):
+        raise ValueError(f"place_error must be zero or positive, in metres; it is {describe(place_error)}.")
     if intensity is not None and taps.samples is None:
         raise ValueError("intensity: band and window are for taps that come as samples; these are intensities.")
     report = progress or (lambda step: None)
     if taps.samples is not None:
         report("measure intensities")
-    readings = _read(taps, intensity)
+    readings = _read(taps, intensity, place_error)
     found, refused = {}, {}
     for kind in decays or DECAYS.values():
         report(f"fit {kind.name}")
@@ -175,15 +186,15 @@ class _Readings(NamedTuple):
     """Input of a fit: positions and intensities of the taps, and the noise of the microphones.
 
     **Fields**: `microphones`, `places`: positions of microphones and taps in metres; `surface`: the surface;
-    `distance`: distances in metres; `power`: intensities minus the floor, NaN where unusable; `noise`: noise of the
-    microphones; `known_noise`: whether its floor was measured; `faults`: fault of each microphone; `settings`: band and
-    windows, for taps given as samples.
+    `place_error`: standard deviation of the microphones' coordinates in metres; `power`: intensities minus the floor,
+    NaN where unusable; `noise`: noise of the microphones; `known_noise`: whether its floor was measured; `faults`:
+    fault of each microphone; `settings`: band and windows, for taps given as samples.
     """
 
     microphones: Float[np.ndarray, "M d"]
     surface: AbstractSurface
     places: Float[np.ndarray, "T d"]
-    distance: Float[np.ndarray, "T M"]
+    place_error: float
     power: Float[np.ndarray, "M T"]
     noise: IntensityNoise
     known_noise: bool
@@ -211,7 +222,7 @@ class _NoFitError(Exception):
     """Raised if a decay model cannot be fitted to the taps. The message gives the reason."""
 
 
-def _read(taps: Taps, intensity: IntensitySettings | None) -> _Readings:
+def _read(taps: Taps, intensity: IntensitySettings | None, place_error: float) -> _Readings:
     surface = make_surface(taps.outline, taps.positions)
     settings = None
     if taps.samples is None:
@@ -222,20 +233,20 @@ def _read(taps: Taps, intensity: IntensitySettings | None) -> _Readings:
         settings = intensity if intensity is not None else IntensitySettings()
         power, floor, freedom, usable, faults = tap_intensities(taps, settings)
         noise = IntensityNoise.create(power.shape[1], floor=floor, freedom=np.median(freedom))
-    distance = np.linalg.norm(taps.positions[:, None] - taps.microphones, axis=-1)
     known = np.where(usable, power, np.nan).T
     noisy = noise, settings is not None, tuple(faults), settings
-    return _Readings(taps.microphones, surface, taps.positions, distance, known, *noisy)
+    return _Readings(taps.microphones, surface, taps.positions, float(place_error), known, *noisy)
 
 
 def _fit(kind: type[AbstractDecay], readings: _Readings) -> _Fitted:
     """Fit one decay model to all microphones. Raises `_NoFitError` if too few microphones received the taps or agree
     with the model."""
-    enough, why = check_received(kind, readings.distance.T, readings.power, readings.faults)
+    distance = np.linalg.norm(readings.microphones[:, None] - readings.places, axis=-1)
+    enough, why = check_received(kind, distance, readings.power, readings.faults)
     if why:
         raise _NoFitError(why)
-    squared = readings.distance.T**2
-    fit = fit_taps(kind, readings.microphones, squared, readings.power, readings.noise, readings.known_noise)
+    noise = readings.noise, readings.known_noise
+    fit = fit_taps(kind, readings.microphones, readings.places, readings.power, *noise, readings.place_error)
     tried = fit.use.T
     fit, good, reasons, explained = leave_out(fit, readings.faults)
     left = locate_left_out(fit, readings.microphones, readings.surface, readings.places)
@@ -251,14 +262,15 @@ def _fit(kind: type[AbstractDecay], readings: _Readings) -> _Fitted:
 def _calibration_fit(taps: Taps, readings: _Readings, fitted: _Fitted, notes) -> CalibrationFit:
     fit, good = fitted.fit, fitted.good
     # Logarithm of the common factor of gains and strengths, according to the convention of `Calibration`.
-    gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.values)).gain))[good].mean()
+    gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.logarithms)).gain))[good].mean()
     strength = np.where(fit.received, np.exp(fit.strength + gain), np.nan)
-    shared, errors = fit.shared & good, standard_errors(fit)
+    shared, errors = fit.shared & good, standard_errors(fit)[: len(fit.logarithms)]
     errors[1:, shared] = np.nan
-    decay = on_device(fit.kind.from_logarithms(host.concatenate([fit.values[:1] - gain, fit.values[1:]])))
+    decay = on_device(fit.kind.from_logarithms(host.concatenate([fit.logarithms[:1] - gain, fit.logarithms[1:]])))
     loud = (fit.use & (readings.power > 3 * fit.noise.deviation[:, None])).any(axis=0)
+    microphones = readings.microphones + fit.displacement
     calibration = Calibration(
-        MicrophoneArray(as_array(taps.microphones), readings.surface, decay, on_device(fit.noise)),
+        MicrophoneArray(as_array(microphones), readings.surface, decay, on_device(fit.noise)),
         good,
         fitted.reasons,
         errors,
@@ -267,8 +279,9 @@ def _calibration_fit(taps: Taps, readings: _Readings, fitted: _Fitted, notes) ->
         _range(strength[loud]),
         fitted.left.widening,
     )
-    rest = strength, fit.outlier, fitted.explained, shared, notes
-    return CalibrationFit(calibration, readings.distance, readings.power.T, fitted.tried, *rest)
+    rest = strength, fit.outlier, fitted.explained, shared, fit.displacement, notes
+    distance = np.linalg.norm(readings.places[:, None] - microphones, axis=-1)
+    return CalibrationFit(calibration, distance, readings.power.T, fitted.tried, *rest)
 
 
 def _range(strength: np.ndarray) -> tuple[float, float] | None:

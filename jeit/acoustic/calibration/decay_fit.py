@@ -1,10 +1,12 @@
 """Weighted least-squares fit of decay models to taps of unknown strength.
 
-Microphones are the first axis of arrays, and taps the last. For M microphones with K parameters each, and T taps, there
-are K M + T unknowns. The strengths of the taps are eliminated by a Schur complement, which leaves a system with K M
+Microphones are the first axis of arrays, and taps the last. For M microphones with P values each, and T taps, there
+are P M + T unknowns. The strengths of the taps are eliminated by a Schur complement, which leaves a system with P M
 unknowns. Since the microphones of an array are usually of the same kind, a penalty acts on the deviation of each
 parameter except the first from its common value over the array, relative to a `spread`. The common value is eliminated
-too: it is the mean, which minimises the penalty. The code uses NumPy, since an array is calibrated only once.
+too: it is the mean, which minimises the penalty. Microphones may be displaced from their given positions; the
+displacements are further unknowns, with a penalty on their deviation from 0. The code uses NumPy, since an array is
+calibrated only once.
 """
 
 from __future__ import annotations
@@ -31,28 +33,40 @@ _SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 class DecayProblem(NamedTuple):
     """Least-squares problem of a calibration.
 
-    **Fields**: `level`: levels y (M, T); `squared_distance`: squared distances r² (M, T) in m²; `weight`: weights (M,
-    T) of the levels, 0 for unused ones; `floor`: noise floors N (M,); `decay`: class of the decay model; `spread`:
-    standard deviation (K,) of the logarithm of each parameter over the microphones, infinite for no penalty.
+    **Fields**: `level`: levels y (M, T); `offset`: vectors (M, T, d) from the taps to the given positions of the
+    microphones in metres; `weight`: weights (M, T) of the levels, 0 for unused ones; `floor`: noise floors N (M,);
+    `decay`: class of the decay model; `spread`: standard deviation (P,) of each value over the microphones, infinite
+    for no penalty; `place_error`: unit of the displacements in metres.
+
+    The values (P, M) of the microphones are the logarithms of the K parameters of their decay models and, for P = K +
+    d, the coordinates of their displacements divided by `place_error`.
     """
 
     level: Float[np.ndarray, "M T"]
-    squared_distance: Float[np.ndarray, "M T"]
+    offset: Float[np.ndarray, "M T d"]
     weight: Float[np.ndarray, "M T"]
     floor: Float[np.ndarray, " M"]
     decay: type[AbstractDecay]
-    spread: Float[np.ndarray, " K"]
+    spread: Float[np.ndarray, " P"]
+    place_error: float
 
-    def log_response(self, logarithms: Any) -> Float[np.ndarray, "M T"]:
-        """Logarithm of the responses f (M, T) of the models whose parameters have the given `logarithms` (K, M)."""
-        return np.asarray(self.decay.from_logarithms(logarithms).log_response(host.asarray(self.squared_distance)))
+    def displacement(self, values: Any) -> Float[np.ndarray, "M d"]:
+        """Displacements of the microphones from their given positions in metres."""
+        moved = values[len(self.decay.parameters) :].T
+        return self.place_error * moved if moved.size else np.zeros(self.offset.shape[::2])
+
+    def log_response(self, values: Any) -> Float[np.ndarray, "M T"]:
+        """Logarithm of the responses f (M, T) of the models that have the given `values` (P, M)."""
+        squared = ((self.offset + self.displacement(values)[:, None]) ** 2).sum(axis=-1)
+        decay = self.decay.from_logarithms(values[: len(self.decay.parameters)])
+        return np.asarray(decay.log_response(host.asarray(squared)))
 
     def expected(
-        self, logarithms: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"]
+        self, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"]
     ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"]]:
         """Expected levels m = log(e^s f + N) (M, T), and their derivatives with respect to s, which equal those with
         respect to log f. `strength` (T,): logarithms s of the strengths."""
-        return self.levels(strength + self.log_response(logarithms))
+        return self.levels(strength + self.log_response(values))
 
     def levels(
         self, log_received: Float[np.ndarray, "M T"]
@@ -63,11 +77,11 @@ class DecayProblem(NamedTuple):
         return np.log(total), received / total
 
     def expand(
-        self, logarithms: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"]
-    ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"], Float[np.ndarray, "K M T"]]:
-        """Residuals y − m, the derivatives of m with respect to s, and those with respect to the logarithms of the
-        parameters. Residuals with weight 0 are 0."""
-        log_response, along = slopes(self.log_response, logarithms)
+        self, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"]
+    ) -> tuple[Float[np.ndarray, "M T"], Float[np.ndarray, "M T"], Float[np.ndarray, "P M T"]]:
+        """Residuals y − m, the derivatives of m with respect to s, and those with respect to the values. Residuals with
+        weight 0 are 0."""
+        log_response, along = slopes(self.log_response, values)
         mean, share = self.levels(strength + log_response)
         return self.residual(mean), share, share * np.stack(along)
 
@@ -77,7 +91,7 @@ class DecayProblem(NamedTuple):
 
 
 def fit_strengths(
-    problem: DecayProblem, logarithms: Float[np.ndarray, "K M"], start: Float[np.ndarray, " T"]
+    problem: DecayProblem, values: Float[np.ndarray, "P M"], start: Float[np.ndarray, " T"]
 ) -> Float[np.ndarray, " T"]:
     """Fit the logarithms of the strengths of all taps for given decay models."""
 
@@ -91,7 +105,7 @@ def fit_strengths(
         curvature = np.sum(weight * share**2, axis=0)
         return value, gradient[None], np.maximum(curvature, 1e-30)[None, None]
 
-    taps = problem.level, problem.log_response(logarithms), problem.weight
+    taps = problem.level, problem.log_response(values), problem.weight
     return _minimise(expand, start[None], taps, (np.full(1, -np.inf), np.full(1, np.inf)))[0]
 
 
@@ -104,11 +118,12 @@ def _minimise(expand, start, data, bounds) -> np.ndarray:
 
 def fit_together(
     problem: DecayProblem,
-    start: Float[np.ndarray, "K M"],
+    start: Float[np.ndarray, "P M"],
     strength: Float[np.ndarray, " T"],
-    free: Bool[np.ndarray, "K M"],
-) -> tuple[Float[np.ndarray, "K M"], Float[np.ndarray, " T"]]:
-    """Fit the parameters in the mask `free` and the strengths of all taps jointly. Returns their logarithms."""
+    free: Bool[np.ndarray, "P M"],
+) -> tuple[Float[np.ndarray, "P M"], Float[np.ndarray, " T"]]:
+    """Fit the values in the mask `free` and the strengths of all taps jointly. Returns the values and the logarithms of
+    the strengths."""
 
     def unpack(unknowns):
         return unknowns[: start.size].reshape(start.shape), unknowns[start.size :]
@@ -135,12 +150,12 @@ def fit_together(
 
 def fit_within(
     problem: DecayProblem,
-    start: Float[np.ndarray, "K M"],
+    start: Float[np.ndarray, "P M"],
     strength: Float[np.ndarray, " T"],
     received: Bool[np.ndarray, " M"],
-    bounds: tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]],
-) -> tuple[Float[np.ndarray, "K M"], Float[np.ndarray, " T"], Bool[np.ndarray, "K M"]]:
-    """Fit parameters and strengths as `fit_together` does, with `bounds` on the logarithms of the parameters.
+    bounds: tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]],
+) -> tuple[Float[np.ndarray, "P M"], Float[np.ndarray, " T"], Bool[np.ndarray, "P M"]]:
+    """Fit values and strengths as `fit_together` does, with `bounds` on the values.
 
     `received`: mask of the microphones with usable readings, whose parameters are fitted. Also returns the mask of the
     parameters that are held at a bound. A held parameter is released if the cost decreases towards the interior.
@@ -162,16 +177,16 @@ def fit_within(
 
 
 def log_covariance(
-    problem: DecayProblem, logarithms: Float[np.ndarray, "K M"], strength: Float[np.ndarray, " T"], free, scale
+    problem: DecayProblem, values: Float[np.ndarray, "P M"], strength: Float[np.ndarray, " T"], free, scale
 ) -> np.ndarray:
-    """Covariance (K M, K M) of the logarithms of the parameters, ordered by parameter and then by microphone.
+    """Covariance (P M, P M) of the values, ordered by parameter and then by microphone.
 
     The weights of the problem must be inverse variances. The undetermined common factor of gains and strengths is fixed
-    by the condition `scale` · logarithms = constant, with `scale` (K M,). Entries of parameters that are not `free` (K,
-    M) are NaN.
+    by the condition `scale` · values = constant, with `scale` (P M,). Entries of values that are not `free` (P, M) are
+    NaN.
     """
-    schur = _schur(_normal_equations(problem, logarithms, strength, free)[1], 0.0)
-    number, count = logarithms.shape
+    schur = _schur(_normal_equations(problem, values, strength, free)[1], 0.0)
+    number, count = values.shape
     kept = np.asarray(free).ravel()
     shift = np.concatenate([np.ones(count), np.zeros((number - 1) * count)])[kept]
     normal = np.asarray(scale)[kept]
@@ -187,10 +202,10 @@ def log_covariance(
 class _System(NamedTuple):
     """Normal equations of the least-squares problem.
 
-    **Fields**: `matrix`: block (M, K, K) of each microphone; `ties`: matrices (K, M, M) of the penalty, which couple
-    the microphones; `coupling`: block (K, M, T) between parameters and strengths; `tap_matrix`: diagonal (T,) of the
-    strengths; `gradient`, `tap_gradient`: gradients with respect to parameters (K, M) and strengths (T,); `free`: mask
-    (K, M) of the fitted parameters.
+    **Fields**: `matrix`: block (M, P, P) of each microphone; `ties`: matrices (P, M, M) of the penalty, which couple
+    the microphones; `coupling`: block (P, M, T) between values and strengths; `tap_matrix`: diagonal (T,) of the
+    strengths; `gradient`, `tap_gradient`: gradients with respect to values (P, M) and strengths (T,); `free`: mask
+    (P, M) of the fitted values.
     """
 
     matrix: np.ndarray
@@ -221,13 +236,13 @@ def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[n
     return 0.5 * np.sum(weight * off**2) + 0.5 * np.sum(values * pulled), system
 
 
-def _ties(problem: DecayProblem) -> Float[np.ndarray, "K M M"]:
-    """Matrices (K, M, M) of the penalties Σ_m (v_m − v̄)² / spread², where v̄ is the mean over the microphones with at
-    least one reading of nonzero weight."""
+def _ties(problem: DecayProblem) -> Float[np.ndarray, "P M M"]:
+    """Matrices (P, M, M) of the penalties Σ_m (v_m − v̄)² / spread², where v̄ is the mean over the microphones with at
+    least one reading of nonzero weight, or 0 for displacements."""
     received = (problem.weight > 0).any(axis=1).astype(float)
-    return (np.diag(received) - np.outer(received, received) / max(received.sum(), 1.0)) / problem.spread[
-        :, None, None
-    ] ** 2
+    mean = np.outer(received, received) / max(received.sum(), 1.0)
+    tied = np.arange(len(problem.spread)) < len(problem.decay.parameters)
+    return (np.diag(received) - tied[:, None, None] * mean) / problem.spread[:, None, None] ** 2
 
 
 def _step(system: _System, damping):

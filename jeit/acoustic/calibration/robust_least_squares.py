@@ -4,8 +4,9 @@ Arrays are (M, T) for M microphones and T taps. The fitted data are levels, log(
 
 The fit is an iteratively reweighted least-squares fit. First, all microphones share the shape of the response, that is,
 all parameters of the decay model except the gain; almost any set of taps determines it. Then each microphone has its
-own shape, with the variation of the shapes over the array as the prior. Between fits, the noise and the weights are
-re-estimated from the residuals, until convergence. Each step takes a `TapFit` and returns a new one.
+own shape, with the variation of the shapes over the array as the prior, and its own displacement from its given
+position. Between fits, the noise and the weights are re-estimated from the residuals, until convergence. Each step
+takes a `TapFit` and returns a new one.
 
 The noise of a microphone consists of a relative error and an additive deviation; see `jeit.acoustic.noise`.
 """
@@ -113,6 +114,8 @@ _OUTLIER = 12.0
 # Standard deviation of the logarithms of the shape parameters over the array: in the fit with a shared shape; initially
 # in the fit with individual shapes; its minimum; its maximum.
 _ALIKE, _FIRST, _LEAST, _MOST = 0.03, 0.5, 0.1, 1.0
+# Maximum displacement of a microphone along each coordinate, in units of `place_error`.
+_FARTHEST = 4.0
 # Relative standard error of the shape at or above which a microphone's own taps are considered not to determine it.
 _LOOSE = 0.5
 
@@ -121,31 +124,44 @@ class TapFit(eqx.Module):
     """State of the fit of M microphones to T taps.
 
     - `kind`: class of the decay model.
-    - `squared`: (M, T) squared distances in m².
+    - `offset`: (M, T, d) vectors from the taps to the given positions of the microphones in metres.
+    - `place_error`: standard deviation of each coordinate of the given positions in metres; 0 if they are exact.
     - `power`: (M, T) intensities minus the floor; NaN where not usable.
     - `noise`: noise of the microphones. `known_noise`: whether its floor was measured.
-    - `values`: (K, M) logarithms of the parameters of the decay models.
-    - `held`: (K, M) mask of the parameters that are held at a bound.
-    - `spread`: (K,) standard deviation of each logarithm over the array, used as the prior.
+    - `values`: (P, M) logarithms of the K parameters of the decay models, and the coordinates of the displacements of
+      the microphones from their given positions, divided by `place_error`, if it is not 0: P is K + d or K.
+    - `held`: (P, M) mask of the parameters that are held at a bound.
+    - `spread`: (P,) standard deviation of each logarithm over the array, and of the displacements, used as the prior.
     - `strength`: (T,) logarithms of the strengths of the taps.
     - `weight`: (M, T) inverse variances of the levels, reduced for large residuals.
     - `outlier`: (T,) mask of the excluded taps. `dropped`: (M,) mask of the excluded microphones.
-    - `bounds`: lower and upper bounds (K,) of the logarithms.
+    - `bounds`: lower and upper bounds (P,) of the values.
     """
 
     kind: type[AbstractDecay] = eqx.field(static=True)
-    squared: Float[np.ndarray, "M T"]
+    offset: Float[np.ndarray, "M T d"]
+    place_error: float
     power: Float[np.ndarray, "M T"]
     noise: IntensityNoise
     known_noise: bool
-    values: Float[np.ndarray, "K M"]
-    held: Bool[np.ndarray, "K M"]
-    spread: Float[np.ndarray, " K"]
+    values: Float[np.ndarray, "P M"]
+    held: Bool[np.ndarray, "P M"]
+    spread: Float[np.ndarray, " P"]
     strength: Float[np.ndarray, " T"]
     weight: Float[np.ndarray, "M T"]
     outlier: Bool[np.ndarray, " T"]
     dropped: Bool[np.ndarray, " M"]
     bounds: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def logarithms(self) -> Float[np.ndarray, "K M"]:
+        """Logarithms of the parameters of the decay models."""
+        return self.values[: len(self.kind.parameters)]
+
+    @property
+    def displacement(self) -> Float[np.ndarray, "M d"]:
+        """Estimated displacements of the microphones from their given positions in metres."""
+        return self.problem().displacement(self.values)
 
     @property
     def usable(self) -> Bool[np.ndarray, "M T"]:
@@ -164,7 +180,7 @@ class TapFit(eqx.Module):
         return np.asarray(self.use.any(axis=0))
 
     @property
-    def free(self) -> Bool[np.ndarray, "K M"]:
+    def free(self) -> Bool[np.ndarray, "P M"]:
         """Mask of the parameters that are fitted to data: not held at a bound, and of microphones with usable
         readings."""
         return ~self.held & self.usable.any(axis=1)
@@ -190,7 +206,7 @@ class TapFit(eqx.Module):
         """Create the least-squares problem with the current weights, optionally including the excluded taps."""
         weight = np.where(self.usable if with_outliers else self.use, self.weight, 0.0)
         floor = np.asarray(self.noise.floor)
-        return DecayProblem(self.level, self.squared, weight, floor, self.kind, self.spread)
+        return DecayProblem(self.level, self.offset, weight, floor, self.kind, self.spread, self.place_error)
 
     def expected(self) -> Float[np.ndarray, "M T"]:
         """Levels predicted by the fitted models."""
@@ -200,28 +216,35 @@ class TapFit(eqx.Module):
 def fit_taps(
     kind: type[AbstractDecay],
     microphones: Float[np.ndarray, "M d"],
-    squared: Float[np.ndarray, "M T"],
+    places: Float[np.ndarray, "T d"],
     power: Float[np.ndarray, "M T"],
     noise: IntensityNoise,
     known_noise: bool,
+    place_error: float,
 ) -> TapFit:
-    """Fit the decay model `kind` to all microphones: first with a shared shape, then with individual shapes."""
-    extent = float(np.sqrt(squared.max()))
+    """Fit the decay model `kind` to all microphones: first with a shared shape, then with individual shapes and
+    displacements. The arguments are the fields of `TapFit`; `microphones`: given positions."""
+    offset = microphones[:, None] - places
+    extent = float(np.linalg.norm(offset, axis=-1).max())
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
-    lower, upper = (np.array(bound) for bound in kind.bounds(extent))
+    moves = offset.shape[2] if place_error > 0 else 0
+    low, high = kind.bounds(extent)
+    lower, upper = np.array([*low, *[-_FARTHEST] * moves]), np.array([*high, *[_FARTHEST] * moves])
     start = np.asarray(kind.start(spacing if spacing > 0 else extent / 4, len(microphones)).logarithms())
-    taps = squared.shape[1]
+    start = np.concatenate([start, np.zeros((moves, len(microphones)))])
+    shapes, taps = len(kind.parameters) - 1, len(places)
     fit = TapFit(
         kind,
-        squared,
+        offset,
+        place_error,
         power,
         on_host(noise),
         known_noise,
         values=np.clip(start, lower[:, None], upper[:, None]),
         held=np.zeros(start.shape, bool),
-        spread=_spread(np.full(len(start) - 1, _ALIKE)),
+        spread=_spread(np.full(shapes, _ALIKE), np.full(moves, _ALIKE)),
         strength=np.zeros(taps),
-        weight=np.zeros(squared.shape),
+        weight=np.zeros(power.shape),
         outlier=np.zeros(taps, bool),
         dropped=np.zeros(len(microphones), bool),
         bounds=(lower, upper),
@@ -238,7 +261,7 @@ def fit_taps(
         weight=1 / np.maximum(_level_variance(fit, np.nan_to_num(np.maximum(power, 0.0))), 0.04),
     )
     fit = _refine(fit, _ALTERNATIONS)
-    return _refine(replace(fit, spread=_spread(np.full(len(start) - 1, _FIRST))), _REWEIGHTINGS, scattered=True)
+    return _refine(replace(fit, spread=_spread(np.full(shapes, _FIRST), np.ones(moves))), _REWEIGHTINGS, scattered=True)
 
 
 def refit_without(fit: TapFit, bad: Bool[np.ndarray, " M"]) -> TapFit:
@@ -246,15 +269,16 @@ def refit_without(fit: TapFit, bad: Bool[np.ndarray, " M"]) -> TapFit:
     return _refine(replace(fit, dropped=fit.dropped | bad), _REWEIGHTINGS, scattered=True)
 
 
-def standard_errors(fit: TapFit) -> Float[np.ndarray, "K M"]:
-    """Standard deviations (K, M) of the logarithms of the parameters, for gains normalised as in a `Calibration`; NaN
-    for parameters held at a bound."""
+def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
+    """Standard deviations (P, M) of the values, for gains normalised as in a `Calibration`; NaN for values held at a
+    bound."""
     free = fit.free
     if free[0].sum() < 2:
         return np.full(free.shape, np.nan)
+    count = len(fit.kind.parameters)
 
     def scale(values):
-        return np.where(free[0], np.log(fit.kind.from_logarithms(values).gain), 0.0)
+        return np.where(free[0], np.log(fit.kind.from_logarithms(values[:count]).gain), 0.0)
 
     normal = np.ravel(slopes(scale, fit.values)[1])
     covariance = log_covariance(fit.problem(), fit.values, fit.strength, free, normal)
@@ -277,23 +301,27 @@ def _refine(fit: TapFit, rounds: int, *, scattered: bool = False) -> TapFit:
     return fit
 
 
-def _spread(shapes) -> Float[np.ndarray, " K"]:
-    """Spread (K,) of all parameters from that of the `shapes`; infinite for the gain, which has no prior."""
-    return np.concatenate([[np.inf], shapes])
+def _spread(shapes, moves) -> Float[np.ndarray, " P"]:
+    """Spread (P,) of all values from that of the `shapes` and of the displacements (`moves`); infinite for the gain,
+    which has no prior."""
+    return np.concatenate([[np.inf], shapes, moves])
 
 
-def _scatter(fit: TapFit) -> Float[np.ndarray, " K"]:
-    """Update the spread of the shape parameters over the array by one step of expectation maximisation, from the
-    estimates and their standard errors."""
+def _scatter(fit: TapFit) -> Float[np.ndarray, " P"]:
+    """Update the spread of the shape parameters over the array, and that of the displacements, by one step of
+    expectation maximisation, from the estimates and their standard errors."""
     known = fit.usable.any(axis=1)
     if known.sum() < 2:
         return fit.spread
-    shapes, errors = fit.values[1:, known], np.nan_to_num(standard_errors(fit)[1:, known])
+    count, errors = len(fit.kind.parameters), np.nan_to_num(standard_errors(fit)[:, known])
+    shapes, moves = fit.logarithms[1:, known], fit.values[count:, known]
     # Deviations are limited, so that an outlying microphone does not dominate.
     off = np.abs(shapes - np.median(shapes, axis=1, keepdims=True))
-    near = np.minimum(off, 3 * fit.spread[1:, None])
-    square = (near**2 + errors**2).sum(axis=1) / (known.sum() - 1)
-    return _spread(np.clip(np.sqrt(square), _LEAST, _MOST))
+    near = np.minimum(off, 3 * fit.spread[1:count, None])
+    square = (near**2 + errors[1:count] ** 2).sum(axis=1) / (known.sum() - 1)
+    # The displacements have one spread, which is at most `place_error`.
+    moved = np.full(len(moves), (moves**2 + errors[count:] ** 2).mean() if moves.size else 0.0)
+    return _spread(*(np.clip(np.sqrt(one), _LEAST, _MOST) for one in (square, moved)))
 
 
 def _reweight(fit: TapFit) -> TapFit:

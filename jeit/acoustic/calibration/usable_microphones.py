@@ -162,7 +162,8 @@ class LeftOutTaps(NamedTuple):
 def locate_left_out(
     fit: TapFit, microphones: Float[np.ndarray, "M d"], surface: AbstractSurface, places: Float[np.ndarray, "T d"]
 ) -> LeftOutTaps:
-    """Locate each tap with decay models fitted to taps in other folds, and with the noise of the fit to all taps."""
+    """Locate each tap with decay models and displacements fitted to taps in other folds, and with the noise of the fit
+    to all taps. `microphones`: given positions."""
     part = _deal(places)
     off, square = np.full((2, len(places)), np.nan)
     coarse = Localiser.create(_array(fit, fit.values, microphones, surface)).coarse
@@ -187,8 +188,9 @@ def locate_left_out(
 
 
 def _array(fit: TapFit, values, microphones, surface: AbstractSurface) -> MicrophoneArray:
-    decay = on_device(fit.kind.from_logarithms(host.asarray(values)))
-    return MicrophoneArray(as_array(microphones), surface, decay, on_device(fit.noise))
+    decay = on_device(fit.kind.from_logarithms(host.asarray(values[: len(fit.kind.parameters)])))
+    displaced = microphones + fit.problem().displacement(values)
+    return MicrophoneArray(as_array(displaced), surface, decay, on_device(fit.noise))
 
 
 def _most_likely(array: MicrophoneArray, coarse: Pixels, power, use):

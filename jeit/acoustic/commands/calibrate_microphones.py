@@ -39,6 +39,13 @@ def calibrate_microphones(
             "best locates taps left out of the fit."
         ),
     ] = "auto",
+    place_error: Annotated[
+        float,
+        typer.Option(
+            help="Standard deviation in metres of each coordinate of the given positions of the microphones, which are "
+            "corrected by the taps; 0 if they are exact."
+        ),
+    ] = 0.002,
     low: BandLow = None,
     high: BandHigh = None,
     window: Window = None,
@@ -53,6 +60,8 @@ def calibrate_microphones(
     from jeit.acoustic.reports import calibration_files, write_calibration
     from jeit.cli.console import Steps, plain_console, say_written
 
+    if not 0 <= place_error < float("inf"):
+        raise ValueError(f"--place-error must be zero or positive, in metres; it is {place_error}.")
     settings = intensity_settings(low, high, window, hop)
     console = plain_console()
     with naming_options(_OPTIONS):
@@ -62,7 +71,7 @@ def calibrate_microphones(
         with Steps(console, quiet=quiet) as step:
             step("read")
             touched = read_taps(taps)
-            fit = calibrate(touched, decay=kind, intensity=settings, progress=step)
+            fit = calibrate(touched, decay=kind, place_error=place_error, intensity=settings, progress=step)
             step("write")
             write_calibration(fit, output)
     if not quiet:
@@ -111,7 +120,8 @@ def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
 
 
 def _parameters(fit: "CalibrationFit"):
-    """A table of the decay models of all usable microphones."""
+    """A table of the decay models and displacements of all usable microphones."""
+    import numpy as np
     from rich.table import Table
 
     from jeit_solvers.engines import on_host
@@ -122,7 +132,7 @@ def _parameters(fit: "CalibrationFit"):
     if decay.name == "exponential":
         units["a"] = "1"
     columns = [text for name in decay.parameters for text in (f"{name} / {units[name]}", "± %")]
-    table = Table("", *columns, "error %", "explained %", box=None, padding=(0, 1))
+    table = Table("", *columns, "moved / mm", "error %", "explained %", box=None, padding=(0, 1))
     for column in table.columns[1:]:
         column.justify = "right"
     for k, reason in enumerate(calibration.reasons):
@@ -135,6 +145,7 @@ def _parameters(fit: "CalibrationFit"):
                 f"{factors[name] * float(getattr(decay, name)[k]):.3g}",
                 f"{error:.1f}" if error == error else "–",
             ]
-        cells += [f"{100 * float(noise.relative[k]):.1f}", f"{100 * float(fit.explained[k]):.1f}"]
+        moved = 1e3 * float(np.linalg.norm(fit.displacement[k]))
+        cells += [f"{moved:.1f}", f"{100 * float(noise.relative[k]):.1f}", f"{100 * float(fit.explained[k]):.1f}"]
         table.add_row(str(k), *cells)
     return table
