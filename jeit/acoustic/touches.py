@@ -9,7 +9,7 @@ import numpy as np
 
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
-from jeit.acoustic.localisation.locate import locate
+from jeit.acoustic.localisation.locate import GAIN_DRIFT, locate
 from jeit.acoustic.localisation.locations import Locations
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
@@ -41,6 +41,7 @@ def locate_touches(
     gap: float = 0.15,
     intensity: IntensitySettings | None = None,
     silence: Recording | None = None,
+    gain_drift: float = GAIN_DRIFT,
     progress: Callable[[str], None] | None = None,
 ) -> LocatedTouches:
     """Locate every touch in a recording. The command `jeit locate` calls this function;
@@ -49,8 +50,9 @@ def locate_touches(
     `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022, minimised on a map of 200 ×
     200 pixels and then refined. `gap`: time in seconds without a position after which a touch has ended. `intensity`:
     band and windows, for recordings of samples; by default those of the calibration. `silence`: recording of the
-    untouched array, from which the noise floor is estimated if touches never pause. `progress` is called with the name
-    of each step when it begins.
+    untouched array, from which the noise floor is estimated if touches never pause. `gain_drift`: standard deviation of
+    the changes of the gains since the calibration, as a fraction of the intensities; see `locate`. `progress` is called
+    with the name of each step when it begins.
 
     Raises `ValueError` for a recording with another number of microphones, fewer than three usable microphones, frames
     farther apart than `gap`, `intensity` or `silence` given for a recording of intensities, and values out of range.
@@ -69,6 +71,6 @@ def locate_touches(
         )
     said("locate")
     map_shape = _PAPERS_MAP if method == "consistency" else None
-    locations = locate(result, calibration, method=method, map_shape=map_shape)
+    locations = locate(result, calibration, method=method, map_shape=map_shape, gain_drift=gain_drift)
     said("track")
     return LocatedTouches(result, locations, track(locations, gap=gap), calibration, method)

@@ -45,6 +45,13 @@ def locate(
             show_default=False,
         ),
     ] = None,
+    gain_drift: Annotated[
+        float,
+        typer.Option(
+            help="Standard deviation of the changes of the microphones' gains since the calibration, as a fraction of "
+            "the intensities; 0 if they have not changed."
+        ),
+    ] = 0.1,
     low: BandLow = None,
     high: BandHigh = None,
     window: Window = None,
@@ -61,6 +68,8 @@ def locate(
     check_name("--method", method, METHODS)
     if not 0 < gap < float("inf"):
         raise ValueError(f"--gap must be positive, in seconds; it is {gap}.")
+    if not 0 <= gain_drift < float("inf"):
+        raise ValueError(f"--gain-drift must be zero or positive, as a fraction; it is {gain_drift}.")
     settings = intensity_settings(low, high, window, hop)
     make_folder(output, ("track.csv", "report.json", "track.png"))
     console = plain_console()
@@ -69,7 +78,7 @@ def locate(
         known = Calibration.load(calibration)
         sound = read_recording(recording)
         hush = None if silence is None else _silence(silence, sound)
-        options = {"method": method, "gap": gap, "intensity": settings, "silence": hush}
+        options = {"method": method, "gap": gap, "intensity": settings, "silence": hush, "gain_drift": gain_drift}
         found = locate_touches(sound, known, **options, progress=step)
         step("write")
         write_track(found, output)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
+import jax
 import numpy as np
 from scipy.special import chdtrc, chdtri
 
 from jeit.acoustic.calibration.calibration import Calibration
 from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
+from jeit.acoustic.localisation.gain_changes import GainChanges, covariance_with_gains, estimate_gain_changes
 from jeit.acoustic.localisation.localiser import Localiser, SourceEstimate
 from jeit.acoustic.localisation.locations import FEW_FRAMES, Locations, LocationStatus
 from jeit.acoustic.localisation.setup_changes import find_setup_changes
@@ -18,8 +22,12 @@ from jeit.acoustic.signal.faults import describe_faults
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.acoustic.surface import longer_side
+from jeit.arguments import describe, is_number
 from jeit_solvers.engines import as_array, on_host
 
+# Default standard deviation of the changes of the microphones' gains since the calibration, as a fraction of the
+# intensities.
+GAIN_DRIFT = 0.1
 # Probability that a silent frame is detected as a touch, and that a frame with one source is classified as a misfit.
 _FALSE_ALARM, _FALSE_MISFIT = 1e-6, 1e-4
 # Detection threshold in standard deviations of the noise, if the distribution of the noise is unknown.
@@ -35,6 +43,8 @@ _BOTH, _STILL_FAIR, _WEAKEST = 0.2, 10.0, 0.05
 # Fraction of the touches that are not explained by one source on the skin, above which changes of the setup are
 # searched for.
 _ODD = 0.25
+# Minimum fraction of the frames that one or two sources must explain if the gains have not changed.
+_EXPLAINED = 0.9
 # Minimum ratio of the intensity of a touch to the highest intensity of the recording, if no floor is known (−60 dB).
 _DYNAMIC_RANGE = 1e-6
 # Maximum plausible ratio of the strength of touches to that of the calibration taps, or its inverse (40 dB).
@@ -49,6 +59,7 @@ def locate(
     map_shape: tuple[int, int] | None = None,
     intensity: IntensitySettings | None = None,
     silence: Recording | None = None,
+    gain_drift: float = GAIN_DRIFT,
     compiled: bool | None = None,
 ) -> Locations:
     """Locate the touch in each frame of a recording.
@@ -56,18 +67,22 @@ def locate(
     `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022. `map_shape`: (rows,
     columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid. The best position is
     refined in either case. `intensity`: band and windows, for recordings of samples; by default those of the
-    calibration. `silence`: recording of the untouched array; see `calibrated_intensities`. `compiled`: whether to
-    compile the computation, which takes seconds but makes it several times faster; by default True for more than 1,024
-    frames with a touch. Use True for many successive recordings. Raises `ValueError` for a recording with another
-    number of microphones, and if fewer than three microphones can be used.
+    calibration. `silence`: recording of the untouched array; see `calibrated_intensities`. `gain_drift`: standard
+    deviation of the changes of the microphones' gains since the calibration, as a fraction of the intensities. The
+    changes are estimated from all touches of the recording, and the covariances include their remaining errors; 0 if
+    the gains have not changed. `compiled`: whether to compile the computation, which takes seconds but makes it several
+    times faster; by default True for more than 1,024 frames with a touch. Use True for many successive recordings.
+    Raises `ValueError` for a recording with another number of microphones, a `gain_drift` that is negative or not
+    finite, and if fewer than three microphones can be used.
     """
+    if not (is_number(gain_drift) and gain_drift >= 0):
+        raise ValueError(f"gain_drift must be zero or positive, as a fraction; it is {describe(gain_drift)}.")
     intensities = calibrated_intensities(recording, calibration, intensity, silence=silence)
     microphone_array, use, faults = microphones_in_use(intensities, calibration)
     touched = use.any(axis=1) & _above_floor(intensities, microphone_array.noise, use)
     enough = use.sum(axis=1) >= 3
     solve = touched & enough
     compiled = int(solve.sum()) > FEW_FRAMES if compiled is None else compiled
-    localiser = Localiser.create(microphone_array, method=method, map_shape=map_shape, compiled=compiled)
     frames, d = len(intensities.times), calibration.microphone_array.microphones.shape[1]
     status = np.where(touched, LocationStatus.TOUCH, LocationStatus.NO_TOUCH).astype(object)
     status[~enough] = LocationStatus.UNUSABLE
@@ -82,23 +97,14 @@ def locate(
     }
     notes = list(intensities.notes)
     if solve.any():
-        power, used = _pad_frames(intensities.power[solve], use[solve], compiled)
-        found = localiser(power, used)
-        # The status of a frame is always determined from the likelihood, also if another method locates the touch.
-        judge = found if method == "likelihood" else Localiser.create(microphone_array, compiled=compiled)(power, used)
-        number = int(solve.sum())
-        for key in ("position", "covariance", "strength"):
-            result[key][solve] = getattr(found, key)[:number]
-        for key in ("misfit", "freedom"):
-            result[key][solve] = getattr(judge, key)[:number]
-        status[solve] = _judge(judge, found)[:number]
-        _fit_two_sources(status, result, intensities.power, use, microphone_array, compiled)
-        excess = np.zeros(frames)
-        excess[solve] = np.asarray(judge.excess)[:number]
-        status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
+        settings = _Settings(method, map_shape, gain_drift, compiled)
+        frames_in_use = intensities.power[solve], use[solve]
+        status[solve], found, changes = _locate_frames(microphone_array, *frames_in_use, settings)
+        for key, values in found.items():
+            result[key][solve] = values
         result["covariance"] *= calibration.widening
         _bound(status, result, float(longer_side(on_host(microphone_array.surface))))
-        notes += _notes(status, intensities, use, microphone_array)
+        notes += [*_gain_note(changes), *_notes(status, intensities, use, microphone_array)]
     return Locations(
         np.asarray(intensities.times),
         **result,
@@ -109,6 +115,52 @@ def locate(
         notes=(*notes, *_unit(result["strength"], intensities, use, calibration)),
         name=intensities.name,
     )
+
+
+class _Settings(NamedTuple):
+    """Arguments of `locate` that determine how frames are located."""
+
+    method: str
+    map_shape: tuple[int, int] | None
+    gain_drift: float
+    compiled: bool
+
+
+def _locate_frames(
+    microphone_array: MicrophoneArray, power: np.ndarray, use: np.ndarray, settings: _Settings
+) -> tuple[np.ndarray, dict[str, np.ndarray], GainChanges]:
+    """Status (F,) of frames with a touch, their results by the names of the fields of `Locations`, and the changes of
+    the gains with which they were located."""
+    compiled, number = settings.compiled, len(power)
+    padded = _pad_frames(power, use, compiled)
+
+    def estimate(array: MicrophoneArray, method: str, map_shape: tuple[int, int] | None) -> SourceEstimate:
+        localiser = Localiser.create(array, method=method, map_shape=map_shape, compiled=compiled)
+        return jax.tree.map(lambda values: np.array(values)[:number], localiser(*padded))
+
+    def most_likely(array: MicrophoneArray) -> tuple[SourceEstimate, np.ndarray]:
+        found = estimate(array, "likelihood", None)
+        return found, _judge(found, found) == LocationStatus.TOUCH
+
+    possible = estimate_gain_changes(microphone_array, power, use, settings.gain_drift, most_likely)
+    for changes in possible:
+        array = changes.apply(microphone_array)
+        # The status of a frame is always determined from the likelihood, also if another method locates the touch.
+        judge, _ = most_likely(array)
+        standard = settings.method == "likelihood" and settings.map_shape is None
+        found = judge if standard else estimate(array, settings.method, settings.map_shape)
+        result = {key: np.array(getattr(found, key)) for key in ("position", "covariance", "strength")}
+        result |= {key: np.array(getattr(judge, key)) for key in ("misfit", "freedom")}
+        result |= {"second": np.full_like(result["position"], np.nan), "second_strength": np.full(number, np.nan)}
+        if settings.method == "likelihood":
+            result["covariance"] = covariance_with_gains(microphone_array, power, use, found, changes)
+        status = _judge(judge, found)
+        _fit_two_sources(status, result, power, use, array, compiled)
+        excess = np.asarray(judge.excess)
+        status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
+        if np.mean(status != LocationStatus.MISFIT) > _EXPLAINED:
+            break
+    return status, result, changes
 
 
 def _judge(judge: SourceEstimate, found: SourceEstimate) -> np.ndarray:
@@ -171,6 +223,18 @@ def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> N
     status[vague] = LocationStatus.AMBIGUOUS
     boundless = located & (~finite | (width > reach))
     result["covariance"][boundless] = (reach / 2) ** 2 * np.eye(result["covariance"].shape[1])
+
+
+def _gain_note(changes: GainChanges) -> list[str]:
+    """Note on the estimated changes of the gains, if they are applied."""
+    factor = np.exp(changes.logarithm)
+    if (factor == 1).all():
+        return []
+    most = int(np.abs(changes.logarithm).argmax())
+    return [
+        "gains have changed since the calibration, and the places are corrected for it: most that of microphone "
+        f"{most}, by {100 * (factor[most] - 1):+.0f} % of its intensity."
+    ]
 
 
 def _notes(
