@@ -149,11 +149,11 @@ def covariance_with_gains(
     """
     array, unknowns = _with_known_gains(microphone_array, changes), _unknowns(microphone_array, found, slice(None))
     known = np.isfinite(unknowns).all(axis=0)
-    unknowns = np.where(known, unknowns, 0.0)
+    unknowns = host.where(known, unknowns, 0.0)
     likelihood, jacobian, share, weight = _linearise(array, power, use, unknowns)
     inverse = inverse_small(likelihood.expand(unknowns)[2])
     slope = np.einsum("klf,lmf->kmf", inverse[:2], weight * share * jacobian)
-    total = inverse[:2, :2] + np.einsum("kmf,mn,lnf->klf", slope, changes.covariance, slope, optimize=True)
+    total = inverse[:2, :2] + host.einsum("kmf,mn,lnf->klf", slope, changes.covariance, slope, optimize=True)
     return np.where(known[:, None, None], in_space(array.surface, unknowns[:2], total)[1], np.nan)
 
 

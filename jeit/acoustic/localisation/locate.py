@@ -142,8 +142,9 @@ def _locate_frames(
         found = estimate(array, "likelihood", None)
         return found, _judge(found, found) == LocationStatus.TOUCH
 
-    possible = estimate_gain_changes(microphone_array, power, use, settings.gain_drift, most_likely)
-    for changes in possible:
+    *others, last = estimate_gain_changes(microphone_array, power, use, settings.gain_drift, most_likely)
+
+    def locate_with(changes: GainChanges) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         array = changes.apply(microphone_array)
         # The status of a frame is always determined from the likelihood, also if another method locates the touch.
         judge, _ = most_likely(array)
@@ -158,9 +159,13 @@ def _locate_frames(
         _fit_two_sources(status, result, power, use, array, compiled)
         excess = np.asarray(judge.excess)
         status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
+        return status, result
+
+    for changes in others:
+        status, result = locate_with(changes)
         if np.mean(status != LocationStatus.MISFIT) > _EXPLAINED:
-            break
-    return status, result, changes
+            return status, result, changes
+    return *locate_with(last), last
 
 
 def _judge(judge: SourceEstimate, found: SourceEstimate) -> np.ndarray:
