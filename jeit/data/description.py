@@ -189,8 +189,8 @@ def _uncertainty(table: UncertaintyTable, domain: Body | None, origin: str) -> U
                 f"{origin}: [uncertainty] position_degrees is of a disk or a cylinder; give position, in metres."
             )
         position = float(np.deg2rad(table.position_degrees) * np.asarray(outline.radius))
-    shares = (table.contact_drift_percent, table.size_percent, table.other_percent)
-    return Uncertainty(position, *(one / 100 for one in shares))
+    drift, size, other = (one / 100 for one in (table.contact_drift_percent, table.size_percent, table.other_percent))
+    return Uncertainty(position, drift, size, other)
 
 
 def _layout(data: DataTable) -> TableLayout:

@@ -23,8 +23,8 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
 
     The NPZ file holds `voltages` (F, M) in volts, `mask` (F, M), `frame_names`, `notes`, `times` (F,) in seconds if
     known, and the protocol: `drive` (S, L) in amperes, `measurement` (K, L), `drive_index` (M,), `measurement_index`
-    (M,), `protocol_name`. The TOML file holds geometry, electrodes and protocol, so it also describes other tables of
-    the same sensor. `read` restores the measurement.
+    (M,), `protocol_name`. The TOML file holds geometry, electrodes, protocol and uncertainty, so it also describes
+    other tables of the same sensor. `read` restores the measurement.
 
     Raises `ValueError` for another suffix, and for electrodes or bodies that a description cannot express (a mesh or an
     outline of your own, and electrodes on its facets).
@@ -39,6 +39,11 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
         lines += ["", "[electrodes]", *_assignments(_electrodes(measurement.electrodes))]
     protocol = measurement.protocol
     lines += ["", "[protocol]", *_assignments(_protocol(protocol))]
+    if (known := measurement.uncertainty) is not None:
+        shares = {"contact_drift": known.drift, "size": known.size, "other": known.other}
+        said = {} if known.position is None else {"position": known.position}
+        said |= {f"{name}_percent": 100 * share for name, share in shares.items()}
+        lines += ["", "[uncertainty]", *_assignments(said)]
     component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
     lines += ["", "[data]", *_assignments({"frames_in": "rows", "component": component})]
     arrays: dict[str, Any] = {part: np.asarray(getattr(protocol, part)) for part in PROTOCOL_ARRAYS}

@@ -14,6 +14,7 @@ from jeit.data.quality import (
     impossible_signs,
     reciprocity_error,
     reciprocity_noise,
+    rounding_deviation,
 )
 from jeit.inverse import relative_noise
 
@@ -38,6 +39,8 @@ class FrameQuality:
       estimated.
     - `trusted_noise`: noise of the difference in units of `jeit.inverse.relative_noise` of the reference, the expected
       error of channels relative to each other; None if it cannot be estimated.
+    - `rounding`: standard deviation of the difference due to rounding of the voltages, relative to the difference; 0 if
+      they are not rounded.
     - `difference_reciprocity_error`: relative reciprocity error of the difference, or None.
     - `impossible_signs`: fraction of voltages whose sign is impossible on a passive body, the larger of the fractions
       of frame and reference; or None.
@@ -52,6 +55,7 @@ class FrameQuality:
     impossible_signs: float | None
     usable_channels: int
     reason: str
+    rounding: float = 0.0
 
     @property
     def imageable(self) -> bool:
@@ -158,10 +162,18 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                 difference_reciprocity_error=error,
                 impossible_signs=wrong,
                 usable_channels=usable,
+                rounding=_rounding(frame, mean, size) if size > 0 else 0.0,
                 reason=_reason(measurement.protocol.num_electrodes, usable, relative, wrong, error, own, alike),
             )
         )
     return results
+
+
+def _rounding(frame: Measurement, reference: Measurement, size: float) -> float:
+    """Root of the sum of squares of the rounding of both, relative to the `size` of the difference, volts."""
+    each = [rounding_deviation(np.asarray(one.voltages)[0], np.asarray(one.mask)[0]) for one in (frame, reference)]
+    both = np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0]
+    return float(np.linalg.norm(np.hypot(*each)[both])) / size
 
 
 def check_imageable(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:

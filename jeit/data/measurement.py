@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact
 from numpy.typing import ArrayLike
 
-from jeit.arguments import counted, describe, did_you_mean, is_number
+from jeit.arguments import check_kind, counted, describe, did_you_mean, is_number
 from jeit.electrodes import AbstractElectrodes
 from jeit.inverse.placement import Uncertainty
 from jeit.mesh import Body, Mesh
@@ -80,6 +80,8 @@ class Measurement(eqx.Module):
         self.frame_names = tuple(frame_names)
         self.notes = tuple(notes)
         self.times = None if times is None else as_array(np.asarray(times, float))
+        if uncertainty is not None:
+            check_kind("uncertainty", uncertainty, Uncertainty, "a jeit.inverse.Uncertainty(position=…)")
         self.uncertainty = uncertainty
         if not jnp.issubdtype(self.voltages.dtype, jnp.inexact):
             raise ValueError(f"voltages are {self.voltages.dtype}; give real or complex volts.")

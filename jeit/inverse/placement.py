@@ -18,17 +18,20 @@ impedances; Darde, Hyvönen, Seppänen and Staboulis, SIAM Journal on Imaging Sc
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 
+from jeit.arguments import check_has_values, describe, is_number
 from jeit.electrodes.electrodes import AbstractMovableElectrodes
 from jeit.forward import ForwardModel
 from jeit.forward.changes import PlacementSensitivity, shifted
 from jeit.forward.model import select_channels
 from jeit.inverse.channels import IndependentChannels, relative_noise
+from jeit.inverse.nonlinear.problem import check_frame
 from jeit_solvers import Descent, QuadraticModel, ridge_model
 from jeit_solvers.engines import as_array, on_host
 
@@ -42,19 +45,31 @@ _STEPS, _RTOL = {2: (15, 15), 3: (5, 3)}, 3e-3
 _LEAST_NOISE = 0.1
 
 
-class Uncertainty(NamedTuple):
-    """How accurately a sensor is described, as standard deviations.
+@dataclass(frozen=True)
+class Uncertainty:
+    """How accurately a sensor is described, as standard deviations. All but the first are shares: 0.1 is 10 %.
 
     **Fields**: `position`: of electrode positions, metres, in every direction in which they can move; default: 0.0175
     of the width of the body, 2° of a disk. `drift`: of the logarithm of each contact impedance, from the reference to
     the frame. `size`: of the lengths of the body, relative. `other`: of whatever else differs from the model, as a
-    share of the difference of the two frames; the misfit of the reference, if that is larger.
+    share of the difference of the two frames; the misfit of the reference, if that is larger. Raises `ValueError` for
+    values that are negative or not finite, and for sizes and others above 1.
     """
 
     position: float | None = None
     drift: float = 0.1
     size: float = 0.01
     other: float = 0.02
+
+    def __post_init__(self):
+        for name, most in (("position", np.inf), ("drift", np.inf), ("size", 1.0), ("other", 1.0)):
+            value = getattr(self, name)
+            if value is None and name == "position":
+                continue
+            if not (is_number(value) and 0 <= value <= most and value < np.inf):
+                wanted = "metres, 0 or more" if name == "position" else "a share, not per cent"
+                wanted += " from 0 to 1" if most == 1 else ""
+                raise ValueError(f"{name} must be a number, {wanted}; it is {describe(value)}.")
 
 
 class Placement(NamedTuple):
@@ -121,12 +136,21 @@ def place_electrodes(
     body.
 
     `voltages` (M,), volts; `mask` (M,): True for channels to use; `deviation`: standard deviation of the described
-    positions, metres, in every direction in which an electrode can move. Raises `ValueError` for electrodes that cannot
-    move, voltages that have the opposite sign of the model's, and where nothing is found that explains them.
+    positions, metres, in every direction in which an electrode can move; 0 if they are exact. Raises `ValueError` for
+    electrodes that cannot move, invalid arguments, voltages that have the opposite sign of the model's, and where
+    nothing is found that explains them.
     """
+    measured, used = check_frame(model, voltages, mask)
+    check_has_values("place_electrodes", (model, measured), "the fit takes steps of NumPy", "take calibrate")
+    width = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+    if not (is_number(deviation) and 0 <= deviation < width):
+        raise ValueError(
+            f"deviation must be a number of metres, less than the width of the body, {width:.3g} m; it is "
+            f"{describe(deviation)}."
+        )
     if not isinstance(model.electrodes, AbstractMovableElectrodes):
         raise ValueError(f"electrodes: {type(model.electrodes).__name__} have no position that can be estimated.")
-    problem = _Problem(model, np.asarray(voltages), mask, deviation)
+    problem = _Problem(model, np.asarray(measured), used, deviation)
     size, scale = len(problem.spread), 1.0
     found: Any = np.zeros(size)
     here, covariance = None, np.eye(size)
@@ -150,7 +174,7 @@ class _Problem:
 
     def __init__(self, model: ForwardModel, measured: np.ndarray, mask, deviation: float):
         self.given, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
-        self.used = np.isfinite(measured) if mask is None else np.asarray(mask, bool) & np.isfinite(measured)
+        self.used = np.ones(len(measured), bool) if mask is None else mask
         self.measured = measured
         self.independent = len(IndependentChannels.create(self.protocol).index)
         self.noise = np.asarray(relative_noise(as_array(measured), as_array(self.used)))

@@ -11,6 +11,7 @@ import numpy as np
 from jeit.image import Inclusion
 from jeit.imaging.difference import ImagedDifference
 from jeit.imaging.method import METHODS, ImagingSettings
+from jeit.inverse import Uncertainty
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.protocol import Protocol
@@ -147,6 +148,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "mesh": {"points": result.mesh.num_points, "cells": result.mesh.num_cells},
         },
         "protocol": _protocol(result.measurement.protocol),
+        "uncertainty": _uncertainty(result.reference.uncertainty or Uncertainty()),
         "calibration": _calibration(result),
         "noise": None
         if noise is None
@@ -163,6 +165,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "difference_reciprocity_error": quality.difference_reciprocity_error,
             "impossible_signs": quality.impossible_signs,
             "usable_channels": quality.usable_channels,
+            "rounding_relative_to_difference": quality.rounding,
         },
         "reconstruction": {
             "quantity": f"change of conductivity against the reference, {_unit(result)}",
@@ -185,6 +188,18 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         "versions": {name: version_of(name) for name in _PACKAGES},
     }
     return plain(content)
+
+
+def _uncertainty(known: Uncertainty) -> dict[str, Any]:
+    """The uncertainty of the description, which intervals are based on; the position is None by default, for 0.0175 of
+    the width of the body."""
+    return {
+        "position": known.position,
+        "position_unit": "m",
+        "contact_drift": known.drift,
+        "size": known.size,
+        "other": known.other,
+    }
 
 
 def _frame(result: ImagedDifference) -> dict[str, Any]:
@@ -280,8 +295,7 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
         for bodies in (result.shapes.bodies, result.shapes.doubtful)
     )
     others = zip(result.shapes.alternatives, result.shapes.alternative_deviations, strict=True)
-    for one, deviation, (other, its) in zip(kept, result.shapes.contrast_deviations, others, strict=True):
-        one["deviation_of_logarithm"] = deviation
+    for one, (other, its) in zip(kept, others, strict=True):
         if other is not None:
             ratio = math.exp(other.sign * other.contrast)
             said = {"conductivity_over_background": ratio, "deviation_of_logarithm": its}

@@ -299,7 +299,8 @@ def test_an_uncertainty_is_described_in_degrees_and_per_cent_and_stays_with_the_
     known = parse_description(
         {**SHEET, "uncertainty": {"position_degrees": 1, "size_percent": 3}}, "d.toml"
     ).uncertainty
-    assert known == Uncertainty(position=pytest.approx(np.deg2rad(1) * 0.1), size=0.03)
+    assert known.position == pytest.approx(np.deg2rad(1) * 0.1)
+    assert known == Uncertainty(position=known.position, size=0.03)
     np.savetxt(tmp_path / "frames.csv", np.random.default_rng(0).normal(size=(3, 40)), delimiter=",")
     (tmp_path / "frames.toml").write_text(
         '[geometry]\nshape = "disk"\nradius = 0.1\n[electrodes]\nlayout = "ring"\nnumber = 8\nwidth = 0.01\n'
@@ -309,6 +310,8 @@ def test_an_uncertainty_is_described_in_degrees_and_per_cent_and_stays_with_the_
     measurement = read(tmp_path / "frames.csv")
     one = measurement.frame(0).masked(np.arange(40) != 3, "for a test.").mean_frame()
     assert measurement.uncertainty == one.uncertainty == known
+    write_table(measurement, tmp_path / "again.npz")
+    assert read(tmp_path / "again.npz").uncertainty == known
     assert parse_description(SHEET, "d.toml").uncertainty is None
 
 
@@ -323,6 +326,19 @@ def test_an_uncertainty_is_described_in_degrees_and_per_cent_and_stays_with_the_
 def test_a_faulty_uncertainty_is_named(given, said):
     with pytest.raises(ValueError, match=said):
         parse_description({**SHEET, "uncertainty": given}, "d.toml")
+
+
+@pytest.mark.parametrize(
+    "given", [{"position": -1e-3}, {"position": "1 mm"}, {"drift": np.nan}, {"size": 3}, {"other": -1}, {"drift": None}]
+)
+def test_an_uncertainty_of_wrong_values_is_refused(given):
+    with pytest.raises(ValueError, match=f"{next(iter(given))} must be a number"):
+        Uncertainty(**given)
+
+
+def test_an_uncertainty_of_another_kind_is_refused():
+    with pytest.raises(ValueError, match=r"jeit\.inverse\.Uncertainty"):
+        Measurement(np.ones(40), np.ones(40, bool), adjacent(8), uncertainty={"position": 1e-3})  # pyright: ignore
 
 
 def test_degrees_need_a_round_body():

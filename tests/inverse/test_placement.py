@@ -81,6 +81,12 @@ def test_what_cannot_be_placed_is_refused(tank):
     model = ForwardModel(DISK.mesh(num_points=800), DESCRIBED, PROTOCOL)
     with pytest.raises(ValueError, match="opposite sign"):
         place_electrodes(model, -voltages, deviation=1e-3)
+    for wrong in (-1e-3, 1.0, np.nan, "1 mm", None):
+        with pytest.raises(ValueError, match="deviation must be a number of metres"):
+            place_electrodes(model, voltages, deviation=wrong)
+    for bad in ({"voltages": voltages[:100]}, {"mask": np.ones(3, bool)}, {"mask": np.zeros(len(voltages), bool)}):
+        with pytest.raises(ValueError, match="mask"):
+            place_electrodes(model, **{"voltages": voltages, **bad}, deviation=1e-3)
     nodes = NodeElectrodes(np.arange(16))
     with pytest.raises(ValueError, match="NodeElectrodes have no position that can be estimated"):
         place_electrodes(ForwardModel(model.mesh, nodes, PROTOCOL), voltages, deviation=1e-3)

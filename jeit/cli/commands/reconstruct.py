@@ -157,6 +157,10 @@ def reconstruct(
         say_written(console, output / "image.png", "image.npz", "report.json", *solid)
 
 
+# Share of the difference above which rounding is reported.
+_ROUNDED = 2e-3
+
+
 def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
     """Print the result; `asked`: whether the frame was given by the user."""
     import numpy as np
@@ -181,6 +185,8 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
         ("method", f"{result.settings.method}, hyperparameter {chosen}"),
         ("mesh", f"{counted(result.mesh.num_points, 'node')}, {counted(result.mesh.num_cells, 'cell')}"),
     ]
+    if result.quality.rounding > _ROUNDED:
+        rows.insert(3, ("rounding", f"{percent(result.quality.rounding)} of the difference: voltages have few digits"))
     if calibration.note:
         rows.insert(1, ("note", calibration.note))
     if calibration.status != Status.CONVERGED:
@@ -231,7 +237,7 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
     strong = sum(not one.contrast_is_determined for one in shapes.bodies)
     upright = sum(isinstance(one, Ellipsoid) and one.column for one in shapes.bodies)
     columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
-    assumed = f"; {strong} so strong that the data give a limit of the change only" if strong else ""
+    assumed = f"; the data only limit the change of {strong}" if strong else ""
     alike = any(isinstance(one, Ellipsoid) and one.alike for one in shapes.bodies)
     material = ", as of one material: the data do not contradict it" if alike else ""
     drift = f"the background has drifted by {percent(shapes.drift)}"

@@ -23,10 +23,11 @@ from jeit.mesh import Mesh, measures
 # Difference of log evidence above which only the likelier of two descriptions is reported (ellipsoid or column, one
 # material or several); maximum number of steps when an alternative is fitted; tolerance of that fit.
 _UNDECIDED, _STEPS, _ROUGHLY = 4.0, 8, 1e-2
-# Contribution of the mesh to the standard deviation of a contrast in log σ, in a solid. Balls of three times the bath's
-# conductivity are estimated as 3.87, 3.59 and 3.31 times as conductive if edges on their surfaces are 0.7, 0.5 and 0.35
-# of the radius, and as 3.1 to 3.2 times if they are 0.25 of it.
-_BY_THE_MESH = 0.1
+# Contribution of the mesh to the standard deviation of a contrast in log σ, in a sheet and in a solid. Balls of three
+# times the bath's conductivity are estimated as 3.87, 3.59 and 3.31 times as conductive if edges on their surfaces are
+# 0.7, 0.5 and 0.35 of the radius, and as 3.1 to 3.2 times if they are 0.25 of it. Disks of four times the conductivity
+# of a sheet are estimated as 4.0 to 4.2 times on meshes of 2,000 to 8,000 nodes.
+_BY_THE_MESH = {2: 0.03, 3: 0.1}
 
 
 def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> list[float]:
@@ -35,12 +36,12 @@ def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = N
 
 
 def besides(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> Float[np.ndarray, " k"]:
-    """Standard deviations of the contrasts of bodies, in log σ, that Laplace's approximation of the problem lacks: in a
-    solid that of the mesh, and that of the materials.
+    """Standard deviations of the contrasts of bodies, in log σ, that Laplace's approximation of the problem lacks: that
+    of the mesh, and that of the materials.
 
     `each`: fit in which every body has its own material. If the data do not rule it out, its contrasts are included.
     """
-    variance = np.full(len(fitted.bodies.sign), (_BY_THE_MESH * (fitted.bodies.dimension == 3)) ** 2)
+    variance = np.full(len(fitted.bodies.sign), _BY_THE_MESH[fitted.bodies.dimension] ** 2)
     if each and problem.surprise(each) - each.bodies.odds < problem.surprise(fitted) - fitted.bodies.odds + _UNDECIDED:
         contrast, deviation = _contrasts(problem, fitted)
         own, its = _contrasts(problem, each)

@@ -74,8 +74,8 @@ class ShapeReconstruction(eqx.Module):
     voltages predicted for the bodies; `misfit`: root mean square of predicted - measured over the channels used, in
     standard deviations; `drift`: relative difference of the bath's conductivity from `background`; `doubtful`: bodies
     that were removed because their `rise` is too small; `contrast_deviations`: posterior standard deviation of each
-    body's contrast due to noise, in solids combined with 0.1 for the mesh; `alternatives`: for each body of a solid,
-    the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
+    body's contrast due to noise, combined with that of the mesh (0.03, in solids 0.1); `alternatives`: for each body
+    of a solid, the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
     `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`: for a solid
     with bodies, the conductivity on the last refined mesh, for display.
     """

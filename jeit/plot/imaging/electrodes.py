@@ -48,17 +48,40 @@ def draw_labels(labels: ArrayLike, extent: tuple[float, float, float, float], *,
 
 def draw_outlines(stars: Sequence[Star], *, ax: Axes | None = None) -> Axes:
     """Draw the outlines of bodies in a sheet, see `jeit.inverse.shapes`, on axes in metres; outlines of resistive
-    bodies are dashed. Below each stands the 68 % interval of its change of conductivity, if it is known."""
-    ax, halo = axes_or_new(ax), [withStroke(linewidth=2.5, foreground="white")]
+    bodies are dashed. Beside each stands the 68 % interval of its change of conductivity, if it is known."""
+    ax = axes_or_new(ax)
     for sign, _, style, name in _STYLES:
         for number, one in enumerate(one for one in stars if one.sign == sign):
             closed = np.concatenate([one.outline, one.outline[:1]])
             ax.plot(*closed.T, color=INK, linewidth=1.4, linestyle=style, label=None if number else name)
-            if one.quantities is not None:
-                place, text = (one.centroid[0], closed[:, 1].min()), _interval_label(one.quantities.change_interval)
-                beside = {"xytext": (0, -3), "textcoords": "offset points", "ha": "center", "va": "top"}
-                ax.annotate(text, place, fontsize=8, color=INK, zorder=4, path_effects=halo, **beside)
+    _label_intervals(ax, [one for one in stars if one.quantities is not None])
     return ax
+
+
+def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
+    """Write the interval of each body on the side of its outline that faces the middle of the axes, where no electrodes
+    are; on the other side if another label is there."""
+    (x_min, y_min), (x_max, y_max) = ax.dataLim.get_points()
+    near, taken = 0.3 * np.array([x_max - x_min, 0.2 * (y_max - y_min)]), []
+    for one in stars:
+        sides = (1, -1) if one.centroid[1] < (y_min + y_max) / 2 else (-1, 1)
+        places = [(one.centroid[0], side * (side * one.outline[:, 1]).max()) for side in sides]
+        free = [all((np.abs(np.subtract(place, other)) > near).any() for other in taken) for place in places]
+        which = free.index(True) if any(free) else 0
+        taken.append(places[which])
+        assert one.quantities is not None
+        ax.annotate(
+            _interval_label(one.quantities.change_interval),
+            places[which],
+            xytext=(0, 3 * sides[which]),
+            textcoords="offset points",
+            ha="center",
+            va="bottom" if sides[which] > 0 else "top",
+            fontsize=8,
+            color=INK,
+            zorder=4,
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
+        )
 
 
 def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) -> Axes:
