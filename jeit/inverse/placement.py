@@ -63,7 +63,7 @@ class Uncertainty:
 
     def __post_init__(self):
         for name, most in (("position", np.inf), ("drift", np.inf), ("size", 1.0), ("other", 1.0)):
-            value = getattr(self, name)
+            value: Any = getattr(self, name)
             if value is None and name == "position":
                 continue
             if not (is_number(value) and 0 <= value <= most and value < np.inf):

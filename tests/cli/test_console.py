@@ -94,6 +94,6 @@ def test_bodies_end_at_outlines_in_a_sheet_and_at_surfaces_in_a_solid(dimension,
     told, strong = (SimpleNamespace(contrast_is_determined=known) for known in (True, False))
     shapes: Any = SimpleNamespace(bodies=[told, strong], doubtful=[told], drift=0.01)
     assert bodies_text(shapes, dimension) == (
-        f"2 {edge} fitted; 1 ghost left out; 1 so strong that the data give a limit of the change only; the background "
+        f"2 {edge} fitted; 1 ghost left out; of 1 the data give a limit of the change only; the background "
         "has drifted by 1 %"
     )

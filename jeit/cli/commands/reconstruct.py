@@ -237,7 +237,7 @@ def bodies_text(shapes: "ShapeReconstruction", dimension: int) -> str:
     strong = sum(not one.contrast_is_determined for one in shapes.bodies)
     upright = sum(isinstance(one, Ellipsoid) and one.column for one in shapes.bodies)
     columns = f", {counted(upright, 'column')} through the whole height" if upright else ""
-    assumed = f"; the data only limit the change of {strong}" if strong else ""
+    assumed = f"; of {strong} the data give a limit of the change only" if strong else ""
     alike = any(isinstance(one, Ellipsoid) and one.alike for one in shapes.bodies)
     material = ", as of one material: the data do not contradict it" if alike else ""
     drift = f"the background has drifted by {percent(shapes.drift)}"
