@@ -64,9 +64,8 @@ class Uncertainty:
     def __post_init__(self):
         for name, most in (("position", np.inf), ("drift", np.inf), ("size", 1.0), ("other", 1.0)):
             value: Any = getattr(self, name)
-            if value is None and name == "position":
-                continue
-            if not (is_number(value) and 0 <= value <= most and value < np.inf):
+            known = is_number(value) and np.isfinite(value) and 0 <= float(value) <= most
+            if not (known or (value is None and name == "position")):
                 wanted = "metres, 0 or more" if name == "position" else "a share, not per cent"
                 wanted += " from 0 to 1" if most == 1 else ""
                 raise ValueError(f"{name} must be a number, {wanted}; it is {describe(value)}.")
