@@ -161,8 +161,8 @@ class Number:
         return f"{low}{high}{f' {self.unit}' if self.unit else ''}"
 
     def _hint(self, given: float) -> str:
-        """Propose a value for a number that is off by a factor of 1000."""
-        if not self.unit or math.isinf(self.high) or abs(given) > 1e100:
+        """Propose a value for a number that is off by a factor of 1000; not for units without such prefixes."""
+        if self.unit in ("", "%", "degrees") or math.isinf(self.high) or abs(given) > 1e100:
             return ""
         for larger, metric in ((True, "metres"), (False, "micrometres")):
             if not (self.low <= 1000 * given <= self.high if larger else self.low <= given / 1000 <= self.high):

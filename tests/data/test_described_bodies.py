@@ -321,6 +321,7 @@ def test_an_uncertainty_is_described_in_degrees_and_per_cent_and_stays_with_the_
         ({"position": 1e-3, "position_degrees": 1}, "the same"),
         ({"position": -1}, "from 0"),
         ({"positions": 1}, "did you mean 'position'"),
+        ({"other_percent": 101}, r"101, and must be from 0 to 100 %\.$"),
     ],
 )
 def test_a_faulty_uncertainty_is_named(given, said):
