@@ -19,6 +19,7 @@ MOST = {
     "every_method": 0.25,
     "hear_a_touch": 0.01,
     "hear_a_stroke": 3e-3,
+    "how_far_to_trust": 0.61,
     "learn_a_prior": 0.97,
     "localisation_error": 2.5e-3,
     "prosthesis": 6e-3,

@@ -41,6 +41,8 @@ _ROUNDS, _SETTLED = 4, 0.05
 _CELL = 0.3
 # Probability that changes are significant if the gains have not changed; relative tolerance of the rank of A.
 _FALSE_CHANGE, _RANK = 0.01, 1e-8
+# Share of its trace that is added to the Fisher matrix of a frame, which is singular where few microphones respond.
+_RIDGE = 1e-12
 
 
 class GainChanges(NamedTuple):
@@ -151,7 +153,7 @@ def covariance_with_gains(
     known = np.isfinite(unknowns).all(axis=0)
     unknowns = host.where(known, unknowns, 0.0)
     likelihood, jacobian, share, weight = _linearise(array, power, use, unknowns)
-    inverse = inverse_small(likelihood.expand(unknowns)[2])
+    inverse = _inverse(likelihood.expand(unknowns)[2])
     slope = np.einsum("klf,lmf->kmf", inverse[:2], weight * share * jacobian)
     total = inverse[:2, :2] + host.einsum("kmf,mn,lnf->klf", slope, changes.covariance, slope, optimize=True)
     return np.where(known[:, None, None], in_space(array.surface, unknowns[:2], total)[1], np.nan)
@@ -186,8 +188,13 @@ def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.
     off = likelihood.level - array.expected(unknowns)[0]
     weighted = weight * share
     coupling = weighted * jacobian
-    inverse = inverse_small(np.einsum("kmf,lmf->klf", weight * jacobian, jacobian))
+    inverse = _inverse(np.einsum("kmf,lmf->klf", weight * jacobian, jacobian))
     eliminated = np.einsum("klf,lmf->kmf", inverse, coupling)
     matrix = np.diag((weighted * share).sum(axis=1)) - np.einsum("kmf,knf->mn", coupling, eliminated)
     right = (weighted * off).sum(axis=1) - np.einsum("kmf,kf->m", eliminated, (weight * jacobian * off).sum(axis=1))
     return matrix, right
+
+
+def _inverse(fisher) -> np.ndarray:
+    """Inverses of Fisher matrices (3, 3, F), also of singular ones: their ridge makes them definite."""
+    return inverse_small(fisher + _RIDGE * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None])
