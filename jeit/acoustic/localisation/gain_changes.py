@@ -197,4 +197,5 @@ def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.
 
 def _inverse(fisher) -> np.ndarray:
     """Inverses of Fisher matrices (3, 3, F), also of singular ones: their ridge makes them definite."""
-    return inverse_small(fisher + _RIDGE * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None])
+    definite = fisher + _RIDGE * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None]
+    return np.asarray(inverse_small(definite))
