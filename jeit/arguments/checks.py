@@ -97,21 +97,12 @@ Interval = tuple[float | None, float | None]
 """Ends of a credible interval, None where the data leave an end open."""
 
 
-def interval_text(
-    value: float | None, interval: Interval | None, written: Callable[[float], str], parted: str = "\n{} to {}"
-) -> str:
-    """A value and its interval, `parted` from it, as text; "at least" or "at most" the known end where the other one is
-    open."""
-    if value is None or interval is None:
-        return "not known" if value is None else written(value)
+def interval_text(interval: Interval, written: Callable[[float], str]) -> str:
+    """An interval as text, each end as `written`; "at least" or "at most" the known end where the other one is open."""
     low, high = interval
-    if low is None and high is None:
-        return "not determined"
     if low is None:
-        return f"at most {written(high)}"  # pyright: ignore
-    if high is None:
-        return f"at least {written(low)}"
-    return written(value) + parted.format(written(low), written(high))
+        return "not determined" if high is None else f"at most {written(high)}"
+    return f"at least {written(low)}" if high is None else f"{written(low)} to {written(high)}"
 
 
 # Maximum reading of any instrument, in volts or fractions of volts; squares of such numbers do not overflow.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jeit.arguments import interval_text, percent
+from jeit.arguments.checks import Interval
 
 if TYPE_CHECKING:
     from jeit.image import Inclusion
@@ -116,13 +117,13 @@ def inclusion_table(inclusions: "Sequence[Inclusion]", unit: str, *, background:
     `unit`: unit of conductivity. `background`: conductivity of the reference, if known.
     """
     unit, peaks = in_one_unit([one.peak for one in inclusions], unit)
-    size, digits = _size(inclusions)
+    noun, size_unit, digits = _size(inclusions)
     more = ["of back-\nground"] if background else []
     rows = []
     for inclusion, peak in zip(inclusions, peaks, strict=True):
         share = [percent(inclusion.peak / background)] if background else []
         rows.append([f"{1e6 * inclusion.area:.{digits}f}", peak, *share])
-    return _with_places(inclusions, [size, f"peak change\n/ {unit}", *more], rows)
+    return _with_places(inclusions, [f"{noun}\n/ {size_unit}", f"peak change\n/ {unit}", *more], rows)
 
 
 def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Table:
@@ -131,16 +132,15 @@ def quantity_table(inclusions: "Sequence[Inclusion]", background: float) -> Tabl
     `background`: conductivity of the reference, S/m (2-D: S). If the data leave an end of an interval open, only the
     other end is given.
     """
-    size, _ = _size(inclusions)
-    unit = size.split("/")[-1].strip()
+    noun, unit, _ = _size(inclusions)
     rows = []
     for one in inclusions:
-        measure = interval_text(one.area, one.area_interval, lambda value: _three_digits(1e6 * value))
+        measure = with_interval(one.area, one.area_interval, lambda value: _three_digits(1e6 * value))
         share = one.peak / background
-        change = interval_text(share, one.contrast_interval, lambda value: _three_digits(100 * value, "+"))
-        strength = interval_text(one.strength, one.strength_interval, lambda value: _three_digits(1e6 * value))
+        change = with_interval(share, one.contrast_interval, lambda value: _three_digits(100 * value, "+"))
+        strength = with_interval(one.strength, one.strength_interval, lambda value: _three_digits(1e6 * value))
         rows.append([measure, change, strength])
-    table = _with_places(inclusions, [size, "change\n/ %", f"strength\n/ {unit}"], rows)
+    table = _with_places(inclusions, [f"{noun}\n/ {unit}", "change\n/ %", f"strength\n/ {unit}"], rows)
     table.caption, table.caption_justify = "below each value its 68 % interval", "left"
     return table
 
@@ -150,10 +150,18 @@ def _three_digits(value: float, sign: str = "") -> str:
     return f"{float(f'{value:.3g}'):{sign}g}"
 
 
-def _size(inclusions: "Sequence[Inclusion]") -> tuple[str, int]:
-    """Heading of sizes, and their number of decimals. The same factor 1e6 converts square metres to mm² and cubic
-    metres to cm³."""
-    return ("volume\n/ cm³", 2) if any(one.is_solid for one in inclusions) else ("area / mm²", 0)
+def with_interval(value: float | None, interval: Interval | None, written: Callable[[float], str]) -> str:
+    """A value above its interval, as text; only the interval where one of its ends is open."""
+    if value is None or interval is None:
+        return "not known" if value is None else written(value)
+    text = interval_text(interval, written)
+    return text if None in interval else f"{written(value)}\n{text}"
+
+
+def _size(inclusions: "Sequence[Inclusion]") -> tuple[str, str, int]:
+    """What sizes are, their unit, and their number of decimals. The same factor 1e6 converts square metres to mm² and
+    cubic metres to cm³."""
+    return ("volume", "cm³", 2) if any(one.is_solid for one in inclusions) else ("area", "mm²", 0)
 
 
 def _with_places(inclusions: "Sequence[Inclusion]", columns: list[str], rows: list[list[str]]) -> Table:

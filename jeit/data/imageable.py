@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from jeit.arguments import counted, percent
 from jeit.data.measurement import Measurement
@@ -162,18 +163,19 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                 difference_reciprocity_error=error,
                 impossible_signs=wrong,
                 usable_channels=usable,
-                rounding=_rounding(frame, mean, size) if size > 0 else 0.0,
+                rounding=float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0,
                 reason=_reason(measurement.protocol.num_electrodes, usable, relative, wrong, error, own, alike),
             )
         )
     return results
 
 
-def _rounding(frame: Measurement, reference: Measurement, size: float) -> float:
-    """Root of the sum of squares of the rounding of both, relative to the `size` of the difference, volts."""
+def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[np.ndarray, " M"]:
+    """Standard deviation (M,), volts, of the difference of two frames due to the rounding of both; 0 where a channel is
+    not usable in both."""
     each = [rounding_deviation(np.asarray(one.voltages)[0], np.asarray(one.mask)[0]) for one in (frame, reference)]
     both = np.asarray(frame.mask)[0] & np.asarray(reference.mask)[0]
-    return float(np.linalg.norm(np.hypot(*each)[both])) / size
+    return np.where(both, np.hypot(*each), 0.0)
 
 
 def check_imageable(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:

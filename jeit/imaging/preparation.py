@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jeit.arguments import check_kind
 from jeit.data import Measurement
-from jeit.data.imageable import FrameQuality, assess
-from jeit.data.quality import rounding_deviation
+from jeit.data.imageable import FrameQuality, assess, rounding_of_difference
 from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
@@ -201,8 +200,7 @@ class PreparedDifference:
     @functools.cached_property
     def _rounding(self) -> Float[np.ndarray, " M"]:
         """Standard deviation of the rounding of the difference, volts."""
-        frames = [np.asarray(one.voltages)[0] for one in (self.measurement, self.reference)]
-        return np.hypot(*(rounding_deviation(one, np.asarray(self.mask)) for one in frames))
+        return rounding_of_difference(self.measurement, self.reference)
 
 
 def prepare_difference(
@@ -228,6 +226,7 @@ def prepare_difference(
     with clock("check"), naming_frame(measurement, number):
         (quality,) = assess(one, base)
         domain, electrodes = body_of(one, base)
+        base = base if one.uncertainty is None else replace(base, uncertainty=one.uncertainty)
         both = np.asarray(one.mask)[0] & np.asarray(base.mask)[0]
         difference = as_array(np.where(both, np.asarray(one.voltages)[0] - np.asarray(base.voltages)[0], 0))
         if not as_is and (exchanged := exchanges_message(one, base)):
@@ -243,7 +242,6 @@ def prepare_difference(
         if not quality.imageable:
             with naming_frame(measurement, number):
                 raise ValueError(f"'{one.name}' cannot be imaged: {quality.reason}")
-    base = base if one.uncertainty is None else replace(base, uncertainty=one.uncertainty)
     calibration, chosen = calibrated_model(model, base, contact=contact, clock=clock)
     return PreparedDifference(
         one, base, quality, domain, chosen, wiring, calibration, difference, both, number, measurement.num_frames
@@ -378,7 +376,8 @@ def check_real(measurement: Measurement) -> None:
 
 
 def body_of(measurement: Measurement, reference: Measurement) -> tuple[Body, AbstractElectrodes]:
-    """Body and electrodes of a measurement, or else of its reference. Raises `ValueError` if neither has them."""
+    """Body and electrodes of a measurement, or else of its reference. Raises `ValueError` if neither has them, and if
+    electrode positions are as uncertain as the body is wide."""
     domain = measurement.domain if measurement.domain is not None else reference.domain
     electrodes = measurement.electrodes if measurement.electrodes is not None else reference.electrodes
     if domain is None or electrodes is None:
@@ -386,5 +385,12 @@ def body_of(measurement: Measurement, reference: Measurement) -> tuple[Body, Abs
         raise ValueError(
             f"'{measurement.name}' does not say what it was measured on: give a description with {missing} "
             "(a TOML file beside the data, or description=)."
+        )
+    position = (measurement.uncertainty or reference.uncertainty or Uncertainty()).position
+    x_min, x_max, y_min, y_max = domain.extent
+    if position is not None and position >= (width := max(x_max - x_min, y_max - y_min)):
+        raise ValueError(
+            f"'{measurement.name}': [uncertainty] position is {position:.3g} m, and the body is {width:.3g} m wide; "
+            "give the standard deviation of the electrodes' positions, in metres."
         )
     return domain, electrodes

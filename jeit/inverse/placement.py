@@ -171,9 +171,9 @@ def place_electrodes(
 class _Problem:
     """Voltages and their derivatives by coefficients of unit variance: those of log σ, of the shifts, and of log zσ."""
 
-    def __init__(self, model: ForwardModel, measured: np.ndarray, mask, deviation: float):
+    def __init__(self, model: ForwardModel, measured: np.ndarray, used: np.ndarray, deviation: float):
         self.given, self.mesh, self.protocol = model, on_host(model.mesh), on_host(model.protocol)
-        self.used = np.ones(len(measured), bool) if mask is None else mask
+        self.used = used
         self.measured = measured
         self.independent = len(IndependentChannels.create(self.protocol).index)
         self.noise = np.asarray(relative_noise(as_array(measured), as_array(self.used)))

@@ -73,8 +73,8 @@ def test_displacements_are_bounded():
 def test_gains_that_changed_are_estimated(seed):
     """Errors are as if gains were known, and 95 % ellipses hold the truth."""
     microphone_array, places = array(16, microphones=SIXTEEN, relative=ERROR), inside(60, reach=0.95)
-    heard = touches(microphone_array, places, drawn_gains(seed))
-    found, fixed = locate(heard, known(microphone_array)), localise(microphone_array, heard.power)["position"]
+    frames = touches(microphone_array, places, drawn_gains(seed))
+    found, fixed = locate(frames, known(microphone_array)), localise(microphone_array, frames.power)["position"]
     error, before = (np.linalg.norm(one - places, axis=1) for one in (found.position, fixed))
     assert held(found, places) > 0.92
     assert (found.status == "touch").mean() > 0.97
@@ -95,8 +95,8 @@ def test_gains_that_changed_much():
 def test_gains_that_did_not_change():
     """Nothing is corrected, and places and ellipses are nearly those of exactly known gains."""
     microphone_array, places = array(16, microphones=SIXTEEN, relative=ERROR), inside(60, reach=0.95)
-    heard = touches(microphone_array, places, np.ones(16))
-    found, exact = locate(heard, known(microphone_array)), locate(heard, known(microphone_array), gain_drift=0)
+    frames = touches(microphone_array, places, np.ones(16))
+    found, exact = locate(frames, known(microphone_array)), locate(frames, known(microphone_array), gain_drift=0)
     assert found.notes == ()
     assert np.linalg.norm(found.position - exact.position, axis=1).max() < 5e-4
     ratio = np.linalg.det(found.covariance) / np.linalg.det(exact.covariance)

@@ -1,16 +1,19 @@
 """Electrode positions estimated from a reference frame: against the true ones of a simulated tank, on another mesh."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, ring
 from jeit.data import Measurement
+from jeit.data.imageable import rounding_of_difference
 from jeit.electrodes import FaceDiscs, FacePatches, NodeElectrodes, SheetDiscs
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward.changes import PlacementSensitivity, shifted
 from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import relative_noise
-from jeit.inverse.placement import ModelError, _Problem, place_electrodes
+from jeit.inverse.placement import ModelError, Uncertainty, _Problem, place_electrodes
 from jeit.mesh import cylinder
 
 RADIUS, SIGMA, WIDTH = 0.1, 0.02, 0.02
@@ -74,6 +77,27 @@ def test_places_that_explain_the_reference_are_kept(tank):
     prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
     assert prepared.calibration.shift is None
     np.testing.assert_array_equal(prepared.model.electrodes.position, DESCRIBED.position)
+
+
+def test_errors_of_a_difference_are_those_of_its_uncertainty_and_of_rounding(tank):
+    """The frame's uncertainty counts; voltages have two digits, so that each is off by up to 5 %."""
+    _, voltages = tank
+    known = Uncertainty(position=0.0, drift=0.4, size=0.03, other=0.1)
+    one, base = (np.array([float(f"{each:.1e}") for each in times * voltages]) for times in (1.1, 1.0))
+    frame, reference = replace(measured(one, "frame"), uncertainty=known), measured(base, "reference")
+    prepared = prepare_difference(frame, reference, num_points=1500)
+    accuracy, rounding = prepared.accuracy, rounding_of_difference(frame, reference)
+    assert (accuracy.size, accuracy.model_error.drift) == (known.size, known.drift)
+    assert np.abs(accuracy.model_error.factor[:16]).max() < 1e-12  # positions are exact
+    assert (np.asarray(accuracy.noise) > rounding).all()
+    assert np.sqrt(np.mean(((one - 1.1 * voltages) / rounding) ** 2)) == pytest.approx(np.sqrt(0.5), rel=0.15)
+    difference = np.linalg.norm(one - base)
+    assert prepared.quality.rounding == pytest.approx(np.linalg.norm(rounding) / difference)
+    shape = np.asarray(prepared.relative_noise)
+    rounded = np.sqrt(np.mean((rounding / shape) ** 2))
+    assert prepared.noise == pytest.approx(np.hypot(prepared.quality.trusted_noise, rounded))
+    with pytest.raises(ValueError, match=r"position is 0\.3 m, and the body is 0\.2 m wide"):
+        prepare_difference(replace(frame, uncertainty=Uncertainty(position=0.3)), reference, num_points=1500)
 
 
 def test_what_cannot_be_placed_is_refused(tank):
@@ -159,7 +183,7 @@ def test_the_noise_is_estimated_from_the_residual():
     model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)
     exact = np.asarray(model.voltages(1.0))
     noise = 0.5 * np.asarray(relative_noise(exact)) * np.random.default_rng(0).normal(size=len(exact))
-    problem = _Problem(model, exact + noise, None, 1e-6)
+    problem = _Problem(model, exact + noise, np.ones(len(exact), bool), 1e-6)
     here = problem.at(np.zeros(33))
     assert here is not None
     assert problem.noise_and_covariance(here, 0.5)[0] == pytest.approx(0.5, rel=0.15)

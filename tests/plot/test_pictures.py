@@ -18,11 +18,12 @@ from jeit.electrodes import (
 )
 from jeit.forward import ForwardModel
 from jeit.image import ImageSeries, Inclusion
+from jeit.inverse.shapes import Quantities, Star
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
 from jeit.plot.axes import bare, extent_of
-from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions
+from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions, draw_outlines
 from jeit.plot.imaging.image import plot_raster, plot_sensitivity
 from jeit.plot.imaging.series import plot_series
 from jeit.plot.imaging.voltages import plot_voltages
@@ -124,6 +125,21 @@ def test_circles_of_inclusions_are_of_their_area_or_volume(ax):
     flat, round_ = Inclusion(1, (0.0, 0.0), np.pi * 0.02**2, 1.0), Inclusion(-1, (0.0, 0.0, 0.1), 4e-6 * np.pi / 3, 1.0)
     draw_inclusions([flat, round_], ax=ax)
     assert [patch.radius for patch in ax.patches] == pytest.approx([0.02, 0.01])
+
+
+def test_intervals_face_the_middle_and_do_not_cover_each_other(ax):
+    """Below a body in the upper half, above one in the lower half; on the other side where a label is already."""
+    known = Quantities(2.0, (1.5, 2.5), 1e-4, (0.5e-4, 2e-4), 0.5e-4, (0.4e-4, 0.6e-4))
+    angle = 2 * np.pi * np.arange(32) / 32
+    round_body = 0.01 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    places = np.array([[0.0, 0.06], [0.0, -0.06], [0.02, -0.06]])
+    ax.set_aspect("equal")
+    ax.plot([-0.1, 0.1], [-0.1, 0.1])
+    draw_outlines([Star(1, place, place + round_body, 1.1, True, 2.0, known) for place in places], ax=ax)
+    (upper, lower, beside) = ax.texts
+    assert [one.get_text() for one in ax.texts] == ["+150 % to +250 %"] * 3
+    np.testing.assert_allclose([one.xy[1] for one in ax.texts], [0.05, -0.05, -0.07])
+    assert [one.get_va() for one in (upper, lower, beside)] == ["top", "bottom", "top"]
 
 
 def test_an_electrode_over_the_start_of_the_outline_is_one_piece(mesh, ax):

@@ -86,10 +86,10 @@ def estimate_gain_changes(
     Returns the estimate. If one source explains too few frames for an estimate, it returns two possibilities, the
     second of which is the last resort: no changes, and unknown changes with the given standard deviation.
     """
-    heard = use.any(axis=0).astype(float)
+    used = use.any(axis=0).astype(float)
     # A factor common to all gains cannot be distinguished from the strengths of the touches.
-    centred = np.diag(heard) - np.outer(heard, heard) / max(heard.sum(), 1.0)
-    none = GainChanges(np.zeros(len(heard)), np.zeros_like(centred))
+    centred = np.diag(used) - np.outer(used, used) / max(used.sum(), 1.0)
+    none = GainChanges(np.zeros(len(used)), np.zeros_like(centred))
     if deviation == 0:
         return (none,)
     for factor in _FACTORS:

@@ -79,19 +79,21 @@ class ContactImpedance(AbstractUnknown):
 class ElectrodePosition(AbstractUnknown):
     """Displacement of electrodes from their positions in the model, in metres.
 
-    Electrodes on the boundary have one value each, along the boundary and positive counter-clockwise; discs in a sheet
-    have two, first x of all discs and then y.
+    Electrodes on the boundary have one value each, along the boundary and positive counter-clockwise; others have two:
+    discs in a sheet x and y, discs and patches on a solid horizontal and upward. The first of all electrodes come
+    before the second.
     """
 
     deviation: Float[Array, " k"]
-    direction: Float[Array, "L a 2"]
+    direction: Float[Array, "L a d"]
 
     def __init__(self, model: ForwardModel, deviation: float):
         """`deviation`: standard deviation in metres. Raises `ValueError` for electrodes that cannot be moved."""
         electrodes = model.electrodes
         if not isinstance(electrodes, AbstractMovableElectrodes):
             raise ValueError(
-                f"ElectrodePosition is for BoundaryElectrodes and SheetDiscs; these are {type(electrodes).__name__}."
+                "ElectrodePosition is for electrodes that can move: BoundaryElectrodes, SheetDiscs, FaceDiscs and "
+                f"FacePatches; these are {type(electrodes).__name__}."
             )
         direction = electrodes.directions(model.mesh)
         self.direction = jnp.asarray(direction)

@@ -102,6 +102,10 @@ class Quantities:
     strength_interval: Interval
 
 
+TINY = 1e-30
+"""Least measure, m² or m³, of a body that has left the domain."""
+
+
 def polarisation(contrast, axes: int):
     """(ρ - 1) / (ρ + n - 1) for ρ = e^`contrast` and n bounded `axes`: the strength of a round body per area or volume.
     Ammari and Kang, Polarization and Moment Tensors (2007), chapter 4."""

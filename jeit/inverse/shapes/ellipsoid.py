@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.arguments import check_name
-from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered, Quantities, polarisation
+from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantities, polarisation
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh, measures
 
@@ -31,11 +31,11 @@ _BY_THE_MESH = {2: 0.03, 3: 0.1}
 
 
 def contrast_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> list[float]:
-    """Standard deviations of the contrasts of bodies, in log σ: those that the problem explains, and `besides`."""
-    return np.hypot(_contrasts(problem, fitted)[1], besides(problem, fitted, each)).tolist()
+    """Standard deviations of the contrasts of bodies, in log σ: those that the problem explains, and `unmodelled`."""
+    return np.hypot(_contrasts(problem, fitted)[1], unmodelled_deviations(problem, fitted, each)).tolist()
 
 
-def besides(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> Float[np.ndarray, " k"]:
+def unmodelled_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None = None) -> Float[np.ndarray, " k"]:
     """Standard deviations of the contrasts of bodies, in log σ, that Laplace's approximation of the problem lacks: that
     of the mesh, and that of the materials.
 
@@ -101,8 +101,6 @@ _STRETCHES = np.array(
         np.array([[0, 0, 0], [0, 0, 1], [0, 1, 0]]) / np.sqrt(2),
     ]
 )
-# Volume, m³, below which a body counts as being of this volume.
-_TINY = 1e-30
 # 1 for the elements of that basis that stretch a column: those within the x-y plane and without trace there.
 _LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 
@@ -190,14 +188,18 @@ class Ellipsoid(eqx.Module):
         return self.volume
 
     @property
+    def bounded_axes(self) -> int:
+        """Number of axes along which the body is bounded: 2 for a column, else 3."""
+        return 2 if self.column else 3
+
+    @property
     def contrast_is_determined(self) -> bool:
         """Whether the data determine the contrast: no end of its interval is open."""
         return self.quantities is None or None not in self.quantities.change_interval
 
     def with_quantities(self, known: Quantities) -> Ellipsoid:
         """The body with its quantities; its volume and contrast become the medians."""
-        bounded = 2 if self.column else 3
-        scale = (known.measure / max(self.volume, _TINY)) ** (1 / bounded)
+        scale = (known.measure / max(self.volume, TINY)) ** (1 / self.bounded_axes)
         upright = self.column & (np.abs(self.axes[:, 2]) > 0.5 * np.linalg.norm(self.axes, axis=1))
         return replace(
             self,

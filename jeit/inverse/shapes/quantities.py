@@ -22,7 +22,7 @@ from scipy.special import ndtri
 
 from jeit.arguments.checks import Interval
 from jeit.inverse.placement import ModelError, Uncertainty
-from jeit.inverse.shapes.bodies import Bodies, Quantities, polarisation
+from jeit.inverse.shapes.bodies import TINY, Bodies, Quantities, polarisation
 from jeit.inverse.shapes.ellipsoid import Ellipsoid
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 
@@ -34,8 +34,6 @@ _STEPS, _STEP, _LONGER = 8, (0.02, 0.35), 1.6
 # In sheets and in solids, where each step takes a second: steps of each fit and its tolerance; and the drop of the log
 # posterior at which the exploration ends.
 _EFFORT, _ENOUGH = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
-# Measure, m² or m³, of a body that has left the domain.
-_TINY = 1e-30
 # Rise of the -log likelihood at an end of the grid below which the data leave that end open.
 _OPEN = 1.0
 # Probabilities of the ends of an interval, and numbers of contrasts and measures of the posterior's sample.
@@ -52,9 +50,9 @@ class Accuracy(NamedTuple):
     size: float = Uncertainty().size
 
 
-def quantified(problem: ShapeProblem, fit: Fit, accuracy: Accuracy, besides: Any, order: Any) -> list[Quantities]:
-    """The quantities of bodies `order` of a `fit`; `besides`: for each body of the fit, the standard deviation of its
-    contrast due to errors that the problem does not contain.
+def quantified(problem: ShapeProblem, fit: Fit, accuracy: Accuracy, unmodelled: Any, order: Any) -> list[Quantities]:
+    """The quantities of bodies `order` of a `fit`; `unmodelled` (k,): standard deviations of the contrasts of all its
+    bodies due to errors that the problem does not contain.
 
     `problem` has the noise of `accuracy` alone; its model error is that at the conductivity of the fit.
     """
@@ -63,7 +61,7 @@ def quantified(problem: ShapeProblem, fit: Fit, accuracy: Accuracy, besides: Any
         rows = accuracy.model_error.voltages(problem.model, conductivity, problem.background)
         problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
     fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
-    return [quantify(problem, fit, int(k), float(besides[k]), accuracy.size) for k in order]
+    return [quantify(problem, fit, int(k), float(unmodelled[k]), accuracy.size) for k in order]
 
 
 def including(known: Quantities, other: Ellipsoid | None, deviation: float) -> Quantities:
@@ -72,7 +70,7 @@ def including(known: Quantities, other: Ellipsoid | None, deviation: float) -> Q
     if other is None:
         return known
     changes = np.expm1(other.sign * (other.contrast + deviation * np.array([-1, 1]))).tolist()
-    strength = float(other.volume * polarisation(other.sign * other.contrast, 2 if other.column else 3))
+    strength = float(other.volume * polarisation(other.sign * other.contrast, other.bounded_axes))
     return replace(
         known,
         change_interval=_hull(known.change_interval, changes),
@@ -96,17 +94,17 @@ class _Held(NamedTuple):
     deviation: float
 
 
-def quantify(problem: ShapeProblem, fit: Fit, k: int, besides: float, size: float) -> Quantities:
+def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, size: float) -> Quantities:
     """Explore the contrast of body k of a `fit` in both directions, until it is improbable or at a bound.
 
-    `besides`: standard deviation of the contrast due to errors that the problem does not contain; the likelihood is
+    `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain; the likelihood is
     flattened by the share of the whole variance that the problem explains. `size` as in `Accuracy`.
     """
     bodies = fit.bodies
     contrast, slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
     first = float(np.clip(np.log(contrast), *_BOUNDS))
     deviation = problem.deviations(fit)[_place(bodies, k)[1]] * abs(slope) / contrast
-    whole = float(np.hypot(deviation, besides / contrast))
+    whole = float(np.hypot(deviation, unmodelled / contrast))
     flattened = (deviation / whole) ** 2
     middle, start = _held_at(problem, bodies, fit.coefficients, k, np.log(contrast), first, size)
     known, enough = [middle._replace(unlikely=flattened * middle.unlikely)], _ENOUGH[bodies.dimension]
@@ -142,7 +140,7 @@ def _held_at(problem: ShapeProblem, bodies: Bodies, coefficients, k: int, before
     deviation = bodies.prior.radius_spread * float(problem.deviations(found)[_place(bodies, k)[0]])
     deviation = bodies.bounded_axes(k) * float(np.hypot(deviation, size))
     measure = found.bodies.body(k, found.coefficients).measure
-    return _Held(at, problem.surprise(found), float(np.log(max(measure, _TINY))), deviation), found.coefficients
+    return _Held(at, problem.surprise(found), float(np.log(max(measure, TINY))), deviation), found.coefficients
 
 
 def _surprise(one: _Held) -> float:

@@ -22,8 +22,8 @@ from jeit.inverse.shapes.ellipsoid import (
     EllipsoidPrior,
     Ellipsoids,
     alternatives,
-    besides,
     contrast_deviations,
+    unmodelled_deviations,
 )
 from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import Accuracy, including, quantified
@@ -205,7 +205,11 @@ def reconstruct_shapes(
         moved = setting.alone.data.voltages - data.voltages  # by the finer mesh
         exact = eqx.tree_at(lambda one: one.voltages, exact, exact.voltages + moved)
         known = quantified(
-            setting.weighted(exact).problem(level), fitted, accuracy, besides(problem, fitted, each), order
+            setting.weighted(exact).problem(level),
+            fitted,
+            accuracy,
+            unmodelled_deviations(problem, fitted, each),
+            order,
         )
         known = [including(one, others[k][0], others[k][1]) for one, k in zip(known, order, strict=True)]
         found_bodies = [body.with_quantities(one) for body, one in zip(found_bodies, known, strict=True)]

@@ -14,7 +14,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
-from jeit.inverse.shapes.bodies import Bodies, BodyPrior, Covered, Quantities
+from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantities
 from jeit.mesh import Mesh, measures
 
 # Barycentric weights of the six points at which a cell is sampled.
@@ -24,8 +24,6 @@ _BLUR = 0.2
 # Distance from an outline, in widths of the blur, beyond which the covered share of a cell is less than 1e-12.
 _REACH = 30
 _OUTLINE = 128
-# Area, m², below which a body counts as being of this area.
-_TINY = 1e-30
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ class Star(eqx.Module):
 
     def with_quantities(self, known: Quantities) -> Star:
         """The body with its quantities; its area and contrast become the medians."""
-        outline = self.centroid + (self.outline - self.centroid) * np.sqrt(known.measure / max(self.area, _TINY))
+        outline = self.centroid + (self.outline - self.centroid) * np.sqrt(known.measure / max(self.area, TINY))
         return replace(self, outline=outline, contrast=float(np.abs(np.log1p(known.change))), quantities=known)
 
     @property

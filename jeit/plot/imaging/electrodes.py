@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
-from jeit.arguments.checks import Interval
+from jeit.arguments import interval_text
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes
 from jeit.image import Inclusion
@@ -71,7 +71,7 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
         taken.append(places[which])
         assert one.quantities is not None
         ax.annotate(
-            _interval_label(one.quantities.change_interval),
+            interval_text(one.quantities.change_interval, _per_cent),
             places[which],
             xytext=(0, 3 * sides[which]),
             textcoords="offset points",
@@ -82,6 +82,11 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
             zorder=4,
             path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
+
+
+def _per_cent(change: float) -> str:
+    """A relative change in per cent, with a sign and two significant digits."""
+    return f"{float(f'{100 * change:.2g}'):+g} %"
 
 
 def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) -> Axes:
@@ -97,14 +102,6 @@ def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) 
         marker = "+" if inclusion.sign > 0 else "_"
         ax.plot(x, y, marker=marker, color=INK, markersize=9, markeredgewidth=1.4, zorder=4, path_effects=halo)
     return ax
-
-
-def _interval_label(interval: Interval) -> str:
-    """An interval of a relative change, in per cent: "+180 to +220 %"."""
-    low, high = (None if end is None else f"{float(f'{100 * end:.2g}'):+g}" for end in interval)
-    if low is None or high is None:
-        return "change not determined" if low is high else f"at least {low} %" if low else f"at most {high} %"
-    return f"{low} to {high} %"
 
 
 METAL = "#b8860b"

@@ -196,7 +196,7 @@ def test_repair_is_told_and_the_reference_is_new(health):
 
 
 def test_a_fresh_reference_before_the_first_frame_is_what_frames_are_compared_with(health):
-    """A day later gains differ, and the skin is whole; damage after that is told."""
+    """A day later gains differ, and the skin is whole; damage after that is reported."""
     gains = 1 + 0.05 * np.random.default_rng(2).normal(size=NUMBER)
     later = recording(57) * gains
     (event,) = watch(health, later).events
