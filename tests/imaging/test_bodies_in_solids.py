@@ -243,6 +243,16 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
     assert told[1]["conductivity_is"] == "estimated from the data"
 
 
+def test_a_column_of_another_volume_keeps_its_height_and_a_ball_grows_all_round():
+    known = Quantities(2.0, (1.5, 2.5), 8e-5, (7e-5, 9e-5), 4e-5, (3e-5, 5e-5))
+    axes = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.0], [0.0, 0.01, 0.0]])
+    for column, scale in ((True, [1.0, 2.0, 2.0]), (False, [4 ** (1 / 3)] * 3)):
+        found = Ellipsoid(1, BALL, axes, 2e-5, BALL, 1.0, column, False, 2.0).with_quantities(known)
+        np.testing.assert_allclose(found.axes, axes * np.array(scale)[:, None])
+        assert (found.volume, found.contrast) == (8e-5, pytest.approx(np.log(3)))
+        assert found.bounded_axes == 3 - column
+
+
 def test_the_last_axis_of_a_column_that_is_drawn_stands():
     axes = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.0], [0.0, 0.01, 0.0]])
     form = difference._form(Ellipsoid(1, BALL, axes, 3e-5, BALL, 1.0, True, False, 2.0))  # pyright: ignore

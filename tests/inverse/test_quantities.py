@@ -8,9 +8,12 @@ from jeit.cli.console import with_interval
 from jeit.data import Measurement
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.image import Inclusion
+from jeit.inverse.channels import Data
 from jeit.inverse.placement import ModelError
 from jeit.inverse.shapes import Accuracy, StarPrior, ellipsoid, reconstruct_shapes
+from jeit.inverse.shapes.problem import ShapeProblem, SmoothField
 from jeit.inverse.shapes.quantities import _Held, _summary
+from jeit.inverse.shapes.search import _Setting
 from jeit.mesh import centroids, measures
 
 RADIUS, SIGMA = 0.1, 0.02
@@ -64,6 +67,37 @@ def test_a_fitted_body_has_its_quantities_and_wider_ones_where_the_model_is_in_d
     assert widths[1] > 1.2 * widths[0]
 
 
+def test_errors_of_the_mesh_and_of_the_size_widen_intervals(monkeypatch):
+    """By 0.3 of log σ, where the data leave far less, and by 5 % of each length."""
+    model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)
+    inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.02, 0.035], axis=1) < 0.025
+    voltages = np.asarray(model.voltages(SIGMA * np.where(inside, 3.0, 1.0)))
+    noise = 3e-3 * np.abs(voltages)
+    options = {"start": [(1, (0.02, 0.03), 0.02)], "noise": noise, "prior": StarPrior(modes=1)}
+    found = {}
+    for mesh, size in ((1e-9, 1e-9), (0.3, 1e-9), (1e-9, 0.05)):
+        monkeypatch.setitem(ellipsoid._BY_THE_MESH, 2, mesh)
+        (one,) = reconstruct_shapes(model, voltages, SIGMA, accuracy=Accuracy(noise, None, size), **options).bodies
+        low, high = one.quantities.change_interval
+        found[mesh, size] = np.log((1 + high) / (1 + low)) / 2, np.ptp(np.log(one.quantities.measure_interval)) / 2
+    assert max(found[1e-9, 1e-9]) < 0.05
+    assert 0.2 < found[0.3, 1e-9][0] < 0.35
+    assert found[1e-9, 0.05][1] == pytest.approx(0.1, rel=0.1)  # of an area, twice that of a length
+    assert found[1e-9, 0.05][0] == pytest.approx(found[1e-9, 1e-9][0], rel=1e-6)
+
+
+def test_other_weights_of_the_data_leave_the_smooth_field_as_it_is():
+    """Its errors in volts; the data have errors of their own besides."""
+    random = np.random.default_rng(0)
+    jacobian, weights = random.normal(size=(4, 3)), (np.ones(4), random.uniform(1, 3, 4))
+    data = [Data(np.zeros(4), one, np.eye(4), np.eye(4), 0.0) for one in weights]  # pyright: ignore
+    alone = ShapeProblem(None, data[0], np.ones(2))  # pyright: ignore
+    setting = _Setting(alone, SmoothField(None, jacobian, np.ones(2), alone))  # pyright: ignore
+    found = setting.weighted(data[1]).problem(0.5).data
+    volts = np.asarray(found.covariance) / np.outer(weights[1], weights[1])
+    np.testing.assert_allclose(volts, np.diag(1 / weights[1] ** 2) + 0.25 * jacobian @ jacobian.T, rtol=1e-12)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("change", "radius"), [(0.5, 0.027), (2.0, 0.025), (-0.5, 0.02), (9.0, 0.012)])
 def test_numbers_are_right_in_a_tank_that_is_not_as_described(change, radius):
@@ -91,7 +125,7 @@ def held(contrast, unlikely, area=1e-3):
 def test_what_the_likelihood_says_is_summed_up():
     """A parabola about a contrast of one, of deviation 0.1: half of its mass lies below, the prior aside."""
     places = np.exp(np.linspace(-0.5, 0.5, 21))
-    found = _summary(1, 2, [held(one, 0.5 * (np.log(one) / 0.1) ** 2) for one in places])
+    found = _summary(1, 2, 0.0, [held(one, 0.5 * (np.log(one) / 0.1) ** 2) for one in places])
     assert found.change == pytest.approx(np.expm1(1.0), rel=0.02)
     low, high = found.change_interval
     assert low == pytest.approx(np.expm1(np.exp(-0.1)), rel=0.03)
@@ -103,12 +137,12 @@ def test_what_the_likelihood_says_is_summed_up():
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_ends_that_the_data_leave_open_are_none(sign):
-    strong = _summary(sign, 2, [held(one, 40 / one if one < 3 else 0.2) for one in (0.5, 1.0, 2.0, 3.0, 4.5)])
+    strong = _summary(sign, 2, 0.0, [held(one, 40 / one if one < 3 else 0.2) for one in (0.5, 1.0, 2.0, 3.0, 4.5)])
     assert strong.change_interval[sign > 0] is None
     assert strong.change_interval[sign < 0] is not None
     assert strong.measure_interval[0] is None
     assert None not in strong.strength_interval
-    weak = _summary(sign, 2, [held(one, 40 * one**2) for one in (0.03, 0.05, 0.1, 0.3, 0.5)])
+    weak = _summary(sign, 2, 0.0, [held(one, 40 * one**2) for one in (0.03, 0.05, 0.1, 0.3, 0.5)])
     assert weak.change_interval[sign < 0] is None
     assert weak.measure_interval[1] is None
 

@@ -36,8 +36,8 @@ _STEPS, _STEP, _LONGER = 8, (0.02, 0.35), 1.6
 _EFFORT, _ENOUGH = {2: (8, 1e-2), 3: (2, 5e-2)}, {2: 5.0, 3: 3.0}
 # Rise of the -log likelihood at an end of the grid below which the data leave that end open.
 _OPEN = 1.0
-# Probabilities of the ends of an interval, and numbers of contrasts and measures of the posterior's sample.
-_ENDS, _CONTRASTS, _MEASURES = (0.16, 0.84), 240, 31
+# Probabilities of the ends of an interval, and numbers of contrasts and of normal deviates of the posterior's sample.
+_ENDS, _CONTRASTS, _NORMAL = (0.16, 0.84), 240, 31
 
 
 class Accuracy(NamedTuple):
@@ -97,27 +97,25 @@ class _Held(NamedTuple):
 def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, size: float) -> Quantities:
     """Explore the contrast of body k of a `fit` in both directions, until it is improbable or at a bound.
 
-    `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain; the likelihood is
-    flattened by the share of the whole variance that the problem explains. `size` as in `Accuracy`.
+    `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain, which leave the
+    strength as it is. `size` as in `Accuracy`.
     """
     bodies = fit.bodies
     contrast, slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
     first = float(np.clip(np.log(contrast), *_BOUNDS))
     deviation = problem.deviations(fit)[_place(bodies, k)[1]] * abs(slope) / contrast
-    whole = float(np.hypot(deviation, unmodelled / contrast))
-    flattened = (deviation / whole) ** 2
     middle, start = _held_at(problem, bodies, fit.coefficients, k, np.log(contrast), first, size)
-    known, enough = [middle._replace(unlikely=flattened * middle.unlikely)], _ENOUGH[bodies.dimension]
+    known, enough = [middle], _ENOUGH[bodies.dimension]
     for way in (-1, 1):
-        at, coefficients, step = first, start, float(np.clip(whole, *_STEP))
+        at, coefficients, step = first, start, float(np.clip(deviation, *_STEP))
         while known[-1 if way > 0 else 0].unlikely + _prior(at) < min(map(_surprise, known)) + enough:
             before, at = at, float(np.clip(at + way * step, *_BOUNDS))
             if at == before:
                 break
             one, coefficients = _held_at(problem, bodies, coefficients, k, before, at, size)
-            known.insert(len(known) if way > 0 else 0, one._replace(unlikely=flattened * one.unlikely))
+            known.insert(len(known) if way > 0 else 0, one)
             step *= _LONGER
-    return _summary(int(bodies.sign[k]), bodies.bounded_axes(k), known)
+    return _summary(int(bodies.sign[k]), bodies.bounded_axes(k), unmodelled, known)
 
 
 def _place(bodies: Bodies, k: int) -> tuple[int, int]:
@@ -153,27 +151,28 @@ def _prior(log_contrast):
     return 0.5 * ((log_contrast - np.log(_MEDIAN)) / _SPREAD) ** 2
 
 
-def _summary(sign: int, axes: int, known: Sequence[_Held]) -> Quantities:
-    """Medians and intervals of the posterior, interpolated between the contrasts that were held; `axes`: number of axes
-    along which the body is bounded."""
+def _summary(sign: int, axes: int, unmodelled: float, known: Sequence[_Held]) -> Quantities:
+    """Medians and intervals of the posterior, interpolated between the contrasts that were held and convolved with a
+    normal distribution of the deviation `unmodelled`; `axes`: number of axes along which the body is bounded."""
     place, unlikely, log_measure, spread = np.array(known).T
     dense = np.linspace(place[0], place[-1], _CONTRASTS)
     likely, measure, deviation = (PchipInterpolator(place, one)(dense) for one in (unlikely, log_measure, spread))
     surprise = likely + _prior(dense)
     weight = np.exp(surprise.min() - surprise)
-    normal = ndtri((np.arange(_MEASURES) + 0.5) / _MEASURES)
-    measures = np.exp(measure[:, None] + deviation[:, None] * normal)
-    strength = polarisation(sign * np.exp(dense), axes)[:, None] * measures
-    weights = np.repeat(weight, _MEASURES)
+    normal = ndtri((np.arange(_NORMAL) + 0.5) / _NORMAL)
+    strength = polarisation(sign * np.exp(dense), axes)[:, None] * np.exp(
+        measure[:, None] + deviation[:, None] * normal
+    )
+    contrast = np.clip(np.exp(dense)[:, None] + unmodelled * normal, *np.exp(_BOUNDS))
+    measures = strength[:, None] / polarisation(sign * contrast, axes)[..., None]
     least = unlikely.min()
     strong = place[-1] == _BOUNDS[1] and unlikely[-1] < least + _OPEN
     weak = place[0] == _BOUNDS[0] and unlikely[0] < least + _OPEN
     # The contrast decides which end of the measure is open: the stronger, the smaller.
-    low, middle, high = _quantiles(np.exp(dense), weight)
-    changes = [float(np.expm1(sign * one)) for one in (low, middle, high)]
+    changes = [float(np.expm1(sign * one)) for one in _quantiles(contrast, weight)]
     ends: list[float | None] = [None if weak else changes[0], None if strong else changes[2]]
-    least_measure, middle_measure, most_measure = _quantiles(measures.ravel(), weights)
-    weakest, middle_strength, strongest = _quantiles(strength.ravel(), weights)
+    least_measure, middle_measure, most_measure = _quantiles(measures, weight)
+    weakest, middle_strength, strongest = _quantiles(strength, weight)
     return Quantities(
         changes[1],
         (ends[0], ends[1]) if sign > 0 else (ends[1], ends[0]),
@@ -184,9 +183,11 @@ def _summary(sign: int, axes: int, known: Sequence[_Held]) -> Quantities:
     )
 
 
-def _quantiles(values: Float[np.ndarray, " s"], weight: Float[np.ndarray, " s"]) -> tuple[float, float, float]:
-    """Quantiles at the ends of an interval and the median, in ascending order: low, median, high."""
-    order = np.argsort(values)
+def _quantiles(values: Float[np.ndarray, "g *s"], weight: Float[np.ndarray, " g"]) -> tuple[float, float, float]:
+    """Quantiles at the ends of an interval and the median, in ascending order: low, median, high. All values along the
+    first axis have its `weight`."""
+    weight = np.repeat(weight, values[0].size)
+    values, order = values.ravel(), np.argsort(values, axis=None)
     share = np.cumsum(weight[order])
     share = (share - weight[order] / 2) / share[-1]
     low, middle, high = np.interp([_ENDS[0], 0.5, _ENDS[1]], share, values[order])

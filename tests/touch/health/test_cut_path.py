@@ -10,7 +10,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids, measures
 from jeit.protocol import adjacent
-from jeit.touch.health.cut_path import LossFit
+from jeit.touch.health.cut_path import LossFit, _FittedUnknowns
 from jeit.touch.health.local_change import LocalChange, finer_mesh, finer_model
 from jeit.touch.simulate.damage import Cut
 
@@ -48,6 +48,15 @@ def test_a_skin_whose_electrodes_are_of_its_mesh_keeps_it(model):
     assert finer is plates
     assert len(parent) == model.mesh.num_cells
     assert 0.004 < edge < 0.012
+
+
+def test_each_end_of_a_path_is_uncertain_by_half_an_edge():
+    """Where the fit is exact, the mesh's edge is all that is left."""
+    fit = object.__new__(LossFit)
+    fit.energy, fit.edge, fit.change = 1.0, 1e-3, np.ones(50)
+    fit._misfit = lambda unknowns: 1e6 * float(np.sum((unknowns - path) ** 2))  # pyright: ignore
+    path = np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])
+    assert fit._deviation(_FittedUnknowns(path, 0.0)) == pytest.approx(np.sqrt(2) * 0.5e-3, rel=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["complete", "point"])
