@@ -18,7 +18,7 @@ from jeit.electrodes import FacePatches
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.forward.changes import solved_fields
-from jeit.mesh import Disk, Rectangle, Solid, bisect, centroids, cut
+from jeit.mesh import Disk, Mesh, Rectangle, Solid, bisect, centroids, cut
 from jeit.protocol import Protocol, adjacent, from_matrices, haar, opposite, skip, trigonometric
 from jeit_solvers.engines import on_host
 
@@ -69,24 +69,16 @@ def draw(seed: int, *, columns: bool = False) -> SolidTank:
     """A tank, the same for the same seed; with `columns` in place of balls a cylinder with strips."""
     rng = np.random.default_rng(seed)
     kind = "strips" if columns else KINDS[int(rng.integers(len(KINDS)))]
-    domain, electrodes, protocol = _tank(rng, kind)
+    domain, electrodes, protocol = empty_tank(rng, kind)
     conductivity = np.exp(rng.uniform(np.log(0.01), np.log(1.0)))
     size = float(domain.outline.area) ** 0.5
     impedance = np.exp(rng.uniform(np.log(1e-3), np.log(0.03))) * size / conductivity
     electrodes = electrodes.with_contact_impedance(impedance * np.exp(rng.normal(0, 0.2, electrodes.num_electrodes)))
-    balls = _balls(rng, domain, middle=kind == "strips")
+    balls = balls_in(rng, domain, middle=kind == "strips")
     if columns:
         balls = tuple(ball._replace(height=domain.thickness) for ball in balls)
-    mesh = body_mesh(domain, electrodes, _NODES)
-    for ball in balls:
-        mesh = bisect(mesh, ball.edge)
-    for ball in balls:
-        mesh = cut(mesh, ball.level)
+    mesh, factors_of_cells = mesh_along(domain, electrodes, balls)
     model = on_host(ForwardModel(mesh, electrodes, protocol, solver="cholesky"))
-    centres = np.asarray(centroids(mesh))
-    factors = np.ones(len(centres))
-    for ball in balls:
-        factors[ball.level(centres) < 0] = ball.factor
 
     def measured(factors, name):
         voltages = solved_fields(model, conductivity * factors).voltages
@@ -96,11 +88,26 @@ def draw(seed: int, *, columns: bool = False) -> SolidTank:
         unknown = electrodes.with_contact_impedance(np.full(electrodes.num_electrodes, impedance))
         return Measurement(voltages, mask, protocol, electrodes=unknown, domain=domain, name=name)
 
-    frame, reference = measured(factors, f"tank {seed}"), measured(np.ones(len(centres)), "empty")
-    return SolidTank(frame, reference, balls, kind)
+    frame = measured(factors_of_cells, f"tank {seed}")
+    return SolidTank(frame, measured(np.ones(mesh.num_cells), "empty"), balls, kind)
 
 
-def _tank(rng, kind: str) -> tuple[Solid, FacePatches, Protocol]:
+def mesh_along(domain: Solid, electrodes: FacePatches, balls: Sequence[Ball]) -> tuple[Mesh, np.ndarray]:
+    """A mesh with faces on the surfaces of the balls, and the conductivity of each cell over the bath's."""
+    mesh = body_mesh(domain, electrodes, _NODES)
+    for ball in balls:
+        mesh = bisect(mesh, ball.edge)
+    for ball in balls:
+        mesh = cut(mesh, ball.level)
+    centres = np.asarray(centroids(mesh))
+    factors = np.ones(len(centres))
+    for ball in balls:
+        factors[ball.level(centres) < 0] = ball.factor
+    return mesh, factors
+
+
+def empty_tank(rng, kind: str) -> tuple[Solid, FacePatches, Protocol]:
+    """A tank of a `kind` (see `KINDS`), its electrodes with contact impedances of 1, and what is driven and read."""
     current = np.exp(rng.uniform(np.log(1e-4), np.log(1e-2)))
     scale = np.exp(rng.uniform(np.log(0.3), np.log(2.0)))
     if kind == "plates":
@@ -145,7 +152,7 @@ def _pairs(rng, current: float) -> Protocol:
     return from_matrices(current * drive, measurement)
 
 
-def _balls(rng, domain: Solid, *, middle: bool) -> tuple[Ball, ...]:
+def balls_in(rng, domain: Solid, *, middle: bool) -> tuple[Ball, ...]:
     """Anywhere, or at half the height: one ring of strips does not tell above from below."""
     number, balls = int(rng.integers(1, 3)), []
     height = domain.thickness

@@ -15,44 +15,46 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks.problems.solid_tanks import Ball, mesh_along
 from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes, FacePatches
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
+from jeit.forward.changes import solved_fields
 from jeit.image import Inclusion
 from jeit.mesh import Disk, Domain, Polygon, Rectangle, Solid, centroids, measures
 from jeit.protocol import adjacent, skip
-from jeit_solvers.engines import as_array
+from jeit_solvers.engines import as_array, on_host
 
 SET_ON = ("exact description", "electrodes", "contacts", "electrodes and contacts")
 KEPT_BACK = ("drifting contacts", "size", "gains", "few digits", "in space")
-SIZE = 0.1
-"""Half of a body's width, metres."""
+_SIZE = 0.1
 REACH = 0.3
-"""Distance, in units of `SIZE`, within which an inclusion may be a body's."""
-_NODES, _NODES_IN_SPACE = 7000, 14_000
+"""Distance, in units of half the width of a tank, within which an inclusion may be a body's."""
+_NODES = 7000
 # Least distance of the two ends of a strip, in units of its width.
 _STRAIGHT = 0.98
 
 
 class Body(NamedTuple):
-    """**Fields**: `centre` (2,) and `radius`, metres; `change` of conductivity relative to the background; `area` of
-    the cells that are the body, m²."""
+    """**Fields**: `centre` (d,) and `radius`, metres; `change` of conductivity relative to the background; `measure`:
+    area of the cells that are the body, m², or volume, m³; `axes`: along how many axes it ends."""
 
     centre: np.ndarray
     radius: float
     change: float
-    area: float = np.nan
+    measure: float = np.nan
+    axes: int = 2
 
     @property
     def strength(self) -> float:
-        """Area times (σ/σ₀ - 1) / (σ/σ₀ + 1), m²."""
-        return self.area * self.change / (2 + self.change)
+        """Area or volume times (σ/σ₀ - 1) / (σ/σ₀ + axes - 1), m² or m³."""
+        return self.measure * self.change / (self.axes + self.change)
 
 
 class Tank(NamedTuple):
     """**Fields**: `frame`: the tank with its `bodies`; `reference`: without them; `kind` of its errors; `outline`;
-    `noise`: of each voltage, relative."""
+    `noise`: of each voltage, relative; `size`: half of the width, metres."""
 
     frame: Measurement
     reference: Measurement
@@ -60,6 +62,7 @@ class Tank(NamedTuple):
     kind: str
     outline: str
     noise: float
+    size: float = _SIZE
 
 
 def draw(seed: int) -> Tank:
@@ -82,7 +85,7 @@ def _draw(rng, kind: str, outline: str) -> Tank:
     perimeter = float(lengths.sum())
     conductivity = np.exp(rng.uniform(np.log(1e-4), np.log(1e-1)))
     width = rng.uniform(0.25, 0.5) * perimeter / count
-    impedance = np.exp(rng.uniform(np.log(1e-3), np.log(2e-2))) * SIZE / conductivity
+    impedance = np.exp(rng.uniform(np.log(1e-3), np.log(2e-2))) * _SIZE / conductivity
     middle = perimeter * (np.arange(count) + 0.5) / count
     described = BoundaryElectrodes(_along(edge, lengths, middle), width, impedance)
     off, spread = kind not in ("exact description", "contacts"), kind not in ("exact description", "electrodes")
@@ -92,14 +95,15 @@ def _draw(rng, kind: str, outline: str) -> Tank:
     scale = 1 + (kind == "size") * rng.uniform(-0.03, 0.03)
     noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.08))))
     place = _along(edge, lengths, middle + shift)
-    height, covered = (rng.uniform(0.3, 1.5) * SIZE, rng.uniform(0.3, 0.99)) if kind == "in space" else (None, 1.0)
+    height, covered = (rng.uniform(0.3, 1.5) * _SIZE, rng.uniform(0.3, 0.99)) if kind == "in space" else (None, 1.0)
     ends = [_along(edge, lengths, middle + shift + side * width / 2) for side in (-1, 1)]
     if height is not None and (np.linalg.norm(ends[1] - ends[0], axis=1) < _STRAIGHT * width).any():
         raise ValueError("a strip bends round a corner.")
     truth = _electrodes(place, width, contact, height, covered)
-    body, nodes = (domain, _NODES) if height is None else (Solid(domain, height), _NODES_IN_SPACE)
-    mesh = body_mesh(body, truth, nodes)
-    truth.check(mesh)
+    mesh = None
+    if isinstance(truth, BoundaryElectrodes):
+        mesh = body_mesh(domain, truth, _NODES)
+        truth.check(mesh)
     current = np.exp(rng.uniform(np.log(1e-4), np.log(1e-2)))
     protocol = (
         skip(count, int(rng.integers(1, 4)), current=current)
@@ -107,24 +111,26 @@ def _draw(rng, kind: str, outline: str) -> Tank:
         else adjacent(count, current=current, driven_electrodes=bool(rng.integers(2)))
     )
     bodies = _bodies(rng, domain)
+    if isinstance(truth, FacePatches):
+        assert height is not None
+        columns = [Ball(np.append(one.centre, height / 2), one.radius, 1 + one.change, height) for one in bodies]
+        mesh, _ = mesh_along(Solid(domain, height), truth, columns)
+        truth.check(mesh)
+    assert mesh is not None
     middles = np.asarray(centroids(mesh))[:, :2]
     whole = np.full(len(middles), conductivity / (height or 1.0))
     held = whole.copy()
     inside = [np.linalg.norm(middles - body.centre, axis=1) < body.radius for body in bodies]
     for body, cells in zip(bodies, inside, strict=True):
         held[cells] *= 1 + body.change
-    gain = 1 + (kind == "gains") * rng.uniform(0, 0.05) * rng.normal(size=protocol.num_measurements)
+    gain = gains(rng, kind, protocol.num_measurements)
     measured = []
     for values, impedances in ((whole, contact), (held, drifted)):
         electrodes = _electrodes(scale * place, width, impedances, height, covered)
         there = replace(mesh, points=as_array(scale * np.asarray(mesh.points)))
-        voltages = gain * np.asarray(ForwardModel(there, electrodes, protocol).voltages(values))
-        deviation = noise * np.hypot(voltages, 0.02 * np.median(np.abs(voltages)))
-        voltages = voltages + deviation * rng.normal(size=voltages.shape)
-        if kind == "few digits":
-            digits = rng.integers(2, 4) - 1 - np.floor(np.log10(np.abs(voltages)))
-            voltages = np.round(voltages * 10**digits) / 10**digits
-        measured.append(voltages)
+        model = on_host(ForwardModel(there, electrodes, protocol))
+        voltages = gain * np.asarray(solved_fields(model, values).voltages)
+        measured.append(recorded(rng, kind, voltages, noise))
     frames = [
         Measurement(one, np.ones(one.shape, bool), protocol, electrodes=described, domain=domain, name=name)
         for one, name in zip(measured, ("reference", "frame"), strict=True)
@@ -137,13 +143,28 @@ def _draw(rng, kind: str, outline: str) -> Tank:
     return Tank(frames[1], frames[0], bodies, kind, outline, noise)
 
 
+def gains(rng, kind: str, number: int) -> np.ndarray:
+    """Gains (number,) of channels, up to 5 % apart if this is the `kind` of error."""
+    return 1 + (kind == "gains") * rng.uniform(0, 0.05) * rng.normal(size=number)
+
+
+def recorded(rng, kind: str, voltages: np.ndarray, noise: float) -> np.ndarray:
+    """Voltages with noise, relative, and rounded to two or three digits if few digits are the `kind` of error."""
+    deviation = noise * np.hypot(voltages, 0.02 * np.median(np.abs(voltages)))
+    voltages = voltages + deviation * rng.normal(size=voltages.shape)
+    if kind == "few digits":
+        digits = rng.integers(2, 4) - 1 - np.floor(np.log10(np.abs(voltages)))
+        voltages = np.round(voltages * 10**digits) / 10**digits
+    return voltages
+
+
 def matched(tank: Tank, inclusions: Sequence[Inclusion]) -> tuple[list[Inclusion | None], int]:
     """For each body its own inclusion, the nearest of its sign within `REACH`; and how many are no body's."""
     found: list[Inclusion | None] = [None] * len(tank.bodies)
     if not inclusions:
         return found, 0
-    places = np.array([one.centroid for one in inclusions]) / SIZE
-    distance = np.linalg.norm(np.array([body.centre / SIZE for body in tank.bodies])[:, None] - places, axis=2)
+    places = np.array([one.centroid for one in inclusions]) / tank.size
+    distance = np.linalg.norm(np.array([body.centre / tank.size for body in tank.bodies])[:, None] - places, axis=2)
     same = np.array([[(body.change > 0) == (one.sign > 0) for one in inclusions] for body in tank.bodies])
     distance = np.where(same & (distance < REACH), distance, 1e3)
     for body, inclusion in zip(*linear_sum_assignment(distance), strict=True):
@@ -163,11 +184,11 @@ def _electrodes(place, width, contact, height: float | None, covered: float) -> 
 
 def _outline(name: str, rng) -> Domain:
     if name == "disk":
-        return Disk(SIZE)
+        return Disk(_SIZE)
     if name == "rectangle":
-        return Rectangle(2 * SIZE, 2 * SIZE * rng.uniform(0.6, 1.0))
+        return Rectangle(2 * _SIZE, 2 * _SIZE * rng.uniform(0.6, 1.0))
     angle = 2 * np.pi * np.arange(6) / 6
-    radius = SIZE * rng.uniform(0.85, 1.1, 6)
+    radius = _SIZE * rng.uniform(0.85, 1.1, 6)
     return Polygon(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
 
 
@@ -179,19 +200,23 @@ def _along(edge: np.ndarray, lengths: np.ndarray, places: np.ndarray) -> np.ndar
     return np.stack([np.interp(places, arc, closed[:, axis]) for axis in range(2)], axis=1)
 
 
+def drawn_change(rng) -> float:
+    """Change of a body's conductivity relative to the background: -30 to -99 %, or +42 to +1,000 %."""
+    contrast = np.exp(rng.uniform(np.log(0.35), np.log(4.6)))
+    return float(np.expm1(-contrast)) if rng.random() < 0.5 else float(np.expm1(min(contrast, 2.4)))
+
+
 def _bodies(rng, domain: Domain) -> tuple[Body, ...]:
     """One to three bodies that lie apart and off the edge."""
     number, (x_min, x_max, y_min, y_max) = int(rng.integers(1, 4)), domain.extent
     while True:
         bodies: list[Body] = []
         for _ in range(300):
-            radius = SIZE * rng.uniform(0.12, 0.28)
+            radius = _SIZE * rng.uniform(0.12, 0.28)
             centre = rng.uniform([x_min, y_min], [x_max, y_max])
-            inside = float(np.asarray(domain.signed_distance(centre[None]))[0]) > radius + 0.08 * SIZE
-            apart = all(np.linalg.norm(centre - one.centre) > radius + one.radius + 0.12 * SIZE for one in bodies)
+            inside = float(np.asarray(domain.signed_distance(centre[None]))[0]) > radius + 0.08 * _SIZE
+            apart = all(np.linalg.norm(centre - one.centre) > radius + one.radius + 0.12 * _SIZE for one in bodies)
             if inside and apart:
-                contrast = np.exp(rng.uniform(np.log(0.35), np.log(4.6)))
-                change = -float(-np.expm1(-contrast)) if rng.random() < 0.5 else float(np.expm1(min(contrast, 2.4)))
-                bodies.append(Body(centre, radius, change))
+                bodies.append(Body(centre, radius, drawn_change(rng)))
                 if len(bodies) == number:
                     return tuple(bodies)

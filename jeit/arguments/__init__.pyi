@@ -14,6 +14,7 @@ from .checks import (
     percent,
     readings,
     real_array,
+    signed_percent,
 )
 
 __all__ = [
@@ -32,4 +33,5 @@ __all__ = [
     "percent",
     "readings",
     "real_array",
+    "signed_percent",
 ]

@@ -93,6 +93,11 @@ def percent(value: float | None) -> str:
     return f"{share:.2g} %"
 
 
+def signed_percent(change: float) -> str:
+    """A relative change in per cent, with its sign and two significant digits."""
+    return f"{float(f'{100 * change:.2g}'):+g} %"
+
+
 Interval = tuple[float | None, float | None]
 """Ends of a credible interval, None where the data leave an end open."""
 

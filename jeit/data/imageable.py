@@ -29,6 +29,8 @@ MOST_OPPOSITE_SIGNS = 0.75
 MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
 # Cosine of the angle between a frame and its reference below which one of them has the opposite sign.
 _LEAST_COSINE = -0.5
+# Maximum share of a difference that is rounding of the voltages.
+_MOST_ROUNDING = 0.7
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
       driven electrodes read large voltages that are mostly due to contacts;
     - the cosine of the angle between its voltages and those of the reference is less than -0.5: no change of a passive
       body reverses all voltages, so one of them has the opposite polarity;
-    - it does not differ from the reference at all;
+    - it does not differ from the reference at all, or its difference is mostly rounding of the voltages;
     - the number of usable channels is smaller than the number of electrodes.
 
     In the available measured data sets, usable frames have at most 0.18 impossible signs and a reciprocity error of at
@@ -155,6 +157,7 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
         error = reciprocity_error(change, trusted) if usable and size > 0 else None
         own = {f"the reference '{reference.name}'": reference_error, "the frame": reciprocity_error(frame)}
         wrong = max(signs) if signs else None
+        rounding = float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0
         results.append(
             FrameQuality(
                 difference=relative,
@@ -163,8 +166,10 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
                 difference_reciprocity_error=error,
                 impossible_signs=wrong,
                 usable_channels=usable,
-                rounding=float(np.linalg.norm(rounding_of_difference(frame, mean))) / size if size > 0 else 0.0,
-                reason=_reason(measurement.protocol.num_electrodes, usable, relative, wrong, error, own, alike),
+                rounding=rounding,
+                reason=_reason(
+                    measurement.protocol.num_electrodes, usable, relative, rounding, wrong, error, own, alike
+                ),
             )
         )
     return results
@@ -193,6 +198,7 @@ def _reason(
     electrodes: int,
     usable: int,
     difference: float,
+    rounding: float,
     signs: float | None,
     reciprocity: float | None,
     own: dict[str, float | None],
@@ -204,6 +210,11 @@ def _reason(
         return f"only {counted(usable, 'channel')} usable in both it and its reference, for {electrodes} electrodes."
     if difference < 1e-12:
         return "it equals its reference, so there is no difference to image. Is it the same file?"
+    if rounding > _MOST_ROUNDING:
+        return (
+            f"its difference from the reference, {percent(difference)}, is mostly rounding of the voltages: record "
+            "them with more digits."
+        )
     if signs is not None and signs > MOST_OPPOSITE_SIGNS:
         return (
             f"{percent(signs)} of the voltages have a sign that no passive body gives: reverse the polarity of it, or "

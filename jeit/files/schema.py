@@ -134,7 +134,7 @@ class Number:
             if swept:
                 return [self.read(one, whole, " or a list of them") for one in _swept_values(given)]
             if isinstance(given, list):
-                raise fault("takes one value, not a list: it cannot be swept.")
+                raise fault("takes one value, not a list.")
             return self.read(given, whole)
 
         return core_schema.no_info_plain_validator_function(read)

@@ -57,9 +57,8 @@ def image_automatically(prepared: PreparedDifference, asked: Asked, segmented: b
         except ValueError as error:
             return Chosen("one-step", f"{fault}; but Gauss-Newton found no image. {error}", imaged)
         assert isinstance(better[0], Reconstruction)
-        shapes = None if plain else _shapes(prepared, better[0], asked)
+        shapes, outlined = (None, "") if plain else _shapes(prepared, better[0], asked)
         if shapes is not None or not segmented:
-            outlined = "" if shapes is None else f", and its bodies' {_edges(prepared)} fitted"
             return _with_bodies(prepared, f"{fault}: solved for conductivity itself{outlined}.", better, shapes)
     elif not (segmented or plain) and (bodies := _bodies_in_solid(prepared, asked, imaged[1])):
         return bodies
@@ -87,7 +86,7 @@ def _bodies_in_solid(prepared: PreparedDifference, asked: Asked, change: Float[A
     except ValueError:
         return None
     assert isinstance(smooth[0], Reconstruction)
-    shapes = _shapes(prepared, smooth[0], asked)
+    shapes, _ = _shapes(prepared, smooth[0], asked)
     why = f"the voltages show bodies, which a linear image of a solid blurs: their {_edges(prepared)} were fitted."
     return shapes and _with_bodies(prepared, why, smooth, shapes)
 
@@ -106,12 +105,18 @@ def _edges(prepared: PreparedDifference) -> str:
     return "surfaces" if prepared.mesh.dimension == 3 else "outlines"
 
 
-def _shapes(prepared: PreparedDifference, smooth: Reconstruction, asked: Asked) -> ShapeReconstruction | None:
-    """Fit the bodies of a smooth image as shapes; None if none are found, or if their misfit exceeds both that of the
-    smooth image and one standard deviation of `PreparedDifference.sharp_noise`."""
-    found = shapes_in(prepared, smooth, asked)
-    explains = float(found.misfit) <= max(1.0, float(smooth.misfit))
-    return found if found.bodies and explains else None
+def _shapes(
+    prepared: PreparedDifference, smooth: Reconstruction, asked: Asked
+) -> tuple[ShapeReconstruction | None, str]:
+    """Fit the bodies of a smooth image as shapes, and say so in half a sentence; None, with the reason, if none are
+    found, or if their misfit exceeds both that of the smooth image and one standard deviation of
+    `PreparedDifference.sharp_noise`."""
+    found, edges = shapes_in(prepared, smooth, asked), _edges(prepared)
+    if not found.bodies:
+        return None, f"; no body's {edges[:-1]} explains the voltages better than errors of the model do"
+    if (misfit := float(found.misfit)) > (most := max(1.0, float(smooth.misfit))):
+        return None, f"; {edges} of bodies miss the voltages by {misfit:.2g} standard deviations, {most:.2g} at most"
+    return found, f", and its bodies' {edges} fitted"
 
 
 def unsound(prepared: PreparedDifference, change: Float[Array, " m"]) -> str:

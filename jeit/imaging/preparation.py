@@ -163,13 +163,13 @@ class PreparedDifference:
 
         If the noise is not known, 0.1 of the difference is used instead, at most 1 in units of `relative_noise`.
         """
-        return self._off_by(1.0)
+        return self._off_by(self._misfit)
 
     @property
     def sharp_noise(self) -> Float[Array, " M"]:
         """`modelled_noise` for bodies with sharp outlines, volts. Its model error is three times larger, since bodies
         with sharp outlines, unlike smooth images, cannot adapt to model errors."""
-        return self._off_by(_SHARP)
+        return self._off_by(_SHARP * self._misfit)
 
     @property
     def accuracy(self) -> Accuracy:
@@ -181,7 +181,8 @@ class PreparedDifference:
             error = placed and placed.error
         known = self.uncertainty
         error = error and error._replace(drift=known.drift)
-        return Accuracy(self._off_by(1.0, known.other), error, known.size)
+        share = max(self._relative_misfit, known.other)
+        return Accuracy(self._off_by(share), error, known.size, self._unexplained)
 
     @property
     def modelled_share(self) -> float:
@@ -190,12 +191,32 @@ class PreparedDifference:
         sharp = np.asarray(self.sharp_noise)[self.mask] / np.asarray(self.relative_noise)[self.mask]
         return 1 - (0 if self.noise is None else self.noise**2 / float(np.mean(sharp**2)))
 
-    def _off_by(self, times: float, least: float = _LEAST_MISFIT) -> Float[Array, " M"]:
+    def _off_by(self, share: float) -> Float[Array, " M"]:
+        """Root of the sum of squares of noise, rounding, and an error that is a `share` of the difference, volts."""
         shape, used = np.asarray(self.relative_noise), np.asarray(self.mask)
         size = np.sqrt(np.mean(np.abs(np.asarray(self.difference)[used] / shape[used]) ** 2))
         noise = min(1.0, 0.1 * size) if self.noise is None else self.quality.trusted_noise
-        unmodelled = times * max(float(self.calibration.misfit), least) * size
-        return as_array(np.hypot(shape * np.hypot(noise, unmodelled), self._rounding))
+        return as_array(np.hypot(shape * np.hypot(noise, share * size), self._rounding))
+
+    @functools.cached_property
+    def _misfit(self) -> float:
+        """Misfit of the reference, at least 3 %: of all volts alike, or of each channel relative to its noise if that
+        is less."""
+        return max(min(float(self.calibration.misfit), self._relative_misfit), _LEAST_MISFIT)
+
+    @functools.cached_property
+    def _relative_misfit(self) -> float:
+        """Misfit of the reference, each channel relative to its noise."""
+        reference = np.asarray(self.reference.voltages)[0], np.asarray(self.reference.mask)[0]
+        return _relative_misfit(self.calibration.voltages, *reference)
+
+    @property
+    def _unexplained(self) -> float:
+        """What the noise leaves of the misfit of the reference, relative: how far the model's fields are off."""
+        measured, used = np.asarray(self.reference.voltages)[0], np.asarray(self.mask)
+        size = np.sqrt(np.mean(np.abs(measured[used] / np.asarray(self.relative_noise)[used]) ** 2))
+        noise = 0.0 if self.noise is None else self.noise / np.sqrt(2) / size
+        return float(np.sqrt(max(self._relative_misfit**2 - noise**2, 0.0)))
 
     @functools.cached_property
     def _rounding(self) -> Float[np.ndarray, " M"]:
@@ -276,7 +297,7 @@ def calibrated_model(
             chosen = "common"  # the data do not determine one impedance per electrode
             calibration = calibrate(model, voltages, mask=mask, contact=chosen)
         position = (base.uncertainty or Uncertainty()).position
-        calibration = _with_places(calibration, model, voltages, mask, chosen, position)
+        calibration = _with_places(calibration, model, voltages, mask, position)
         calibration = jax.block_until_ready(calibration)
         if not np.isfinite(calibration.misfit):
             raise ValueError(
@@ -286,23 +307,37 @@ def calibrated_model(
     return calibration, chosen
 
 
-def _with_places(
-    calibration: Calibration, model: ForwardModel, voltages, mask, contact: str, deviation: float | None
-) -> Calibration:
+def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float | None) -> Calibration:
     """The calibration with electrode positions estimated along, if that explains the reference far better.
 
     Described positions that explain the reference are kept. So are they where a misfit has other causes: estimated
-    positions explain little of a deep tank under a two-dimensional model.
+    positions explain little of a deep tank under a two-dimensional model. The background is estimated with the
+    positions, from the channels in proportion to what they show: fitted to the largest voltages, those at the drives,
+    it would follow what a two-dimensional model misses there.
     """
-    if not float(calibration.misfit) > _EXPLAINED or (placed := _placed(model, voltages, mask, deviation)) is None:
+    described = _relative_misfit(calibration.voltages, voltages, mask)
+    if not described > _EXPLAINED or (placed := _placed(model, voltages, mask, deviation)) is None:
         return calibration
-    try:
-        again = calibrate(placed.model, voltages, mask=mask, contact=contact)
-    except ValueError:
-        return calibration
-    if not float(again.misfit) < _BETTER * float(calibration.misfit):
+    predicted = np.asarray(placed.model.voltages(placed.conductivity))
+    if not _relative_misfit(predicted, voltages, mask) < _BETTER * described:
         return replace(calibration, model_error=placed.error)
-    return replace(again, shift=as_array(placed.shift), model_error=placed.error)
+    off = np.where(mask, predicted - voltages, 0)
+    return replace(
+        calibration,
+        model=placed.model,
+        conductivity=as_array(placed.conductivity),
+        voltages=as_array(predicted),
+        misfit=as_array(np.linalg.norm(off) / np.linalg.norm(np.where(mask, voltages, 0))),
+        shift=as_array(placed.shift),
+        model_error=placed.error,
+    )
+
+
+def _relative_misfit(predicted, measured, mask) -> float:
+    """Misfit of predicted voltages (M,), each channel relative to its expected noise, as a share of the voltages."""
+    noise = np.asarray(relative_noise(measured, mask))[mask]
+    off = (np.asarray(predicted) - measured)[mask]
+    return float(np.linalg.norm(off / noise) / np.linalg.norm(measured[mask] / noise))
 
 
 def _placed(model: ForwardModel, voltages, mask, deviation: float | None) -> Placement | None:

@@ -40,7 +40,7 @@ from jeit_solvers.engines import as_array, on_host
 _OWN_CONTACT, _COMMON_CONTACT, _CONDUCTIVITY = 1.0, 4.0, 2.0
 # Steps of the two fits, before and after κ is estimated, in sheets and in solids, where each takes a second; the
 # tolerance of their cost.
-_STEPS, _RTOL = {2: (15, 15), 3: (5, 3)}, 3e-3
+_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 3e-4, 3: 3e-3}
 # κ in units of `relative_noise`: 0.1 % of a voltage at least.
 _LEAST_NOISE = 0.1
 
@@ -154,7 +154,7 @@ def place_electrodes(
     found: Any = np.zeros(size)
     here, covariance = None, np.eye(size)
     for steps in _STEPS[model.mesh.dimension]:
-        descent = Descent(rtol=_RTOL, damping=1e-2, history=steps + 1)
+        descent = Descent(rtol=_RTOL[model.mesh.dimension], damping=1e-2, history=steps + 1)
         found, _ = descent.at_once(problem.expand, found, scale, steps)
         here = problem.at(found)
         if here is None or not np.isfinite(here.voltages).all():

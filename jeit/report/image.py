@@ -230,7 +230,7 @@ def _calibration(result: ImagedDifference) -> dict[str, Any]:
     return {
         "conductivity": np.asarray(calibration.conductivity).item(),
         "conductivity_unit": _unit(result),
-        "contact": result.settings.contact,
+        "contact": result.settings.contact if calibration.shift is None else "each, with the electrode positions",
         "contact_impedance": None if electrodes.is_point else electrodes.contact_impedance,
         "contact_impedance_unit": "ohm·m" if result.mesh.dimension == 2 else "ohm·m²",
         "relative_misfit": float(calibration.misfit),

@@ -67,9 +67,10 @@ def test_segmentation(tank, run, tmp_path):
     assert content["labels"].any()
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["hyperparameter"]["chosen_by"] == "default"
-    # What is listed is what the labels show.
+    # What is listed is what the labels show; inclusions that touch in the raster are one island.
     islands = sum(label(content["labels"] == kind)[1] for kind in (1, 2))
-    assert len(report["inclusions"]) == islands == sum(told.count(f"  {kind}") for kind in ("conductive", "resistive"))
+    assert 0 < islands <= len(report["inclusions"])
+    assert len(report["inclusions"]) == sum(told.count(f"  {kind}") for kind in ("conductive", "resistive"))
     pixel = (0.2 / 256) ** 2
     assert sum(one["area"] for one in report["inclusions"]) == pytest.approx(
         (content["labels"] > 0).sum() * pixel, rel=0.01

@@ -244,7 +244,10 @@ def test_what_a_model_misses_is_noise_to_those_who_solve_with_it():
     exact = prepare_difference(frame(20.0, seed=1), frame(), num_points=700)
     assert float(prepared.calibration.misfit) > 3 * float(exact.calibration.misfit)
     for one in (prepared, exact):
-        missed = max(0.03, float(one.calibration.misfit))
+        measured = np.asarray(one.reference.voltages)[0]
+        off, noise = np.asarray(one.calibration.voltages) - measured, np.asarray(one.relative_noise)
+        shares = [np.linalg.norm(off / scale) / np.linalg.norm(measured / scale) for scale in (1.0, noise)]
+        missed = max(0.03, min(shares))
         size = np.sqrt(np.mean((one.difference / one.relative_noise) ** 2))
         np.testing.assert_allclose(one.modelled_noise, one.relative_noise * np.hypot(one.noise, missed * size))
     # Noise of 1e-4 of each voltage, in both frames; channels are trusted to 1e-2.

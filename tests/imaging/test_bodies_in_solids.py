@@ -137,9 +137,10 @@ def test_a_prior_that_is_asked_for_is_that_of_the_image(monkeypatch, prior, faul
     data.difference = change
     monkeypatch.setattr(automatic, "unsound", lambda *_: fault)
     monkeypatch.setattr(automatic, "Reconstruction", SimpleNamespace)
-    monkeypatch.setattr(automatic, "_shapes", lambda *_: SimpleNamespace(conductivity=change, finer=None))
+    fitted = SimpleNamespace(bodies=(1,), misfit=0.5, conductivity=change, finer=None)
+    monkeypatch.setattr(automatic, "shapes_in", lambda *_: fitted)
     for name in ("one-step", "gauss-newton"):
-        made = SimpleNamespace(image=lambda *_: (SimpleNamespace(), change), hyperparameter=5.0)
+        made = SimpleNamespace(image=lambda *_: (SimpleNamespace(misfit=1.0), change), hyperparameter=5.0)
         monkeypatch.setitem(automatic.METHODS, name, made)
     chosen = automatic.image_automatically(data, method.Asked(prior))
     assert chosen.method == ("shapes" if prior == "gaussian" else "gauss-newton" if fault else "one-step")
@@ -154,9 +155,10 @@ def test_what_is_fitted_is_named_for_the_body(monkeypatch, dimension, edges, str
     data.mask = np.ones(2, bool)
     monkeypatch.setattr(automatic, "unsound", lambda *_: "it is strong" if strongest == 1 else "")
     monkeypatch.setattr(automatic, "Reconstruction", SimpleNamespace)
-    monkeypatch.setattr(automatic, "_shapes", lambda *_: SimpleNamespace(conductivity=change, finer=None))
+    fitted = SimpleNamespace(bodies=(1,), misfit=0.5, conductivity=change, finer=None)
+    monkeypatch.setattr(automatic, "shapes_in", lambda *_: fitted)
     for name in ("one-step", "gauss-newton"):
-        made = SimpleNamespace(image=lambda *_: (SimpleNamespace(), change), hyperparameter=5.0)
+        made = SimpleNamespace(image=lambda *_: (SimpleNamespace(misfit=1.0), change), hyperparameter=5.0)
         monkeypatch.setitem(automatic.METHODS, name, made)
     chosen = automatic.image_automatically(data, method.Asked("gaussian"))
     if dimension == 3 or strongest == 1:

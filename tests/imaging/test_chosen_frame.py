@@ -75,3 +75,11 @@ def test_a_frame_that_cannot_be_imaged_is_named_and_its_reference_is_not():
         prepare_difference(tank(EMPTY, FULL), tank(EMPTY), num_points=300)
     with pytest.raises(ValueError, match=r"^'tank' cannot be imaged: it equals its reference"):
         prepare_difference(tank(EMPTY), tank(EMPTY), num_points=300)
+
+
+def test_a_difference_that_is_rounding_is_named():
+    drifted = EMPTY * (1 + 5e-5 * np.random.default_rng(0).normal(size=EMPTY.size))
+    empty, almost = (np.array([float(f"{one:.4g}") for one in frame]) for frame in (EMPTY, drifted))
+    assert (empty != almost).any()
+    with pytest.raises(ValueError, match=r"^'tank' cannot be imaged: its difference .* is mostly rounding of the volt"):
+        prepare_difference(tank(almost), tank(empty), num_points=300)

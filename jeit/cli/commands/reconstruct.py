@@ -220,10 +220,13 @@ def show(console, result: "ImagedDifference", *, asked: bool = False) -> None:
     console.print(pairs(result.measurement.name, rows))
     console.print()
     if any(one.contrast_interval is not None for one in result.inclusions):
-        table = quantity_table(result.inclusions, background.real)
+        table, note = quantity_table(result.inclusions, background.real), ""
     else:
         table = inclusion_table(result.inclusions, unit, background=background.real)
+        note = "  peaks of the image, which blurs; only fitted bodies have intervals"
     console.print(table if result.inclusions else "  no inclusion found")
+    if result.inclusions and note:
+        console.print(note, style="dim", highlight=False)
     console.print()
 
 

@@ -42,12 +42,14 @@ _ENDS, _CONTRASTS, _NORMAL = (0.16, 0.84), 240, 31
 
 class Accuracy(NamedTuple):
     """How accurately a difference is known. **Fields**: `noise` (M,): standard deviation of the channels, volts, of all
-    errors but those of `model_error`, the unknown part of electrode positions and contact impedances, if any; `size`:
-    relative standard deviation of the lengths of the described domain."""
+    errors but those of `model_error`, the unknown part of electrode positions and contact impedances, if any; relative
+    standard deviations `size`, of the lengths of the described domain, and `strength`, of all strengths, from errors of
+    the background and the fields."""
 
     noise: Float[Array, " M"]
     model_error: ModelError | None = None
     size: float = Uncertainty().size
+    strength: float = 0.0
 
 
 def quantified(problem: ShapeProblem, fit: Fit, accuracy: Accuracy, unmodelled: Any, order: Any) -> list[Quantities]:
@@ -61,7 +63,7 @@ def quantified(problem: ShapeProblem, fit: Fit, accuracy: Accuracy, unmodelled: 
         rows = accuracy.model_error.voltages(problem.model, conductivity, problem.background)
         problem = problem.with_errors(np.asarray(problem.data.weight)[:, None] * rows)
     fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
-    return [quantify(problem, fit, int(k), float(unmodelled[k]), accuracy.size) for k in order]
+    return [quantify(problem, fit, int(k), float(unmodelled[k]), accuracy) for k in order]
 
 
 def including(known: Quantities, other: Ellipsoid | None, deviation: float) -> Quantities:
@@ -94,17 +96,17 @@ class _Held(NamedTuple):
     deviation: float
 
 
-def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, size: float) -> Quantities:
+def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, accuracy: Accuracy) -> Quantities:
     """Explore the contrast of body k of a `fit` in both directions, until it is improbable or at a bound.
 
     `unmodelled`: standard deviation of the contrast due to errors that the problem does not contain, which leave the
-    strength as it is. `size` as in `Accuracy`.
+    strength as it is.
     """
     bodies = fit.bodies
     contrast, slope = bodies.contrast(k, bodies.rows(fit.coefficients)[k])
     first = float(np.clip(np.log(contrast), *_BOUNDS))
     deviation = problem.deviations(fit)[_place(bodies, k)[1]] * abs(slope) / contrast
-    middle, start = _held_at(problem, bodies, fit.coefficients, k, np.log(contrast), first, size)
+    middle, start = _held_at(problem, bodies, fit.coefficients, k, np.log(contrast), first, accuracy)
     known, enough = [middle], _ENOUGH[bodies.dimension]
     for way in (-1, 1):
         at, coefficients, step = first, start, float(np.clip(deviation, *_STEP))
@@ -112,7 +114,7 @@ def quantify(problem: ShapeProblem, fit: Fit, k: int, unmodelled: float, size: f
             before, at = at, float(np.clip(at + way * step, *_BOUNDS))
             if at == before:
                 break
-            one, coefficients = _held_at(problem, bodies, coefficients, k, before, at, size)
+            one, coefficients = _held_at(problem, bodies, coefficients, k, before, at, accuracy)
             known.insert(len(known) if way > 0 else 0, one)
             step *= _LONGER
     return _summary(int(bodies.sign[k]), bodies.bounded_axes(k), unmodelled, known)
@@ -124,9 +126,9 @@ def _place(bodies: Bodies, k: int) -> tuple[int, int]:
     return 1 + k * size + d, 1 + int(bodies.first[k]) * size + d + 1
 
 
-def _held_at(problem: ShapeProblem, bodies: Bodies, coefficients, k: int, before: float, at: float, size: float):
+def _held_at(problem: ShapeProblem, bodies: Bodies, coefficients, k: int, before: float, at: float, accuracy: Accuracy):
     """The fit with the log contrast of body k, and of all others of its material, held at `at`, started from one of
-    `before` with equal strengths; and its coefficients. `size` as in `Accuracy`."""
+    `before` with equal strengths; and its coefficients."""
     start, alike, sign = coefficients.copy(), bodies.first == bodies.first[k], bodies.sign[k]
     for one in np.flatnonzero(alike).tolist():
         axes = bodies.bounded_axes(one)
@@ -136,7 +138,7 @@ def _held_at(problem: ShapeProblem, bodies: Bodies, coefficients, k: int, before
     held = np.where(alike, np.exp(at), bodies.held)
     found = problem.fit(replace(bodies, held=held), start, *_EFFORT[bodies.dimension])
     deviation = bodies.prior.radius_spread * float(problem.deviations(found)[_place(bodies, k)[0]])
-    deviation = bodies.bounded_axes(k) * float(np.hypot(deviation, size))
+    deviation = float(np.hypot(bodies.bounded_axes(k) * np.hypot(deviation, accuracy.size), accuracy.strength))
     measure = found.bodies.body(k, found.coefficients).measure
     return _Held(at, problem.surprise(found), float(np.log(max(measure, TINY))), deviation), found.coefficients
 

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import ArrayLike
 
-from jeit.arguments import interval_text
+from jeit.arguments import interval_text, signed_percent
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes
 from jeit.image import Inclusion
@@ -71,7 +71,7 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
         taken.append(places[which])
         assert one.quantities is not None
         ax.annotate(
-            interval_text(one.quantities.change_interval, _per_cent),
+            interval_text(one.quantities.change_interval, signed_percent),
             places[which],
             xytext=(0, 3 * sides[which]),
             textcoords="offset points",
@@ -82,11 +82,6 @@ def _label_intervals(ax: Axes, stars: Sequence[Star]) -> None:
             zorder=4,
             path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
-
-
-def _per_cent(change: float) -> str:
-    """A relative change in per cent, with a sign and two significant digits."""
-    return f"{float(f'{100 * change:.2g}'):+g} %"
 
 
 def draw_inclusions(inclusions: Sequence[Inclusion], *, ax: Axes | None = None) -> Axes:

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from jeit.arguments import interval_text, signed_percent
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane
@@ -92,6 +93,8 @@ def _caption(ax: Axes, place, levels, inclusions: Sequence[Inclusion], *, differ
         sign = "+" if one.sign > 0 else "−"
         column = "column of " if one.is_column else ""
         lines.append(f"{sign}  {column}{1e6 * one.area:.3g} cm³ at ({_millimetres(one.centroid)}) mm")
+        if one.contrast_interval is not None:
+            lines.append(f"    {interval_text(one.contrast_interval, signed_percent)}")
     if len(inclusions) > _MOST_LISTED:
         lines.append(f"and {len(inclusions) - _MOST_LISTED} more")
     ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=INK, linespacing=1.6)

@@ -1,0 +1,94 @@
+"""Cylinders and boxes that are not as they are described, with one or two balls or columns in them.
+
+Voltages are computed on a mesh along the balls, other and finer than that of an image. Errors are those of
+`problems/unlike_tanks.py`: of electrodes along both directions of their face, of contacts, size, gains and digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.problems.solid_tanks import KINDS, balls_in, empty_tank, mesh_along
+from benchmarks.problems.unlike_tanks import KEPT_BACK, SET_ON, Body, Tank, drawn_change, gains, recorded
+from jeit.data import Measurement
+from jeit.electrodes import FacePatches
+from jeit.forward import ForwardModel
+from jeit.forward.changes import solved_fields
+from jeit.mesh import Disk, Solid
+from jeit_solvers.engines import as_array, on_host
+
+ERRORS = (*SET_ON, *(one for one in KEPT_BACK if one != "in space"))
+# Share of the room between an electrode and the rim of its face that a shift may use.
+_ROOM = 0.9
+
+
+def draw(seed: int) -> Tank:
+    """A tank, the same for the same seed; its kind of error is `seed` modulo the number of kinds."""
+    rng = np.random.default_rng(seed)
+    kind, form = ERRORS[seed % len(ERRORS)], KINDS[seed // len(ERRORS) % len(KINDS)]
+    while True:
+        try:
+            return _draw(rng, kind, form)
+        except ValueError:  # electrodes overlap or leave their face: draw others
+            continue
+
+
+def _draw(rng, kind: str, form: str) -> Tank:
+    domain, described, protocol = empty_tank(rng, form)
+    size = float(np.ptp(np.asarray(domain.extent)[:2])) / 2
+    conductivity = np.exp(rng.uniform(np.log(0.01), np.log(1.0)))
+    impedance = np.exp(rng.uniform(np.log(1e-3), np.log(0.03))) * size / conductivity
+    described = described.with_contact_impedance(np.full(described.num_electrodes, impedance))
+    number = described.num_electrodes
+    off, spread = kind not in ("exact description", "contacts"), kind not in ("exact description", "electrodes")
+    shift = off * rng.uniform(0, 3) / 360 * domain.outline.perimeter * rng.normal(size=(number, 2))
+    contact = impedance * np.exp(spread * rng.uniform(0, np.log(3)) * rng.normal(size=number))
+    drifted = contact * np.exp((kind == "drifting contacts") * rng.uniform(0, 0.3) * rng.normal(size=number))
+    scale = 1 + (kind == "size") * rng.uniform(-0.03, 0.03)
+    noise = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.08))))
+    balls = balls_in(rng, domain, middle=form == "strips")
+    upright = form == "strips" and rng.random() < 0.5
+    balls = tuple(
+        ball._replace(factor=1 + drawn_change(rng), height=domain.thickness if upright else None) for ball in balls
+    )
+    truth = _moved(described, domain, shift)
+    mesh, factors = mesh_along(domain, truth, balls)
+    truth.check(mesh)
+    there = replace(mesh, points=as_array(scale * np.asarray(mesh.points)))
+    gain, measured = gains(rng, kind, protocol.num_measurements), []
+    for values, impedances in ((np.ones(mesh.num_cells), contact), (factors, drifted)):
+        electrodes = replace(truth, position=as_array(scale * np.asarray(truth.position)))
+        model = ForwardModel(there, electrodes.with_contact_impedance(impedances), protocol)
+        voltages = gain * np.asarray(solved_fields(on_host(model), conductivity * values).voltages)
+        measured.append(recorded(rng, kind, voltages, noise))
+    frames = [
+        Measurement(one, np.ones(one.shape, bool), protocol, electrodes=described, domain=domain, name=name)
+        for one, name in zip(measured, ("reference", "frame"), strict=True)
+    ]
+    axes = 2 if upright else 3
+    bodies = tuple(
+        Body(scale * ball.centre, scale * ball.radius, ball.factor - 1, scale**3 * ball.volume, axes) for ball in balls
+    )
+    return Tank(frames[1], frames[0], bodies, kind, f"solid, {form}", noise, size)
+
+
+def _moved(electrodes: FacePatches, domain: Solid, shift: np.ndarray) -> FacePatches:
+    """The patches moved by `shift` (L, 2), metres: around a cylinder and upwards, or along the two edges of a face of a
+    box. Shifts upwards end before the rim."""
+    place = np.asarray(electrodes.position).copy()
+    room = np.minimum(place[:, 2], domain.thickness - place[:, 2]) - np.asarray(electrodes.height) / 2
+    upwards = np.clip(shift[:, 1], -_ROOM * room, _ROOM * room)
+    if isinstance(domain.outline, Disk):
+        radius = np.linalg.norm(place[:, :2], axis=1)
+        angle = np.arctan2(place[:, 1], place[:, 0]) + shift[:, 0] / radius
+        place = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), place[:, 2] + upwards])
+    else:
+        _, x_max, _, y_max = domain.extent
+        faces = [np.isclose(np.abs(place[:, 0]), x_max), np.isclose(np.abs(place[:, 1]), y_max)]
+        lid = ~(faces[0] | faces[1])
+        place[:, 0] += np.where(faces[0], 0, shift[:, 0])
+        place[:, 1] += np.where(faces[0], shift[:, 0], np.where(lid, shift[:, 1], 0))
+        place[:, 2] += np.where(lid, 0, upwards)
+    return replace(electrodes, position=as_array(place))
