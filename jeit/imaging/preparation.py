@@ -77,9 +77,9 @@ _SHARP = 3.0
 # was at most 2.6.
 _UNLIKE = 3.0
 # Misfit of the reference up to which described electrode positions are taken as they are; standard deviation of these
-# positions, relative to the width of the body: 2° of a disk; and the ratio of misfits below which estimated positions
-# are used.
-_EXPLAINED, _MISPLACED, _BETTER = 0.01, 0.0175, 0.7
+# positions, relative to the width of the body: 2° of a disk; and the ratios of misfits below which estimated positions
+# are used, each channel relative to its noise, and all volts alike.
+_EXPLAINED, _MISPLACED, _BETTER, _WORSE = 0.01, 0.0175, 0.7, 2.0
 
 
 @dataclass(frozen=True)
@@ -163,13 +163,13 @@ class PreparedDifference:
 
         If the noise is not known, 0.1 of the difference is used instead, at most 1 in units of `relative_noise`.
         """
-        return self._off_by(self._misfit)
+        return self._off_by(max(self._misfit, _LEAST_MISFIT))
 
     @property
     def sharp_noise(self) -> Float[Array, " M"]:
         """`modelled_noise` for bodies with sharp outlines, volts. Its model error is three times larger, since bodies
         with sharp outlines, unlike smooth images, cannot adapt to model errors."""
-        return self._off_by(_SHARP * self._misfit)
+        return self._off_by(_SHARP * max(self._misfit, _LEAST_MISFIT))
 
     @property
     def accuracy(self) -> Accuracy:
@@ -181,7 +181,7 @@ class PreparedDifference:
             error = placed and placed.error
         known = self.uncertainty
         error = error and error._replace(drift=known.drift)
-        share = max(self._relative_misfit, known.other)
+        share = max(self._misfit, known.other)
         return Accuracy(self._off_by(share), error, known.size, self._unexplained)
 
     @property
@@ -200,15 +200,9 @@ class PreparedDifference:
 
     @functools.cached_property
     def _misfit(self) -> float:
-        """Misfit of the reference, at least 3 %: of all volts alike, or of each channel relative to its noise if that
-        is less."""
-        return max(min(float(self.calibration.misfit), self._relative_misfit), _LEAST_MISFIT)
-
-    @functools.cached_property
-    def _relative_misfit(self) -> float:
-        """Misfit of the reference, each channel relative to its noise."""
+        """Misfit of the reference: of all volts alike, or of each channel relative to its noise if that is less."""
         reference = np.asarray(self.reference.voltages)[0], np.asarray(self.reference.mask)[0]
-        return _relative_misfit(self.calibration.voltages, *reference)
+        return min(float(self.calibration.misfit), _relative_misfit(self.calibration.voltages, *reference))
 
     @property
     def _unexplained(self) -> float:
@@ -216,7 +210,7 @@ class PreparedDifference:
         measured, used = np.asarray(self.reference.voltages)[0], np.asarray(self.mask)
         size = np.sqrt(np.mean(np.abs(measured[used] / np.asarray(self.relative_noise)[used]) ** 2))
         noise = 0.0 if self.noise is None else self.noise / np.sqrt(2) / size
-        return float(np.sqrt(max(self._relative_misfit**2 - noise**2, 0.0)))
+        return float(np.sqrt(max(self._misfit**2 - noise**2, 0.0)))
 
     @functools.cached_property
     def _rounding(self) -> Float[np.ndarray, " M"]:
@@ -319,15 +313,16 @@ def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, 
     if not described > _EXPLAINED or (placed := _placed(model, voltages, mask, deviation)) is None:
         return calibration
     predicted = np.asarray(placed.model.voltages(placed.conductivity))
-    if not _relative_misfit(predicted, voltages, mask) < _BETTER * described:
+    misfit = float(np.linalg.norm((predicted - voltages)[mask]) / np.linalg.norm(voltages[mask]))
+    better = _relative_misfit(predicted, voltages, mask) < _BETTER * described
+    if not (better and misfit < _WORSE * float(calibration.misfit)):
         return replace(calibration, model_error=placed.error)
-    off = np.where(mask, predicted - voltages, 0)
     return replace(
         calibration,
         model=placed.model,
         conductivity=as_array(placed.conductivity),
         voltages=as_array(predicted),
-        misfit=as_array(np.linalg.norm(off) / np.linalg.norm(np.where(mask, voltages, 0))),
+        misfit=as_array(misfit),
         shift=as_array(placed.shift),
         model_error=placed.error,
     )
