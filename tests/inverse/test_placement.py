@@ -11,6 +11,7 @@ from jeit.data.imageable import rounding_of_difference
 from jeit.electrodes import FaceDiscs, FacePatches, NodeElectrodes, SheetDiscs
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward.changes import PlacementSensitivity, shifted
+from jeit.imaging import preparation
 from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import relative_noise
 from jeit.inverse.placement import ModelError, Uncertainty, _Problem, place_electrodes
@@ -77,6 +78,34 @@ def test_places_that_explain_the_reference_are_kept(tank):
     prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
     assert prepared.calibration.shift is None
     np.testing.assert_array_equal(prepared.model.electrodes.position, DESCRIBED.position)
+
+
+def test_the_background_follows_channels_far_from_the_drives(tank):
+    """Voltages next to the drives are 30 % larger than a sheet's, as where current spreads over the height of a tank;
+    fitted to these, the largest, the background would be 9 % too low."""
+    _, voltages = tank
+    near = np.abs(voltages) > 2.5 * np.median(np.abs(voltages))
+    deep = np.where(near, 1.3, 1.0) * voltages
+    prepared = prepare_difference(measured(1.01 * deep, "frame"), measured(deep, "reference"), num_points=1500)
+    calibration, noise = prepared.calibration, np.asarray(relative_noise(deep))
+    assert calibration.shift is not None
+    assert float(calibration.conductivity) == pytest.approx(SIGMA, rel=0.02)
+    off = np.asarray(calibration.voltages) - deep
+    assert float(calibration.misfit) == pytest.approx(np.linalg.norm(off) / np.linalg.norm(deep))
+    # What noise does not explain of the misfit is an error of all strengths.
+    size = np.linalg.norm(deep / noise)
+    misfit = min(float(calibration.misfit), np.linalg.norm(off / noise) / size)
+    strength = np.sqrt(misfit**2 - (prepared.noise / np.sqrt(2) * np.sqrt(len(deep)) / size) ** 2)
+    assert prepared.accuracy.strength == pytest.approx(strength)
+
+
+def test_places_that_miss_all_voltages_more_are_not_taken(tank, monkeypatch):
+    """However well they explain small voltages."""
+    _, voltages = tank
+    monkeypatch.setattr(preparation, "_WORSE", 1e-3)
+    prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
+    assert prepared.calibration.shift is None
+    assert prepared.calibration.model_error is not None
 
 
 def test_errors_of_a_difference_are_those_of_its_uncertainty_and_of_rounding(tank):

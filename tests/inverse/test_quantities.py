@@ -68,22 +68,27 @@ def test_a_fitted_body_has_its_quantities_and_wider_ones_where_the_model_is_in_d
 
 
 def test_errors_of_the_mesh_and_of_the_size_widen_intervals(monkeypatch):
-    """By 0.3 of log σ, where the data leave far less, and by 5 % of each length."""
+    """By 0.3 of log σ, where the data leave far less, by 5 % of each length, and by 10 % of each strength."""
     model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)
     inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.02, 0.035], axis=1) < 0.025
     voltages = np.asarray(model.voltages(SIGMA * np.where(inside, 3.0, 1.0)))
     noise = 3e-3 * np.abs(voltages)
     options = {"start": [(1, (0.02, 0.03), 0.02)], "noise": noise, "prior": StarPrior(modes=1)}
     found = {}
-    for mesh, size in ((1e-9, 1e-9), (0.3, 1e-9), (1e-9, 0.05)):
+    for mesh, size, strength in ((1e-9, 1e-9, 0.0), (0.3, 1e-9, 0.0), (1e-9, 0.05, 0.0), (1e-9, 1e-9, 0.1)):
         monkeypatch.setitem(ellipsoid._BY_THE_MESH, 2, mesh)
-        (one,) = reconstruct_shapes(model, voltages, SIGMA, accuracy=Accuracy(noise, None, size), **options).bodies
+        accuracy = Accuracy(noise, None, size, strength)
+        (one,) = reconstruct_shapes(model, voltages, SIGMA, accuracy=accuracy, **options).bodies
         low, high = one.quantities.change_interval
-        found[mesh, size] = np.log((1 + high) / (1 + low)) / 2, np.ptp(np.log(one.quantities.measure_interval)) / 2
+        found[mesh, size + strength] = (
+            np.log((1 + high) / (1 + low)) / 2,
+            np.ptp(np.log(one.quantities.measure_interval)) / 2,
+        )
     assert max(found[1e-9, 1e-9]) < 0.05
     assert 0.2 < found[0.3, 1e-9][0] < 0.35
     assert found[1e-9, 0.05][1] == pytest.approx(0.1, rel=0.1)  # of an area, twice that of a length
     assert found[1e-9, 0.05][0] == pytest.approx(found[1e-9, 1e-9][0], rel=1e-6)
+    assert found[1e-9, 1e-9 + 0.1][1] == pytest.approx(0.1, rel=0.1)
 
 
 def test_other_weights_of_the_data_leave_the_smooth_field_as_it_is():
