@@ -10,8 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.problems.solid_tanks import KINDS, balls_in, empty_tank, mesh_along
-from benchmarks.problems.unlike_tanks import KEPT_BACK, SET_ON, Body, Tank, drawn_change, gains, recorded
+from benchmarks.problems.solid_tanks import KINDS as FORMS
+from benchmarks.problems.solid_tanks import balls_in, empty_tank, mesh_along
+from benchmarks.problems.unlike_tanks import KINDS, Body, Tank, drawn_change, gains, recorded
 from jeit.data import Measurement
 from jeit.electrodes import FacePatches
 from jeit.forward import ForwardModel
@@ -19,7 +20,7 @@ from jeit.forward.changes import solved_fields
 from jeit.mesh import Disk, Solid
 from jeit_solvers.engines import as_array, on_host
 
-ERRORS = (*SET_ON, *(one for one in KEPT_BACK if one != "in space"))
+ERRORS = tuple(kind for kind in KINDS if kind != "in space")
 # Share of the room between an electrode and the rim of its face that a shift may use.
 _ROOM = 0.9
 
@@ -27,7 +28,7 @@ _ROOM = 0.9
 def draw(seed: int) -> Tank:
     """A tank, the same for the same seed; its kind of error is `seed` modulo the number of kinds."""
     rng = np.random.default_rng(seed)
-    kind, form = ERRORS[seed % len(ERRORS)], KINDS[seed // len(ERRORS) % len(KINDS)]
+    kind, form = ERRORS[seed % len(ERRORS)], FORMS[seed // len(ERRORS) % len(FORMS)]
     while True:
         try:
             return _draw(rng, kind, form)

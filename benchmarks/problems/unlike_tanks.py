@@ -2,8 +2,8 @@
 
 Voltages are computed on another, finer mesh, for electrodes that are not where they are described, with contacts that
 differ; some tanks have one more kind of error. Tanks of the kind "in space" have a height, upright bodies, and strips
-that cover part of the height, and are described as sheets. The defaults of jeit were set on the first kinds, `SET_ON`;
-those `KEPT_BACK` are never looked at for that.
+that cover part of the height, and are described as sheets. The defaults of jeit were set on other tanks of the kinds
+`SET_ON`; those `KEPT_BACK` are never looked at for that.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from jeit.mesh import Disk, Domain, Polygon, Rectangle, Solid, centroids, measur
 from jeit.protocol import adjacent, skip
 from jeit_solvers.engines import as_array, on_host
 
-SET_ON = ("exact description", "electrodes", "contacts", "electrodes and contacts")
-KEPT_BACK = ("drifting contacts", "size", "gains", "few digits", "in space")
+KEPT_BACK = ("drifting contacts", "size", "gains", "few digits")
+KINDS = ("exact description", "electrodes", "contacts", "electrodes and contacts", *KEPT_BACK, "in space")
+SET_ON = tuple(kind for kind in KINDS if kind not in KEPT_BACK)
 _SIZE = 0.1
 REACH = 0.3
 """Distance, in units of half the width of a tank, within which an inclusion may be a body's."""
@@ -68,8 +69,7 @@ class Tank(NamedTuple):
 def draw(seed: int) -> Tank:
     """A tank, the same for the same seed; its kind of error is `seed` modulo the number of kinds."""
     rng = np.random.default_rng(seed)
-    kinds = SET_ON + KEPT_BACK
-    kind, outline = kinds[seed % len(kinds)], ("disk", "rectangle", "polygon")[seed // len(kinds) % 3]
+    kind, outline = KINDS[seed % len(KINDS)], ("disk", "rectangle", "polygon")[seed // len(KINDS) % 3]
     while True:
         try:
             return _draw(rng, kind, outline)

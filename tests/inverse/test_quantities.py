@@ -1,5 +1,7 @@
 """Contrast, area and strength of bodies, with intervals: against tanks that differ from their description."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,6 +91,10 @@ def test_errors_of_the_mesh_and_of_the_size_widen_intervals(monkeypatch):
     assert found[1e-9, 0.05][1] == pytest.approx(0.1, rel=0.1)  # of an area, twice that of a length
     assert found[1e-9, 0.05][0] == pytest.approx(found[1e-9, 1e-9][0], rel=1e-6)
     assert found[1e-9, 1e-9 + 0.1][1] == pytest.approx(0.1, rel=0.1)
+    # The outline is that of the median area, and that of the fit where the data leave open how small the body is.
+    for low, times in ((one.area, 2.0), (None, 1.0)):
+        known = replace(one.quantities, measure=2 * one.area, measure_interval=(low, 3 * one.area))
+        assert one.with_quantities(known).area == pytest.approx(times * one.area)
 
 
 def test_other_weights_of_the_data_leave_the_smooth_field_as_it_is():

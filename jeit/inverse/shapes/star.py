@@ -102,8 +102,10 @@ class Star(eqx.Module):
         return self.weak if self.quantities is None else None not in self.quantities.change_interval
 
     def with_quantities(self, known: Quantities) -> Star:
-        """The body with its quantities; its area and contrast become the medians."""
-        outline = self.centroid + (self.outline - self.centroid) * np.sqrt(known.measure / max(self.area, TINY))
+        """The body with its quantities; its area and contrast become the medians, but the outline stays that of the fit
+        where the data leave open how small a strong body is."""
+        scale = 1.0 if known.measure_interval[0] is None else np.sqrt(known.measure / max(self.area, TINY))
+        outline = self.centroid + (self.outline - self.centroid) * scale
         return replace(self, outline=outline, contrast=float(np.abs(np.log1p(known.change))), quantities=known)
 
     @property
