@@ -22,7 +22,7 @@ from jeit.image.inclusions import inclusion_regions
 from jeit.image.merit import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
 from jeit.imaging.method import AUTO, METHODS, Asked, ImagingSettings, as_settings
-from jeit.imaging.preparation import Clock, prepare_difference
+from jeit.imaging.preparation import Clock, prepare_difference, threads_for
 from jeit.imaging.wiring import Wiring
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.image_noise import image_noise
@@ -224,7 +224,7 @@ def image_difference(
     calibration = prepared.calibration
     if prepared.mesh.dimension == 2 and settings.bodies != KINDS[0]:
         raise ValueError("bodies: ellipsoids and columns are of solids, and this is a sheet; leave it out.")
-    with clock("image"):
+    with clock("image"), threads_for(prepared.mesh):
         why, shapes = "", None
         asked = Asked(settings.prior, settings.hyperparameter, settings.bodies, progress)
         if settings.method == AUTO:

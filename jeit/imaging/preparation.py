@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 
 import jax
@@ -27,6 +27,7 @@ from jeit.inverse.channels import electrode_misfits
 from jeit.inverse.placement import Placement, Uncertainty, place_electrodes
 from jeit.inverse.shapes.quantities import Accuracy
 from jeit.mesh import Body, Mesh, OwnMesh, Solid
+from jeit_solvers import one_thread_of_blas
 from jeit_solvers.engines import as_array
 
 
@@ -283,7 +284,7 @@ def calibrated_model(
     contact impedance of each electrode. Raises `ValueError` if the calibration fails.
     """
     clock = Clock(None) if clock is None else clock
-    with clock("calibrate"):
+    with clock("calibrate"), threads_for(model.mesh):
         chosen = contact or default_contact(base)
         voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
         calibration = calibrate(model, voltages, mask=mask, contact=chosen)
@@ -299,6 +300,12 @@ def calibrated_model(
                 "and are geometry and protocol right?"
             )
     return calibration, chosen
+
+
+def threads_for(mesh: Mesh) -> AbstractContextManager:
+    """Context in which the BLAS has one thread for a sheet: its matrices are small, and on a busy machine threads that
+    wait for each other take ten times as long."""
+    return one_thread_of_blas() if mesh.dimension == 2 else nullcontext()
 
 
 def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float | None) -> Calibration:

@@ -1,5 +1,5 @@
 from .clustering import KMeans, kmeans
-from .cores import number_of_cores, on_cores, over_cores
+from .cores import number_of_cores, on_cores, one_thread_of_blas, over_cores
 from .dense import (
     QuadraticModel,
     lower_cholesky,
@@ -74,6 +74,7 @@ __all__ = [
     "near_inverse",
     "number_of_cores",
     "on_cores",
+    "one_thread_of_blas",
     "over_cores",
     "projected_gradient",
     "quadratic_form",

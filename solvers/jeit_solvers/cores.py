@@ -65,7 +65,7 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
         for part in parts:
             quietly(part)
         return
-    with _one_thread_of_blas():
+    with one_thread_of_blas():
         list(_workers(os.getpid()).map(quietly, parts))
 
 
@@ -93,7 +93,7 @@ _limits_lock = threading.Lock()
 
 
 @contextlib.contextmanager
-def _one_thread_of_blas() -> Iterator[None]:
+def one_thread_of_blas() -> Iterator[None]:
     """Limit the BLAS to one thread while this context, or another one of this kind, is active. Takes a few
     microseconds."""
     with _limits_lock:

@@ -1,6 +1,7 @@
 """The default method: linear where that is sound, solved for conductivity itself where it is not; and what it finds."""
 
 import functools
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -12,13 +13,13 @@ from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
-from jeit.imaging import ImagingSettings, automatic, prepare_difference
+from jeit.imaging import ImagingSettings, automatic, preparation, prepare_difference
 from jeit.imaging.automatic import unsound
 from jeit.imaging.method import METHODS
 from jeit.inverse import Gaussian, calibrate, reconstruct
 from jeit.inverse.image_noise import image_noise
 from jeit.layout import ring
-from jeit.mesh import Disk, centroids
+from jeit.mesh import Disk, centroids, cylinder
 from jeit.protocol import adjacent
 from jeit.report.image import report_image
 
@@ -55,6 +56,21 @@ def test_a_small_change_is_imaged_in_one_step():
     assert result.settings.method == "one-step"
     assert "sound" in result.why
     assert report_image(result)["reconstruction"]["why"] == result.why
+
+
+def test_sheets_are_imaged_with_one_thread_of_blas(monkeypatch):
+    """Whatever comes of it; solids, whose matrices are large, with all threads."""
+    entered = []
+
+    def context():
+        entered.append(True)
+        return nullcontext()
+
+    monkeypatch.setattr(preparation, "one_thread_of_blas", context)
+    image(20.0, method="one-step", raster_shape=(16, 16))
+    assert len(entered) == 2  # while it is calibrated, and while it is imaged
+    with preparation.threads_for(cylinder(0.1, 0.1, cell_size=0.05)):
+        assert len(entered) == 2
 
 
 def test_a_sheet_has_no_columns():
