@@ -1,7 +1,8 @@
 """Numbers of bodies in tanks that are not as described: places, and how often 68 % intervals hold the truth.
 
 Sheets are those of `problems/unlike_tanks.py`, solids of `problems/unlike_solids.py`. jeit's defaults were set on some
-kinds of error; the others were kept back. No tank of this case was looked at when defaults were set.
+kinds of error; the others were kept back. Defaults were set on other tanks; what this case showed of tanks with a
+height was the reason to look at those.
 """
 
 from __future__ import annotations

@@ -175,7 +175,8 @@ class PreparedDifference:
     @property
     def accuracy(self) -> Accuracy:
         """Errors of the difference, from which intervals are computed: noise, the unknown part of electrode positions
-        and contacts, and the share of the difference that equals the misfit of the reference, at least 2 %."""
+        and contacts, and the share of the difference that equals the misfit of the reference, at least 2 %; and of all
+        strengths, the part of that misfit that noise does not explain."""
         error = self.calibration.model_error
         if error is None:  # a reference that the described places explain still leaves them uncertain
             placed = _placed(self.model, np.asarray(self.reference.voltages)[0], self.mask, self.uncertainty.position)
@@ -330,6 +331,7 @@ def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, 
         conductivity=as_array(placed.conductivity),
         voltages=as_array(predicted),
         misfit=as_array(misfit),
+        contact_deviation=as_array(np.linalg.norm(placed.error.factor, axis=1)[placed.shift.size :]),
         shift=as_array(placed.shift),
         model_error=placed.error,
     )

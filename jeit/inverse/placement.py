@@ -40,7 +40,7 @@ from jeit_solvers.engines import as_array, on_host
 _OWN_CONTACT, _COMMON_CONTACT, _CONDUCTIVITY = 1.0, 4.0, 2.0
 # Steps of the two fits, before and after κ is estimated, in sheets and in solids, where each takes a second; the
 # tolerance of their cost.
-_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 3e-4, 3: 3e-3}
+_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 1e-4, 3: 3e-3}
 # κ in units of `relative_noise`: 0.1 % of a voltage at least.
 _LEAST_NOISE = 0.1
 

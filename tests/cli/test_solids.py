@@ -64,17 +64,18 @@ def test_from_description_to_picture(body, run, tmp_path):
     for name, change in (("empty", 1.0), ("full", 3.0)):
         conductivity = np.where(np.linalg.norm(where, axis=1) < 0.012, change, 1.0)
         np.savetxt(tmp_path / f"{name}.csv", np.asarray(model.voltages(conductivity))[None], delimiter=",")
-    status, told, error = run(
+    status, printed, error = run(
         "reconstruct", tmp_path / "full.csv", "--reference", tmp_path / "empty.csv",
         "--description", tmp_path / "full.toml", "--output", tmp_path / "out",
         *OPTIONS[body],
     )  # fmt: skip
     assert (status, error) == (0, "")
-    assert ("volume" in told) == (body == "solid")
-    assert (" area " in told) == ("/ mm²" in told) == (body == "mesh")  # the heading may take two lines
-    assert ("outline" in told) == (body == "mesh")
-    assert ("peak change" if body == "solid" else "68 % interval") in told
-    assert ("of back-" if body == "solid" else "strength") in told
+    assert ("volume" in printed) == (body == "solid")
+    assert (" area " in printed) == ("/ mm²" in printed) == (body == "mesh")  # the heading may take two lines
+    assert ("outline" in printed) == (body == "mesh")
+    assert ("peak change" if body == "solid" else "68 % interval") in printed
+    assert ("only fitted bodies have intervals" in printed) == (body == "solid")
+    assert ("of back-" if body == "solid" else "strength") in printed
     assert (tmp_path / "out" / "image.png").stat().st_size > 10_000
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     (found,) = report["inclusions"]
@@ -83,7 +84,7 @@ def test_from_description_to_picture(body, run, tmp_path):
     assert {key for key in found if key.startswith(("area", "volume"))} == size
     assert found.get("volume_unit", found.get("area_unit")) == ("m³" if body == "solid" else "m²")
     assert (tmp_path / "out" / "image.vtu").is_file() == (body == "solid")
-    assert ("image.vtu" in told) == (body == "solid")
+    assert ("image.vtu" in printed) == (body == "solid")
     np.testing.assert_allclose(found["centroid"], [0.02, 0.0, 0.02][: model.mesh.dimension], atol=0.005)
     if body == "solid":
         assert report["geometry"]["thickness"] == 0.04
@@ -124,10 +125,10 @@ SOLIDS = {
 }
 
 
-@pytest.mark.parametrize("told", SOLIDS)
-def test_info_tells_a_body_in_the_words_of_its_description(told, run, tmp_path):
-    (tmp_path / "full.toml").write_text(f"[geometry]\n{SOLIDS[told]}\n{PROTOCOL}number = 8\n")
+@pytest.mark.parametrize("printed", SOLIDS)
+def test_info_tells_a_body_in_the_words_of_its_description(printed, run, tmp_path):
+    (tmp_path / "full.toml").write_text(f"[geometry]\n{SOLIDS[printed]}\n{PROTOCOL}number = 8\n")
     np.savetxt(tmp_path / "full.csv", np.arange(1.0, 41)[None], delimiter=",")
     status, out, error = run("info", tmp_path / "full.csv")
     assert (status, error) == (0, "")
-    assert f" {told} " in " ".join(out.split()) + " "
+    assert f" {printed} " in " ".join(out.split()) + " "

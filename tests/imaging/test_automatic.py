@@ -170,7 +170,11 @@ def test_shapes_that_explain_less_than_the_image_are_not_shown(monkeypatch):
     for misfit, shown in ((0.99, True), (1.01 * max(1.0, float(found.reconstruction.misfit)), False)):
         shapes = replace(found.shapes, misfit=misfit)
         monkeypatch.setattr(automatic, "shapes_in", lambda *_, shapes=shapes: shapes)
-        assert (image.__wrapped__(20.0).shapes is not None) == shown
+        tried = image.__wrapped__(20.0)
+        assert (tried.shapes is not None) == shown
+        assert ("outlines fitted" if shown else "outlines of bodies miss the voltages by") in tried.why
+    monkeypatch.setattr(automatic, "shapes_in", lambda *_: replace(found.shapes, bodies=()))
+    assert "; no body's outline explains the voltages better" in image.__wrapped__(20.0).why
 
 
 @pytest.mark.slow

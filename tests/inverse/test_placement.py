@@ -69,6 +69,8 @@ def test_a_difference_is_prepared_with_the_places_that_explain_the_reference(tan
     prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
     assert prepared.calibration.shift.shape == (16, 1)
     assert float(prepared.calibration.misfit) < 0.01
+    left = prepared.calibration.contact_deviation
+    np.testing.assert_allclose(left, np.linalg.norm(prepared.calibration.model_error.factor[16:], axis=1))
     assert np.abs(np.asarray(prepared.model.electrodes.position) - np.asarray(DESCRIBED.position)).max() > 1e-3
 
 

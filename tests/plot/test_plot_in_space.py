@@ -273,7 +273,7 @@ def test_a_slice_shows_electrodes_that_it_passes_and_cuts_balls(tank, image, pat
 
 def test_bodies_that_were_fitted_are_outlined_as_what_they_are(tank, image, ax):
     form = SolidForm((0.02, -0.05, 0.085), ((0.03, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.085)), True)
-    column = Inclusion(1, (0.02, -0.05, 0.085), 1e-4, 1e-3, form=form)
+    column = Inclusion(1, (0.02, -0.05, 0.085), 1e-4, 1e-3, form=form, contrast_interval=(1.5, None))
     plot_slice(tank, image, Plane.at("z", 0.02), inclusions=[column], ax=ax)
     plot_slice(tank, image, Plane.at("y", -0.05), inclusions=[column], ax=(side := Figure().subplots()))
     plot_slice(tank, image, Plane.at("y", -0.03), inclusions=[column], ax=(beside := Figure().subplots()))
@@ -288,6 +288,7 @@ def test_bodies_that_were_fitted_are_outlined_as_what_they_are(tank, image, ax):
     (words,) = [text.get_text() for one in overview.axes for text in one.texts if "found" in text.get_text()]
     assert "found, dashed:" in words
     assert "column of 100 cm³" in words
+    assert "at least +150 %" in words
 
 
 def test_grids_have_one_scale(tank, image, patches):

@@ -204,13 +204,8 @@ def reconstruct_shapes(
         exact = independent_data(model, measured, used, accuracy.noise, at_once=True)[1]
         moved = setting.alone.data.voltages - data.voltages  # by the finer mesh
         exact = eqx.tree_at(lambda one: one.voltages, exact, exact.voltages + moved)
-        known = quantified(
-            setting.weighted(exact).problem(level),
-            fitted,
-            accuracy,
-            unmodelled_deviations(problem, fitted, each),
-            order,
-        )
+        unmodelled = unmodelled_deviations(problem, fitted, each)
+        known = quantified(setting.weighted(exact).problem(level), fitted, accuracy, unmodelled, order)
         known = [including(one, others[k][0], others[k][1]) for one, k in zip(known, order, strict=True)]
         found_bodies = [body.with_quantities(one) for body, one in zip(found_bodies, known, strict=True)]
     return ShapeReconstruction(
