@@ -127,6 +127,19 @@ def test_double_precision_unless_told_otherwise():
     assert jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def test_products_in_single_precision_keep_all_of_its_digits(monkeypatch):
+    """The text of a compiled program says so; on graphics processors its absence means factors of 11 bits."""
+    ones = jax.numpy.ones((2, 2), "float32")
+    assert "HIGHEST" in jax.jit(lambda a: a @ a).lower(ones).as_text()
+    before = jax.config.jax_default_matmul_precision  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        jax.config.update("jax_default_matmul_precision", "tensorfloat32")
+        take_double_precision()
+        assert jax.config.jax_default_matmul_precision == "tensorfloat32"  # pyright: ignore[reportAttributeAccessIssue]
+    finally:
+        jax.config.update("jax_default_matmul_precision", before)
+
+
 def test_double_precision_that_the_user_asked_for_is_not_warned_of(monkeypatch):
     monkeypatch.setenv("JAX_ENABLE_X64", "1")
     take_double_precision()
