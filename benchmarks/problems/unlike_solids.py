@@ -44,7 +44,7 @@ def _draw(rng, kind: str, form: str) -> Tank:
     described = described.with_contact_impedance(np.full(described.num_electrodes, impedance))
     number = described.num_electrodes
     off, spread = kind not in ("exact description", "contacts"), kind not in ("exact description", "electrodes")
-    shift = off * rng.uniform(0, 3) / 360 * domain.outline.perimeter * rng.normal(size=(number, 2))
+    degrees = off * rng.uniform(0, 3) * rng.normal(size=(number, 2))
     contact = impedance * np.exp(spread * rng.uniform(0, np.log(3)) * rng.normal(size=number))
     drifted = contact * np.exp((kind == "drifting contacts") * rng.uniform(0, 0.3) * rng.normal(size=number))
     scale = 1 + (kind == "size") * rng.uniform(-0.03, 0.03)
@@ -54,7 +54,7 @@ def _draw(rng, kind: str, form: str) -> Tank:
     balls = tuple(
         ball._replace(factor=1 + drawn_change(rng), height=domain.thickness if upright else None) for ball in balls
     )
-    truth = _moved(described, domain, shift)
+    truth = _moved(described, domain, degrees)
     mesh, factors = mesh_along(domain, truth, balls)
     truth.check(mesh)
     there = replace(mesh, points=as_array(scale * np.asarray(mesh.points)))
@@ -75,21 +75,39 @@ def _draw(rng, kind: str, form: str) -> Tank:
     return Tank(frames[1], frames[0], bodies, kind, f"solid, {form}", noise, size)
 
 
-def _moved(electrodes: FacePatches, domain: Solid, shift: np.ndarray) -> FacePatches:
-    """The patches moved by `shift` (L, 2), metres: around a cylinder and upwards, or along the two edges of a face of a
-    box. Shifts upwards end before the rim."""
+def _moved(electrodes: FacePatches, domain: Solid, degrees: np.ndarray) -> FacePatches:
+    """The patches moved by `degrees` (L, 2) of the perimeter: around a cylinder column by column and upwards ring by
+    ring, or along the two edges of a face of a box all of a face alike, so that a mesh can follow their edges. Shifts
+    upwards end before the rim."""
+    shift = degrees / 360 * domain.outline.perimeter
     place = np.asarray(electrodes.position).copy()
+    group = _rings(place) if isinstance(domain.outline, Disk) else _faces(place, domain)
+    first = np.unique(group, return_index=True)[1]
     room = np.minimum(place[:, 2], domain.thickness - place[:, 2]) - np.asarray(electrodes.height) / 2
-    upwards = np.clip(shift[:, 1], -_ROOM * room, _ROOM * room)
+    room = _ROOM * np.array([room[group == one].min() for one in group])
+    upwards = np.clip(shift[first[group], 1], -room, room)
     if isinstance(domain.outline, Disk):
         radius = np.linalg.norm(place[:, :2], axis=1)
-        angle = np.arctan2(place[:, 1], place[:, 0]) + shift[:, 0] / radius
+        angle = np.arctan2(place[:, 1], place[:, 0])
+        column, number = np.unique(np.round(angle, 6), return_index=True, return_inverse=True)[1:]
+        angle = angle + shift[column[number], 0] / radius
         place = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), place[:, 2] + upwards])
     else:
-        _, x_max, _, y_max = domain.extent
-        faces = [np.isclose(np.abs(place[:, 0]), x_max), np.isclose(np.abs(place[:, 1]), y_max)]
-        lid = ~(faces[0] | faces[1])
-        place[:, 0] += np.where(faces[0], 0, shift[:, 0])
-        place[:, 1] += np.where(faces[0], shift[:, 0], np.where(lid, shift[:, 1], 0))
+        along = shift[first[group], 0]
+        lid = group >= 4
+        place[:, 0] += np.where(group < 2, 0, along)
+        place[:, 1] += np.where(group < 2, along, np.where(lid, shift[first[group], 1], 0))
         place[:, 2] += np.where(lid, 0, upwards)
     return replace(electrodes, position=as_array(place))
+
+
+def _rings(place: np.ndarray) -> np.ndarray:
+    """The number of the ring of each patch, from below."""
+    return np.unique(place[:, 2], return_inverse=True)[1]
+
+
+def _faces(place: np.ndarray, domain: Solid) -> np.ndarray:
+    """The number of the face of each patch: two across x, two across y, the lower and the upper one."""
+    x_min, x_max, y_min, y_max = domain.extent[:4]
+    walls = [(0, x_min), (0, x_max), (1, y_min), (1, y_max), (2, 0.0), (2, domain.thickness)]
+    return np.argmax([np.isclose(place[:, axis], at) for axis, at in walls], axis=0)
