@@ -144,6 +144,18 @@ def check_metres(name: str, value: Any, most: float = np.inf, limit: str = "") -
         raise ValueError(f"{name} is {1e3 * float(value):g} mm, more than {limit}, {1e3 * most:g} mm; {IN_MILLIMETRES}")
 
 
+def check_positive(name: str, value: float) -> None:
+    """Raises `ValueError` if `value` is not a finite number greater than zero."""
+    if not (is_number(value) and value > 0):
+        raise ValueError(f"{name} must be a positive number in SI units; it is {describe(value)}.")
+
+
+def check_not_negative(name: str, value: float) -> None:
+    """Raises `ValueError` if `value` is not a finite number greater than or equal to zero."""
+    if not (is_number(value) and value >= 0):
+        raise ValueError(f"{name} must be zero or positive; it is {describe(value)}.")
+
+
 def check_name(argument: str, given: Any, names: Iterable[str], otherwise: str = "") -> None:
     """Raise `ValueError` with the `argument` unless `given` is one of `names`; `otherwise` describes what else is
     accepted."""

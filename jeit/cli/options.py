@@ -30,6 +30,14 @@ Description = Annotated[
     str | None,
     typer.Option(help="TOML file that says what the numbers mean; looked for beside the data unless given."),
 ]
+Key = Annotated[
+    str | None,
+    typer.Option(help="Array of the frames in a .mat or .npz file; that which fits unless given.", metavar="NAME"),
+]
+ReferenceKey = Annotated[
+    str | None,
+    typer.Option(help="Array of the reference, in REFERENCE, or in DATA where no REFERENCE is given.", metavar="NAME"),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Contact = Annotated[
     str | None,
@@ -119,21 +127,29 @@ def read_file(
     format: str | None,
     description: str | None,
     like: "Measurement | None" = None,
+    key: str | None = None,
 ) -> "Measurement":
     """Read the measured file given as `option`, "DATA" or "--reference", which is named in error messages."""
     from jeit.data import read
 
-    with naming_options({"path": option}):
-        return read(path, format, description, like=like)
+    with naming_options({"path": option, "key": "--key"}):
+        return read(path, format, description, like=like, key=key)
 
 
 def read_pair(
-    data: Path, reference: Path | None, frames: str | None, format: str | None, description: str | None
+    data: Path,
+    reference: Path | None,
+    frames: str | None,
+    format: str | None,
+    description: str | None,
+    keys: tuple[str | None, str | None] = (None, None),
 ) -> "tuple[Measurement, Measurement | None]":
     """Read DATA and its reference. `frames`: range of the frames of the reference, or of DATA without one, that are
-    used as reference."""
-    base = None if reference is None else read_file("--reference", reference, format, description)
-    measurement = read_file("DATA", data, format, description, like=base)
+    used as reference. `keys`: names of the arrays of DATA and of the reference."""
+    key, reference_key = keys
+    reference = data if reference is None and reference_key is not None else reference
+    base = None if reference is None else read_file("--reference", reference, format, description, key=reference_key)
+    measurement = read_file("DATA", data, format, description, like=base, key=key)
     if frames is None:
         return measurement, base
     whole = measurement if base is None else base

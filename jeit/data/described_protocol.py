@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,6 +49,25 @@ def described_protocol(table: ProtocolTable, num_electrodes: int | None, path: P
         return _construct(table, num_electrodes, path, origin)
     except ValueError as error:
         raise located(error, origin, "protocol") from None
+
+
+# Options that a description may leave out, and their values: those of the constructors first.
+_OPEN = {"driven_electrodes": (False, True), "order": ("rotating", "fixed"), "reciprocal": ("all", "half"),
+         "drives": ("distinct", "all")}  # fmt: skip
+
+
+def variants(table: ProtocolTable) -> list[tuple[ProtocolTable, str]]:
+    """The table, and with other values of the options that it does not state, each with these in the words of a
+    description."""
+    fields = type(table).model_fields
+    left = [name for name in _OPEN if name in fields and name not in table.model_fields_set]
+    left = [name for name in left if fields[name].default in _OPEN[name]]
+    found = []
+    for values in product(*(_OPEN[name] for name in left)):
+        changed = {name: one for name, one in zip(left, values, strict=True) if one != fields[name].default}
+        said = [f"{name} = " + ("true" if one is True else f'"{one}"') for name, one in changed.items()]
+        found.append((table.model_copy(update=changed), ", ".join(said)))
+    return found
 
 
 def _construct(table: ConstructedTable, num_electrodes: int | None, path: Path, origin: str) -> Protocol:

@@ -21,10 +21,11 @@ Sections of a description (`tank6cm.toml` in this folder is an example; only `[p
   column, or per row with `patterns_in` = "rows"; `measurement` states how the potentials of all electrodes are read:
   "mean-removed" (minus the mean of all), "mean" (against the mean of the others), "adjacent", or "against" an electrode
   `reference`; alternatively `measurement_key` names a matrix of measurement patterns in the file.
-- `[data]`: `frames_in` = "columns" or "rows"; `delimiter`, `skip_rows`; `complex_pairs`, `component`; `gain`,
-  `polarity`, `unit`, `saturation`; `frame_names`; `keys`: variables to read from a .mat or .npz file; `axes`: order of
-  the axes of a three-dimensional array (default: electrodes, patterns, frames); `frames` = "all", or "mean" for their
-  average; `frame_rate` in frames per second.
+- `[data]`: `frames_in` = "columns" or "rows"; `delimiter`, `skip_rows`; `time_column`, whether the first number of a
+  frame is its time; `complex_pairs`, `component`; `gain`, `polarity`, `unit`, `saturation`; `frame_names`; `keys`:
+  variables to read from a .mat or .npz file; `axes`: order of the axes of a three-dimensional array (default:
+  electrodes, patterns, frames); `frames` = "all", or "mean" for their average; `frame_rate` in frames per second. What
+  is left out of arrangement and `polarity` is found from the numbers, with a note.
 - `[uncertainty]`: standard deviations of what is described: `position` of electrodes in metres, or `position_degrees`
   on a disk or cylinder; `contact_drift_percent`, from the reference to a frame; `size_percent` of the body;
   `other_percent` of the difference. See `jeit.inverse.Uncertainty`.
@@ -34,6 +35,7 @@ Sections of a description (`tank6cm.toml` in this folder is an example; only `[p
 from __future__ import annotations
 
 import tomllib
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -42,7 +44,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jeit.data.described_body import described_body, described_electrodes
-from jeit.data.described_protocol import described_protocol
+from jeit.data.described_protocol import described_protocol, variants
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.files import read_toml
@@ -61,14 +63,16 @@ _VOLTAGE_UNITS = {"V": 1.0, "mV": 1e-3, "uV": 1e-6, "µV": 1e-6}
 
 @dataclass(frozen=True)
 class TableLayout:
-    """Arrangement of the numbers in a data file (section `[data]`)."""
+    """Arrangement of the numbers in a data file (section `[data]`); None: to be found out."""
 
-    frames_in: str = "rows"
-    delimiter: str = ","
-    skip_rows: int = 0
+    frames_in: str | None = None
+    delimiter: str | None = None
+    skip_rows: int | None = None
+    time_column: bool | None = None
     complex_pairs: bool = False
     component: str = "real"
     scale: float = 1.0
+    polarity: str | None = None
     saturation: float | None = None
     frame_names: tuple[str, ...] = ()
     keys: tuple[str, ...] = ()
@@ -89,6 +93,18 @@ class Description:
     notes: tuple[str, ...]
     protocol_section: ProtocolTable | None = field(repr=False)
     uncertainty: Uncertainty | None = None
+
+    def protocols(self, path: str | Path) -> list[tuple[Protocol, str]]:
+        """The protocols that agree with the description, each with the options that it does not state: first
+        `protocol`, with their usual values, then with others, named in words."""
+        first = self.protocol(path)
+        if first is None or self.protocol_section is None:
+            return []
+        number, found = None if self.electrodes is None else self.electrodes.num_electrodes, [(first, "")]
+        for table, said in variants(self.protocol_section)[1:]:
+            with suppress(ValueError):  # no channel is left
+                found.append((described_protocol(table, number, Path(path), self.origin), said))
+        return found
 
     def protocol(self, path: str | Path) -> Protocol | None:
         """The protocol of the file at `path`, or None if none is described. The name of the file may state the current.
@@ -199,9 +215,11 @@ def _layout(data: DataTable) -> TableLayout:
         frames_in=data.frames_in,
         delimiter=data.delimiter,
         skip_rows=data.skip_rows,
+        time_column=data.time_column,
         complex_pairs=data.complex_pairs,
         component=data.component,
         scale=scale,
+        polarity=data.polarity,
         # The saturation level is given in the numbers of the file, but compared with voltages from which the gain is
         # removed.
         saturation=None if data.saturation is None else data.saturation * abs(scale),

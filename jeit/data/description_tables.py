@@ -359,13 +359,14 @@ class DataTable(Table):
     """Table of the arrangement of the numbers in a file."""
 
     what = "[data]"
-    frames_in: Literal["rows", "columns"] = "rows"
-    delimiter: Annotated[str, Field(max_length=10)] = ","
-    skip_rows: Annotated[int, Number(0, 10**9)] = 0
+    frames_in: Literal["rows", "columns"] | None = None
+    delimiter: Annotated[str, Field(max_length=10)] | None = None
+    skip_rows: Annotated[int, Number(0, 10**9)] | None = None
+    time_column: bool | None = None
     complex_pairs: bool = False
     component: Literal["real", "imaginary", "magnitude", "complex"] = "real"
     gain: Annotated[float, Number(1e-12, 1e12)] = 1.0
-    polarity: Literal["normal", "reversed"] = "normal"
+    polarity: Literal["normal", "reversed"] | None = None
     unit: Literal["V", "mV", "uV", "µV"] = "V"
     saturation: Annotated[float, Number(1e-12, 1e12, "in the file's unit")] | None = None
     frame_names: Words = Field(default=[])

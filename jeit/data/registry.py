@@ -45,7 +45,7 @@ _TABLES = (".csv", ".txt", ".dat", ".npy", ".npz")
 FORMATS: dict[str, Format] = {
     "kit4": Format("kit4", (".mat",)),
     "ktc2023": Format("ktc2023", (".mat",)),
-    "eidors": Format("eidors", (".mat",), described=True),
+    "eidors": Format("eidors", (".mat",), described=True, borrows=True),
     "sciospec": Format("sciospec", (".eit",), described=True),
     "draeger": Format("draeger", (".eit",), described=True),
     "carefusion": Format("carefusion", (".eit",), described=True),
@@ -63,6 +63,7 @@ def read(
     description: str | Path | None = None,
     *,
     like: Measurement | None = None,
+    key: str | None = None,
 ) -> Measurement:
     """Read a measurement from a file.
 
@@ -73,6 +74,7 @@ def read(
       files) or the body measured (files of instruments). By default it is looked for beside the data.
     - `like`: a measurement of the same sensor, such as the reference, whose description applies to a table that has
       none.
+    - `key`: name of the array of voltages in a .mat or .npz file, in place of `[data] keys`.
 
     Raises `ValueError` if the file does not exist, is of no known format, or violates its format.
     """
@@ -88,12 +90,14 @@ def read(
         raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
     if file.stat().st_size == 0:
         raise ValueError(f"{file.name} is empty.")
-    name = _recognise(file, description) if format is None else format
+    name = _recognise(file, description or like) if format is None else format
     check_name("format", name, FORMATS)
     chosen = FORMATS[name]
     reader = chosen.reader
     if chosen.borrows:
-        return reader.read(file, description=description, like=like)
+        return reader.read(file, description=description, like=like, key=key)
+    if key is not None:
+        raise ValueError(f"key: files of format '{name}' have no choice of arrays; leave it out.")
     if chosen.described:
         return reader.read(file, description=description)
     if description is not None:
@@ -101,7 +105,7 @@ def read(
     return reader.read(file, description=chosen.bundled) if chosen.bundled else reader.read(file)
 
 
-def _recognise(file: Path, description: str | Path | None) -> str:
+def _recognise(file: Path, description: object) -> str:
     for name, candidate in FORMATS.items():
         if candidate.recognises(file):
             return name
@@ -112,8 +116,8 @@ def _recognise(file: Path, description: str | Path | None) -> str:
             return "eidors"
         raise ValueError(
             f"{file.name} is a .mat file of no known kind; it holds "
-            f"{listed(sorted(_matlab.variable_names(file)))}. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; "
-            f"{eidors.DESCRIPTION}."
+            f"{listed(sorted(_matlab.variable_names(file)))}. `jeit describe {file.name}` finds out what it can, and "
+            f"writes a description. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; {eidors.DESCRIPTION}."
         )
     raise ValueError(
         f"{file.name}: files ending in '{file.suffix}' are of no known format. Known: " + f"{', '.join(FORMATS)}."

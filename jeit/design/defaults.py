@@ -5,6 +5,8 @@ The skin and its touches are those of Park et al., Science Robotics 7, eabm7187 
 
 from __future__ import annotations
 
+from typing import Literal
+
 # The hydrogel: a square if the layout has no outline. Thickness and conductivity scale all voltages by the same factor,
 # apart from the influence of the contact impedances.
 SIDE = 0.2  # m
@@ -55,3 +57,18 @@ TEMPERATURE = 0.1
 NUM_POINTS = 1300
 STEPS = 60
 MINIMUM_SPACING = 8e-3  # m
+
+# Scores available in a study.
+ScoreName = Literal[
+    "minimum",
+    "mean",
+    "uniformity",
+    "blind_spot",
+    "taxels",
+    "information",
+    "mean_variance",
+    "largest_variance",
+    "localisation_error",
+]
+# Scores for sheets only, from linearised voltage changes and a prior: see `jeit.design.layout_scores`.
+OPTIMALITY = ("information", "mean_variance", "largest_variance", "localisation_error")

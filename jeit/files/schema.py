@@ -20,7 +20,7 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, FailFast, Field, GetCoreSchemaHandler, ValidationError, model_validator
@@ -55,13 +55,19 @@ class Table(BaseModel):
             unknown = itertools.islice((key for key in given if key not in cls.model_fields), _UNKNOWN)
             given = {key: given[key] for key in [*(key for key in cls.model_fields if key in given), *unknown]}
         try:
-            return made(given)
+            return made(cls._spelled(given) if isinstance(given, Mapping) else given)
         except ValidationError as error:
             faults = [
                 InitErrorDetails(type=fault(cls._said(one)), loc=_steps(one), input=0)
                 for one in error.errors(include_url=False)
             ]
             raise ValidationError.from_exception_data(cls.what, faults) from None
+
+    @classmethod
+    def _spelled(cls, given: Mapping[Any, Any]) -> dict[Any, Any]:
+        """The table, with hyphens and underscores in words as in the words that a key may have."""
+        known = {key: one.annotation for key, one in cls.model_fields.items()}
+        return {key: spelled(value, _words(known[key])) if key in known else value for key, value in given.items()}
 
     @classmethod
     def _said(cls, one: Any) -> str:
@@ -105,6 +111,21 @@ Word = Annotated[str, Field(min_length=1, max_length=200)]
 """One line of text."""
 Words = Annotated[list[Word], FailFast()]
 """A list of lines of text."""
+
+
+def spelled(given: Any, words: Iterable[str]) -> Any:
+    """The one of `words` that differs from `given` by hyphens and underscores alone, or `given`."""
+    if not isinstance(given, str):
+        return given
+    return next((word for word in words if word.replace("_", "-") == given.replace("_", "-")), given)
+
+
+def _words(annotation: Any) -> list[str]:
+    """Words that a key with this annotation may have."""
+    inner = get_args(annotation)
+    if get_origin(annotation) is Literal:
+        return [one for one in inner if isinstance(one, str)]
+    return [word for one in inner if get_origin(one) is Literal for word in _words(one)]
 
 
 def fault(said: str, key: str = "") -> PydanticCustomError:
@@ -291,10 +312,10 @@ class OneOf:
                 end = f", or {self.mark}" if self.mark else ""
                 raise fault(f"is missing; give it, one of {_few(self.tables)}{end}.", self.key)
             return self.usual.model_validate(given)
-        word = given[self.key]
+        word = spelled(given[self.key], self.tables)
         if not (isinstance(word, str) and word in self.tables):
             raise fault(not_among(word, self.tables, self._likely(word)), self.key)
-        return self.tables[word].model_validate(given)
+        return self.tables[word].model_validate({**given, self.key: word})
 
     def _likely(self, word: Any) -> str:
         """Text that proposes the valid word that is probably meant by `word`, with the sizes that it needs."""

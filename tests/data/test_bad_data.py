@@ -109,20 +109,28 @@ BAD_FILES = {
         changed('delimiter = ","', 'frame_names = ["a", "b"]'),
         "as many as the frames of a.csv, 1; they are 2",
     ),
-    "header not skipped": (table("first,second\n" + FRAME), "line 1"),
+    "a heading that is not to be skipped": (
+        table("first,second\n" + FRAME, GOOD + "skip_rows = 0\n"),
+        "line 1, column 1: 'first' is no number; .* skip_rows",
+    ),
     "a word for a number": (
         table(FRAME + "\n" + FRAME.replace(",", ",abc,", 1)),
         "a.csv, line 2, column 2: 'abc' is no n",
     ),
-    "an empty cell": (table(FRAME + ","), r"a.csv, line 1, column 41: nothing stands there; where .* write nan\.$"),
-    "semicolons": (table("1;2;3"), "a.csv, line 1: '1;2;3' is no number, nor numbers separated by ','. Set .* delim"),
-    "a heading": (table("first,second\n" + FRAME), "line 1, column 1: 'first' is no number; .* skip_rows"),
-    "ragged": (table(FRAME + "\n1,2,3"), "line 2 has length 3"),
+    "an empty cell": (
+        table(FRAME + ",,7"),
+        r"a.csv, line 1, column 41: nothing stands there; where .* write nan\.$",
+    ),
+    "semicolons": (
+        table("1;2;3", GOOD + "skip_rows = 0\n"),
+        "a.csv, line 1: '1;2;3' is no number, nor numbers separated by commas. Set .* delim",
+    ),
+    "ragged": (table(FRAME + "\n1,2,3\n" + FRAME), "row 2 has length 3"),
     "only comments": (table("# nothing\n"), "no numbers"),
     "binary": (lambda folder: table()(folder) and raw("a.csv", b"\xff\xfe\x00PK")(folder), "not a text file"),
     "odd complex columns": (changed('delimiter = ","', "complex_pairs = true"), "even number"),
     "wrong number of channels": (table("1,2,3,4"), "40 channels"),
-    "transposed": (table("\n".join(FRAME.split(","))), "transposed"),
+    "transposed": (table("\n".join(FRAME.split(",")), GOOD + 'frames_in = "rows"\n'), "transposed"),
     "all zero": (table(",".join(["0"] * 40)), "every usable voltage is zero"),
     "all missing": (table(",".join(["nan"] * 40)), "every usable voltage is zero, NaN or missing"),
     "no voltages in npz": (numpy_file(u=np.ones(40)), "no array 'voltages'"),
@@ -135,11 +143,17 @@ BAD_FILES = {
     "kit4 text": (matlab(**{**KIT4, "Uel": "none"}), "not numbers"),
     "ktc of another shape": (matlab(Uel=np.ones(5), Inj=np.eye(4), Mpat=np.eye(4)), "5 voltages"),
     "eidors without voltages": (matlab(**{**PATTERN, "vh": []}), "not numbers"),
-    "eidors unnamed voltages": (matlab(stim=1.0, meas=1.0, meas_stim=1.0), "none of v_h"),
+    "eidors unnamed voltages": (
+        matlab(**{name: PATTERN[name] for name in ("stim", "meas", "meas_stim")}, u=np.ones((3, 7))),
+        r"none of v_h, .* u \(3 × 7\)\. Name the array of frames by key=",
+    ),
     "eidors lengths differ": (matlab(**PATTERN, vi=[[1.0, 2]]), "differ in length"),
     "eidors drive beyond the last": (matlab(**{**PATTERN, "meas_stim": [[2]]}), "1 drive patterns"),
     "eidors fractional drive": (matlab(**{**PATTERN, "meas_stim": [[1.5]]}), "whole numbers"),
-    "eidors other length": (matlab(**{**PATTERN, "vh": [[1.0], [2.0]]}), "1 channels"),
+    "eidors other length": (
+        matlab(**{**PATTERN, "meas": [[1.0, -1]] * 3, "meas_stim": [[1]] * 3, "vh": [[1.0], [2.0]]}),
+        "3 channels",
+    ),
 }
 
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.acoustic.commands.options import BandHigh, BandLow, Hop, Window, intensity_settings
 from jeit.cli.options import Quiet, in_options, make_folder, naming_options
 
 if TYPE_CHECKING:
@@ -15,6 +14,28 @@ if TYPE_CHECKING:
     from jeit.acoustic.calibration.calibrate import CalibrationFit
 
 _OPTIONS = {"path": "--output", "intensity": "--low, --high, --window and --hop"}
+
+BandLow = Annotated[
+    float | None, typer.Option(help="Lowest frequency of the band, hertz (default 50, or the calibration's).")
+]
+BandHigh = Annotated[
+    float | None, typer.Option(help="Highest frequency of the band, hertz (default 1000, or the calibration's).")
+]
+Window = Annotated[float | None, typer.Option(help="Length of a window, seconds (default 0.05, or the calibration's).")]
+Hop = Annotated[
+    float | None, typer.Option(help="From one window to the next, seconds (default 0.0125, or the calibration's).")
+]
+
+
+def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):
+    """`IntensitySettings` with what was given, None if nothing was."""
+    given = {"low": low, "high": high, "window": window, "hop": hop}
+    given = {name: value for name, value in given.items() if value is not None}
+    if not given:
+        return None
+    from jeit.acoustic import IntensitySettings
+
+    return IntensitySettings(**given)
 
 
 def calibrate_microphones(

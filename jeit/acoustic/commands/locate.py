@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jeit.acoustic.commands.options import BandHigh, BandLow, Hop, Window, intensity_settings
+from jeit.acoustic.commands.calibrate_microphones import BandHigh, BandLow, Hop, Window, intensity_settings
 from jeit.cli.options import Quiet, in_options, make_folder, naming_options
 
 if TYPE_CHECKING:

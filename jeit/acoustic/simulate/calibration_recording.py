@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.simulate.checks import check_not_negative
 from jeit.acoustic.simulate.propagation import noise_power, transfer
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import (
@@ -28,6 +27,7 @@ from jeit.acoustic.simulate.synthesis import (
     source_spectrum,
     transform_size,
 )
+from jeit.arguments.checks import check_not_negative
 
 # Number of samples computed at once: 32 MB.
 PIECE = 2**22

@@ -5,8 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 import numpy as np
 
-from jeit.acoustic.simulate.checks import check_not_negative
 from jeit.arguments import check_metres
+from jeit.arguments.checks import check_not_negative
 from jeit.layout.layout import LARGEST
 
 # Time between two slots of a multiplexer in seconds, and number of slots. Eight 4:1 multiplexers switch simultaneously

@@ -10,13 +10,13 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.acoustic.simulate.checks import check_positive
 from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, quiet, record
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import ONSET, Burst, microphone_noise, sample_times
 from jeit.acoustic.simulate.touches import NOMINAL_SPEED
 from jeit.acoustic.simulate.wind_sound import TURBULENCE, room_sound, wind
 from jeit.arguments import check_key, check_kind, check_name, describe
+from jeit.arguments.checks import check_positive
 
 # Standard deviation of the logarithm of a trait between the clips of one person; and standard deviation of `slope`,
 # which varies linearly, between people. Between the clips of one person, `slope` varies half as much.

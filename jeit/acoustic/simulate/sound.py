@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.acoustic.simulate.checks import check_positive
 from jeit.acoustic.simulate.propagation import transfer
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import (
@@ -26,6 +25,7 @@ from jeit.acoustic.simulate.synthesis import (
     source_spectrum,
     transform_size,
 )
+from jeit.arguments.checks import check_positive
 
 # Time in seconds between the positions of a moving source. The source is at rest during each Hann-weighted block of two
 # hops; blocks overlap by half, and their weights sum to one. In 10 ms, a fast stroke of 0.5 m/s moves by 5 mm, much

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.simulate.checks import check_not_negative, check_positive
 from jeit.acoustic.simulate.microphones import MicrophoneModel, Readout, microphone_grid
 from jeit.arguments import check_key, check_kind, check_metres
+from jeit.arguments.checks import check_not_negative, check_positive
 from jeit.layout.layout import LARGEST
 
 

@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy.fft import next_fast_len
 
-from jeit.acoustic.simulate.checks import check_positive
 from jeit.acoustic.simulate.propagation import band_filter, noise_power, source_density
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin
 from jeit.arguments import check_kind
+from jeit.arguments.checks import check_positive
 
 # Duration in seconds for which the source's filter rings before and after a burst, since it has zero phase: about the
 # inverse of its lowest frequency.

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.simulate.checks import check_positive
 from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, record
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import FIRM, LIGHT, ONSET, VIBRATOR, Burst, check_burst, sample_times
+from jeit.arguments.checks import check_positive
 
 # Speed in m/s at which a stroke has its nominal strength. The power dissipated by friction is force times speed, so the
 # sound's power is taken as proportional to speed, and its amplitude to the square root of speed.

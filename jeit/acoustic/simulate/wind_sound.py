@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.acoustic.simulate.checks import check_not_negative, check_positive
 from jeit.acoustic.simulate.propagation import band_filter, noise_power, transfer
 from jeit.acoustic.simulate.sound import SimulatedSound, block_times
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
@@ -20,6 +19,7 @@ from jeit.acoustic.simulate.synthesis import (
     sample_times,
     transform_size,
 )
+from jeit.arguments.checks import check_not_negative, check_positive
 
 # Number of source positions in a jet, and number of frequencies at which their total power is computed. The power is
 # interpolated between these frequencies, where it is smooth.

@@ -14,10 +14,12 @@ from jeit.cli.options import (
     Description,
     Format,
     Frame,
+    Key,
     Nodes,
     Quiet,
     Reference,
     ReferenceFrames,
+    ReferenceKey,
     make_folder,
     naming_options,
     number_or_name,
@@ -41,6 +43,8 @@ def choose(
             help="Only this rule: gcv, l-curve, discrepancy, noise-figure or best-resolution; may be given repeatedly."
         ),
     ] = None,
+    key: Key = None,
+    reference_key: ReferenceKey = None,
     format: Format = None,
     description: Description = None,
     prior: Annotated[str | None, typer.Option(help="tikhonov, laplace, noser, gaussian (default) or matern.")] = None,
@@ -61,7 +65,7 @@ def choose(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measurement, base = read_pair(data, reference, reference_frames, format, description)
+        measurement, base = read_pair(data, reference, reference_frames, format, description, (key, reference_key))
         chosen = None if frame is None else number_or_name(frame, int)
         with naming_options({"rules": "--rule"}):
             result = compare_on_data(measurement, base, settings, rules=rule or None, frame=chosen, progress=step)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from jeit.cli.options import Description, Format, read_file
+from jeit.cli.options import Description, Format, Key, read_file
 
 # Solids with a given outline: their name, and the words of a description for their sizes if they differ.
 _SOLIDS = {
@@ -18,6 +18,7 @@ _SOLIDS = {
 
 def info(
     data: Annotated[Path, typer.Argument(help="Measured file.", show_default=False)],
+    key: Key = None,
     format: Format = None,
     description: Description = None,
 ) -> None:
@@ -26,7 +27,7 @@ def info(
     from jeit.cli.console import pairs, plain_console, scaled
     from jeit.report import report_measurement
 
-    measurement = read_file("DATA", data, format, description)
+    measurement = read_file("DATA", data, format, description, key=key)
     found = report_measurement(measurement)
     body, noise = found["body"], found["noise"]
     names = f" ({', '.join(found['frame_names'])})" if found["frame_names"] else ""

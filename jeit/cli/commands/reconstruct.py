@@ -16,11 +16,13 @@ from jeit.cli.options import (
     Description,
     Format,
     Frame,
+    Key,
     Model,
     Nodes,
     Quiet,
     Reference,
     ReferenceFrames,
+    ReferenceKey,
     make_folder,
     number_or_name,
     read_pair,
@@ -44,6 +46,8 @@ def reconstruct(
     ],
     reference: Reference = None,
     reference_frames: ReferenceFrames = None,
+    key: Key = None,
+    reference_key: ReferenceKey = None,
     format: Format = None,
     description: Description = None,
     method: Annotated[
@@ -108,6 +112,8 @@ def reconstruct(
             "reference-frames": reference_frames,
             "bodies": bodies,
             "as-is": as_is or None,
+            "key": key,
+            "reference-key": reference_key,
         }
         which = None if frame is None else number_or_name(frame, int)
         image_by_network(
@@ -146,7 +152,7 @@ def reconstruct(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measurement, base = read_pair(data, reference, reference_frames, format, description)
+        measurement, base = read_pair(data, reference, reference_frames, format, description, (key, reference_key))
         chosen = None if frame is None else number_or_name(frame, int)
         result = image_difference(measurement, base, settings, frame=chosen, progress=step)
         step("write")

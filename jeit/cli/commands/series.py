@@ -15,9 +15,11 @@ from jeit.cli.options import (
     Data,
     Description,
     Format,
+    Key,
     Nodes,
     Quiet,
     ReferenceFrames,
+    ReferenceKey,
     make_folder,
     naming_options,
     number_or_name,
@@ -62,6 +64,8 @@ def series(
     rate: Annotated[
         float | None, typer.Option(help="Frames in a second, where neither DATA nor its description says so.")
     ] = None,
+    key: Key = None,
+    reference_key: ReferenceKey = None,
     format: Format = None,
     description: Description = None,
     hyperparameter: Annotated[
@@ -107,7 +111,7 @@ def series(
     console = plain_console()
     with Steps(console, quiet=quiet) as step:
         step("read")
-        measured, base = read_pair(data, reference, reference_frames, format, description)
+        measured, base = read_pair(data, reference, reference_frames, format, description, (key, reference_key))
         with naming_options({"rate": "--rate"}):
             measured = measured if rate is None else measured.at_rate(rate)
         with naming_options({"frequency": "--frequency"}):

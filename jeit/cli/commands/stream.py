@@ -15,8 +15,10 @@ from jeit.cli.options import (
     Contact,
     Description,
     Format,
+    Key,
     Model,
     Quiet,
+    ReferenceKey,
     make_folder,
     naming_options,
     number_or_name,
@@ -40,6 +42,8 @@ def stream(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for frames.csv, images.npz and pictures.", show_default=False)
     ],
+    key: Key = None,
+    reference_key: ReferenceKey = None,
     format: Format = None,
     description: Description = None,
     method: Annotated[
@@ -130,8 +134,8 @@ def stream(
         make_folder(output, ("frames.csv", "images.npz", "frames.png", *films))
         with Steps(console, quiet=quiet) as step:
             step("read")
-            empty = read_file("--reference", reference, format, description)
-            measured = empty if data == "-" else read_file("DATA", Path(data), format, description, like=empty)
+            empty = read_file("--reference", reference, format, description, key=reference_key)
+            measured = empty if data == "-" else read_file("DATA", Path(data), format, description, empty, key)
             imager, calibration = prepare_imager(empty, settings, measurement=measured, progress=step)
         if data == "-":
             frames, number = parse_frames(sys.stdin), None

@@ -57,6 +57,14 @@ def variable_names(path: Path) -> set[str]:
     return {one.name for one in _variables(path)}
 
 
+def shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Shapes of the numeric variables in a .mat file, by name. Raises `ValueError` as `variable_names`."""
+    if _is_format_4(path):
+        with read_as(_unreadable(path)):
+            return {name: shape for name, shape, kind in scipy.io.whosmat(str(path)) if kind != "char"}
+    return {one.name: one.shape for one in _variables(path) if one.kind in (_SPARSE, *_NUMERIC)}
+
+
 def load(path: Path, *wanted: str) -> dict[str, np.ndarray]:
     """Read the numeric ones of the variables `wanted`, by name. Sparse matrices are converted to dense arrays; the key
     "" holds the names of all variables in the file. Other variables are not unpacked.

@@ -7,6 +7,7 @@ second, so that adjacent data are positive: set `polarity = "reversed"`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,8 @@ import numpy as np
 from jeit.arguments import listed
 from jeit.data.description import Description, load_description, parse_description
 from jeit.data.formats import _matlab
-from jeit.data.formats.table import frames_from, measurement_from, part_of
+from jeit.data.formats.frames import frames_in_table
+from jeit.data.formats.table import channel_counts, description_like, measurement_in
 from jeit.data.measured_patterns import frames_of
 from jeit.data.measurement import Measurement
 from jeit.protocol import Protocol, from_channels
@@ -41,52 +43,79 @@ def find_description(path: Path) -> Path | None:
     return common if common.is_file() and not recognises(path) else None
 
 
-def read(path: Path, description: str | Path | None = None) -> Measurement:
-    """Read the vectors named by `[data] keys` of the description, or by default the variables vh, vi, v_h, v_i.
+def read(
+    path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
+) -> Measurement:
+    """Read the array `key`, else those named by `[data] keys` of the description, else the variables vh, vi, v_h, v_i,
+    else the only array that has as many numbers as frames of the protocol.
 
     A file with `stim` (L, S) in amperes, `meas` (M, L) and `meas_stim` (M,), counted from 1, defines its own protocol.
+    `like`: as in `jeit.data.formats.table.read`.
 
     Raises `ValueError` if neither the file nor a description defines the protocol, or if no vector is found.
     """
     which = description if description is not None else find_description(path)
-    described = parse_description({}, path.name) if which is None else load_description(which)
-    keys, names = _keys(_matlab.variable_names(path), described, path)
-    content = _matlab.load(path, *keys, *PATTERN)
+    if which is None and like is not None and not recognises(path):
+        described = description_like(like)
+    else:
+        described = parse_description({}, path.name) if which is None else load_description(which)
+    described = described if key is None else replace(described, layout=replace(described.layout, keys=(key,)))
+    own = {} if described.protocol_section is not None or (which is None and like) else _matlab.load(path, *PATTERN)
+    protocols = described.protocols(path) or ([(_own_protocol(own, path), "")] if own else [])
+    if not protocols and like is not None:
+        protocols = [(like.protocol, "")]
+    keys, names, said = _keys(_matlab.shapes(path), described, channel_counts(protocols), path)
+    content = _matlab.load(path, *keys)
     vectors = [_matlab.numbers(content, key, path) for key in keys]
     if vectors[0].ndim == 3 or described.patterns_measured:
         if len(vectors) > 1:
             raise ValueError(f"{path.name}: [data] keys names {len(vectors)} arrays; give one, of all frames.")
         table = frames_of(vectors[0], described.layout.axes, path.name)
+        described = replace(described, layout=replace(described.layout, frames_in="rows"))
     elif len(vectors) == 1:
-        # A vector is one frame, whether a row or a column; a matrix holds one frame per column, as in EIDORS.
-        table = vectors[0].reshape(1, -1) if 1 in vectors[0].shape else vectors[0].T
+        table = vectors[0]
+        if 1 in table.shape and table.size in channel_counts(protocols):  # a vector is one frame
+            table = table.reshape(-1, 1)
     else:
         lengths = {vector.size for vector in vectors}
         if len(lengths) > 1:
             raise ValueError(f"{path.name}: variables {', '.join(keys)} differ in length ({sorted(lengths)}).")
-        table = np.stack([vector.ravel() for vector in vectors])
-    protocol = None
-    if described.protocol_section is None:
-        protocol = _own_protocol(content, path)
-    frames = frames_from(table, described.layout, path.name)
-    described = replace(described, notes=(*described.notes, *part_of(table, described.layout)))
-    measurement = measurement_from(path, described, frames, protocol, None)
+        table = np.stack([vector.ravel() for vector in vectors], axis=1)
+    # A matrix holds one frame per column, as in EIDORS, unless the numbers say otherwise.
+    found = frames_in_table(table, channel_counts(protocols), described.layout, usual="columns")
+    found = found._replace(notes=(*said, *found.notes))
+    measurement = measurement_in(path, described, found, protocols, like=like)
     return measurement if measurement.frame_names or not names else replace(measurement, frame_names=names)
 
 
-def _keys(content: set[str], described: Description, path: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _keys(
+    held: dict[str, tuple[int, ...]], described: Description, counts: list[int], path: Path
+) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Names of the arrays to read, names of their frames, and a note if an array was chosen for its shape."""
     if described.layout.keys:
-        return described.layout.keys, ()
-    reference = [name for name in REFERENCE_NAMES if name in content]
-    objects = [name for name in OBJECT_NAMES if name in content]
+        return described.layout.keys, (), ()
+    reference = [name for name in REFERENCE_NAMES if name in held]
+    objects = [name for name in OBJECT_NAMES if name in held]
     if reference and objects:
-        return (reference[0], objects[0]), ("reference", "object")
+        return (reference[0], objects[0]), ("reference", "object"), ()
     if reference or objects:
-        return ((reference + objects)[0],), ()
+        return ((reference + objects)[0],), (), ()
+    held = {name: shape for name, shape in held.items() if name not in PATTERN}
+    fitting = {name: shape for name, shape in held.items() if set(shape) & set(counts) or math.prod(shape) in counts}
+    if len(fitting) == 1:
+        (name,) = fitting
+        return (name,), (), (f"the frames are those of {name!r}.",)
+    there = "as many numbers as a frame's are in" if fitting else "there are"
+    usual = ", ".join(REFERENCE_NAMES + OBJECT_NAMES)
     raise ValueError(
-        f"{path.name}: none of {', '.join(REFERENCE_NAMES + OBJECT_NAMES)} is there; the file has "
-        f'{listed(sorted(content))}. Name the voltages in a description: [data] keys = ["..."].'
+        f"{path.name}: none of {usual} is there; {there} {_shaped(fitting or held)}. "
+        "Name the array of frames by key=, or by [data] keys in the description; --reference-key names that of the "
+        "reference."
     )
+
+
+def _shaped(held: dict[str, tuple[int, ...]]) -> str:
+    return listed([f"{name} ({' × '.join(map(str, shape))})" for name, shape in held.items()]) if held else "no numbers"
 
 
 def _own_protocol(content: dict, path: Path) -> Protocol:

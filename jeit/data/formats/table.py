@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 import re
-from array import array
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from jeit.arguments import listed
+from jeit.arguments import counted, listed
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
+from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text
+from jeit.data.formats.text import read_text, rectangle
+from jeit.data.formats.unstated import driven_zeros, fitting_protocol, with_signs
 from jeit.data.measured_patterns import frames_of, less_their_mean
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
-from jeit.files import check_memory, npy_array, npz_arrays
+from jeit.files import npy_array, npz_arrays
 from jeit.protocol import Protocol
 
 DESCRIPTION = "table (.csv, .txt, .npy, .npz) with a TOML description beside it"
 SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
 # Arrays that `write_table` stores in addition to the voltages and the protocol.
 _WORDS = ("mask", "protocol_name", "frame_names", "notes", "times")
-# Bytes of memory per byte of text: a number may take two characters, and is held twice, as rows and as the table.
-_IN_MEMORY = 8
-_SET = "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
 
 
 def recognises(path: Path) -> bool:
@@ -47,9 +46,11 @@ def find_description(path: Path) -> str | Path | None:
     return None
 
 
-def read(path: Path, description: str | Path | None = None, like: Measurement | None = None) -> Measurement:
+def read(
+    path: Path, description: str | Path | None = None, like: Measurement | None = None, key: str | None = None
+) -> Measurement:
     """Read a table with the given `description` (path or bundled name), else with the one found beside it, else with
-    that of `like`.
+    that of `like`. `key`: name of the array of voltages in an NPZ file.
 
     `like`: a measurement of the same sensor. For a table without a description, its protocol, electrodes and outline
     are used, and, if it was read from a table, the units and columns in its description. Raises `ValueError` if there
@@ -59,36 +60,82 @@ def read(path: Path, description: str | Path | None = None, like: Measurement | 
     if which is not None:
         described = load_description(which)
     elif like is not None:
-        described = _description_like(like)
+        described = description_like(like)
     else:
         raise ValueError(
             f"description: {path.name} is a table of numbers, and nothing says what they mean. Put a description "
-            f"beside it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one."
+            f"beside it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one; "
+            f"`jeit describe {path.name}` finds out what it can, and writes one."
         )
+    if key is not None:
+        described = replace(described, layout=replace(described.layout, keys=(key,)))
+    protocols = described.protocols(path) or ([] if like is None else [(like.protocol, "")])
+    mask = own = times = None
     if path.suffix.lower() in (".npz", ".npy"):
         arrays = _from_numpy(path, described.layout.keys)
-        table, mask, protocol = _voltages(arrays, described.layout, path), arrays.get("mask"), None
+        table, mask = _voltages(arrays, described.layout, path), arrays.get("mask")
         if table.ndim == 3 or described.patterns_measured:
             table = frames_of(table, described.layout.axes, path.name)
         if described.protocol_section is None:
-            protocol = _own_protocol(arrays)
+            own = _own_protocol(arrays)
+        protocols = protocols if own is None else [(own, "")]
+        found = frames_in_table(np.atleast_2d(table), channel_counts(protocols), described.layout)
         described, times = _with_words(described, arrays), _times(arrays, path.name)
     else:
-        table, mask, protocol, times = _from_text(path, described.layout), None, None, None
-    if which is None and like is not None:
-        protocol = protocol or like.protocol
-    frames = frames_from(table, described.layout, path.name)
-    described = replace(described, notes=(*described.notes, *part_of(table, described.layout)))
-    measurement = measurement_from(path, described, frames, protocol, mask)
+        layout = described.layout
+        text = read_text(path, layout.delimiter, layout.skip_rows)
+        found = frames_in_text(text, channel_counts(protocols), layout, path.name)
+    measurement = measurement_in(path, described, found, protocols, mask, like)
     if times is None or described.layout.averaged or described.layout.frame_rate is not None:
         return measurement
     return replace(measurement, times=times)
 
 
-def _description_like(like: Measurement) -> Description:
+Protocols = Sequence[tuple[Protocol, str]]
+"""Protocols that may be meant, the described one first, each with what a description would have to say of it."""
+
+
+def channel_counts(protocols: Protocols) -> list[int]:
+    """Numbers of channels of the protocols, the described one's first."""
+    return [*dict.fromkeys(one.num_measurements for one, _ in protocols)]
+
+
+def measurement_in(
+    path: Path,
+    described: Description,
+    found: Frames,
+    protocols: Protocols,
+    mask: np.ndarray | None = None,
+    like: Measurement | None = None,
+) -> Measurement:
+    """The measurement of frames that were found in a file, with notes on what was found out; arguments as for
+    `measurement_from` and `read`."""
+    layout = replace(described.layout, frames_in="rows")
+    frames = frames_from(found.table, layout, path.name)
+    notes = (*described.notes, *found.notes, *part_of(found.table, layout))
+    if like is not None:  # what was found of the reference holds for the frames
+        protocols = sorted(protocols, key=lambda one: not one[0].same_patterns(like.protocol))
+    protocol, said = fitting_protocol(frames, protocols)
+    described = replace(described, layout=layout, notes=(*notes, *said))
+    if protocol is not None and frames.shape[-1] == protocol.num_measurements:
+        unread = driven_zeros(frames, protocol)
+        if unread.any():
+            mask = ~unread if mask is None else np.asarray(mask) & ~unread
+            said = f"{counted(int(unread.sum()), 'channel')} of driven electrodes are zero in every frame."
+            described = replace(described, notes=(*described.notes, said))
+    measurement = measurement_from(path, described, frames, protocol, mask)
+    if layout.polarity is None:
+        measurement = with_signs(measurement, like)
+    if found.times is None or layout.averaged or layout.frame_rate is not None:
+        return measurement
+    return replace(measurement, times=found.times[:: 2 if layout.complex_pairs else 1])
+
+
+def description_like(like: Measurement) -> Description:
     """Description that consists of the properties of another measurement of the same sensor, without its protocol and
     frame names."""
-    beside = find_description(Path(like.source)) if like.source and recognises(Path(like.source)) else None
+    source = Path(like.source)
+    beside = find_description(source) if like.source and (recognises(source) or source.suffix == ".mat") else None
     layout = TableLayout() if beside is None else replace(load_description(beside).layout, frame_names=(), keys=())
     return Description(
         origin=f"the description of '{like.name}'",
@@ -152,7 +199,7 @@ def numbers(path: Path, layout: TableLayout) -> np.ndarray:
     numbers."""
     if path.suffix.lower() == ".npy":
         return _voltages(_from_numpy(path, ()), layout, path)
-    return _from_text(path, layout)
+    return rectangle(read_text(path, layout.delimiter, layout.skip_rows), path.name)
 
 
 def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
@@ -181,58 +228,6 @@ def part_of(values: np.ndarray, layout: TableLayout) -> tuple[str, ...]:
     if not np.iscomplexobj(values) or layout.component == "complex":
         return ()
     return (f"of complex voltages this is the {layout.component} part; see [data] component.",)
-
-
-def _from_text(path: Path, layout: TableLayout) -> np.ndarray:
-    delimiter = None if layout.delimiter.strip() == "" and layout.delimiter != "\t" else layout.delimiter
-    check_memory(path.name, _IN_MEMORY * path.stat().st_size)
-    numbers, length = array("d"), 0
-    for number, line in enumerate(_lines(path), start=1):
-        if number <= layout.skip_rows or not line.strip() or line.lstrip().startswith("#"):
-            continue
-        cells = line.split(delimiter)
-        try:
-            row = [float(cell) for cell in cells]
-        except ValueError:
-            raise ValueError(f"{path.name}, line {number}{_no_number(cells, delimiter, first=not length)}") from None
-        length = length or len(row)
-        if len(row) != length:
-            raise ValueError(
-                f"{path.name}, line {number} has length {len(row)}, the first {length}. Is the file cut off?"
-            )
-        numbers.extend(row)
-    if not numbers:
-        raise ValueError(f"{path.name} holds no numbers.")
-    return np.array(numbers).reshape(-1, length)
-
-
-def _no_number(cells: list[str], delimiter: str | None, *, first: bool) -> str:
-    """Error message for a line whose cells are not all numbers. `first`: whether no line of numbers precedes it."""
-    wrong = [k for k, cell in enumerate(cells) if not _is_number(cell)]
-    cell = cells[wrong[0]].strip()
-    said = f"{cell[:40]!r} is no number" if cell else "nothing stands there"
-    if len(cells) == 1:
-        return f": {said}, nor numbers separated by {delimiter or 'spaces'!r}. {_SET}"
-    # A heading consists mostly of words.
-    other = f" {_SET}" if first and 2 * len(wrong) > len(cells) else ""
-    return f", column {wrong[0] + 1}: {said}; where a value is missing write nan.{other}"
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _lines(path: Path) -> Iterator[str]:
-    """Lines of a text file."""
-    try:
-        with path.open(encoding="utf-8") as file:
-            yield from file
-    except UnicodeDecodeError:
-        raise ValueError(f"{path.name} is not a text file. If it is a spreadsheet, export it as CSV.") from None
 
 
 def _from_numpy(path: Path, keys: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -14,6 +14,7 @@ from jax.sharding import Mesh as Devices
 from jax.sharding import PartitionSpec
 from jaxtyping import Array, Float
 
+from jeit.design.defaults import OPTIMALITY
 from jeit.design.scores import TouchPrior, layout_scores
 from jeit.design.sensitivity import SensitivityMap
 from jeit.design.skin.cell_size import smallest_diameter
@@ -23,7 +24,6 @@ from jeit.design.skin.skin import Skin, model_conductivity
 from jeit.design.skin.touch_grid import SurfaceGrid, TouchGrid, touch_grid
 from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.voltage_changes import touch_changes
-from jeit.design.study.scores import OPTIMALITY
 from jeit.design.study.spec import Point, Shape, Study
 from jeit.design.taxels import find_taxels
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,24 +14,26 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jeit.design import defaults
+from jeit.design.defaults import OPTIMALITY
 from jeit.design.skin.cell_size import check_cell_size
-from jeit.design.skin.described_surface import surface_identity
+from jeit.design.skin.described_surface import described_surface, surface_identity, typical_cell
 from jeit.design.skin.indentation import AbstractIndentation, Bell, Hemisphere
 from jeit.design.skin.protocol import ProtocolName, skin_protocol
 from jeit.design.skin.skin import longer_side, skin_electrodes
-from jeit.design.study.layouts import is_file
-from jeit.design.study.meshes import meshes_of
-from jeit.design.study.scores import OPTIMALITY
+from jeit.design.study.layouts import curved_layout, is_file, study_layout
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.files import check_memory, read_text
 from jeit.files.limits import parsed_toml
 from jeit.layout import Layout, SurfaceLayout
-from jeit.mesh import Rectangle
+from jeit.mesh import Mesh, Rectangle
 from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
 
 if TYPE_CHECKING:
     from jeit.design.study.study_tables import StudyTable
+
+Maker = Callable[[str, float, float, float], Layout | SurfaceLayout]
+"""Function that creates a layout from name, diameter, contact impedance and minimum gap, as `study_layout` does."""
 
 # Version of the results: increase it if the same study would give different results.
 _VERSION = 2
@@ -237,7 +240,7 @@ def _study(text: str, table: StudyTable, folder: Path) -> Study:
     layers = table.mesh.layers if skin.model == "layer" else 0
     electrodes = table.electrodes
     gap = 1e-3 * electrodes.minimum_gap_mm
-    cells, outline, makers = meshes_of(table, folder)
+    cells, outline, makers = _meshes_of(table, folder)
     # Every layout is created once for each mesh; on flat skins, a single one serves all meshes.
     layouts = [
         [make(name, diameter, impedance, gap) for make in makers]
@@ -402,3 +405,23 @@ def _metres(lengths: list[float]) -> list[float]:
 def _tidy(value) -> float:
     """Round to 12 digits, which removes rounding errors of unit conversion."""
     return float(f"{float(value):.12g}")
+
+
+def _meshes_of(table: StudyTable, folder: Path) -> tuple[list[float], Rectangle | Triangles, Sequence[Maker]]:
+    """Returns the cell sizes, metres; the outline, or for curved skins the surface for the first cell size; and the
+    functions that create layouts: a single one for flat skins, and one for each cell size for curved skins."""
+    from jeit.design.skin.surface_tables import ScanTable  # imported already when the table was read
+
+    cells = [1e-3 * size for size in table.mesh.cell_mm]
+    described = table.surface
+    if described is None:
+        outline = Rectangle(1e-3 * table.skin.width_mm, 1e-3 * table.skin.height_mm)
+        return cells, outline, [lambda name, *sizes: study_layout(name, folder, outline, *sizes)]
+    surfaces = [described_surface(described, folder, size) for size in cells]
+    if isinstance(described, ScanTable) and described.has_cells:
+        cells = [typical_cell(surfaces[0])]
+
+    def on(surface: Mesh) -> Maker:
+        return lambda name, *sizes: curved_layout(name, folder, surface, described.outward, *sizes)
+
+    return cells, Triangles.of(surfaces[0]), [on(surface) for surface in surfaces]

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from jeit.design import defaults
+from jeit.design.defaults import OPTIMALITY, ScoreName
 from jeit.design.skin.protocol import ProtocolName
 from jeit.design.skin.skin_file import (
     CELL,
@@ -21,7 +22,6 @@ from jeit.design.skin.skin_file import (
     THICKNESS,
 )
 from jeit.design.skin.surface_tables import SURFACE, SurfaceTable, check_of_curved
-from jeit.design.study.scores import OPTIMALITY, ScoreName
 from jeit.files.schema import Number, Several, Table, Word, fault
 
 # Maximum numbers of layouts and of points: they are created before anything runs and take milliseconds and kilobytes

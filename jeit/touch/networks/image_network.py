@@ -23,7 +23,6 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, check_name, describe, is_number, real_array
 from jeit.design import Skin
 from jeit.protocol import Protocol
-from jeit.touch.networks.missing import MOST_MISSING, filled
 from jeit.touch.networks.three_stages import ThreeStages
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.simulate.contact.indent_sets import pixel_places
@@ -43,6 +42,8 @@ _AT_ONCE = 64
 # noise floor. An unexplained fraction alone is no evidence, since a network that has learnt little misses many touches:
 # the map must bulge more than it is indented as well.
 _UNEXPLAINED, _LOUD, _TOO_DEEP, _BULGE = 0.6, 3.0, 1.2, 3.0
+# Maximum fraction of missing channels with which a frame is still used.
+MOST_MISSING = 0.5
 # Maximum relative change; larger ones are not caused by touch.
 _GREATEST = 100.0
 
@@ -280,3 +281,21 @@ def _channels_of(protocol: Protocol) -> dict[str, Any]:
         "electrodes": protocol.num_electrodes,
         "patterns_sha256": hashlib.sha256(patterns.tobytes()).hexdigest()[:16],
     }
+
+
+def filled(
+    changes: Float[np.ndarray, "n M"], covariance: Float[np.ndarray, "M M"], noise: float
+) -> Float[np.ndarray, "n M"]:
+    """Replace missing channels, NaN, by their expected values given the others, C₂₁ (C₁₁ + noise² 1)⁻¹ y₁.
+
+    C is the `covariance` of the changes that touches cause; index 1 stands for known channels, 2 for missing ones; y₁
+    are the known changes. `noise`: standard deviation of the Gaussian noise of each channel.
+    """
+    found = np.array(changes, float)
+    known = np.isfinite(found)
+    for mask in np.unique(known[~known.all(axis=1)], axis=0):
+        rows = (known == mask).all(axis=1)
+        own = covariance[np.ix_(mask, mask)] + noise**2 * np.eye(int(mask.sum()))
+        expected = np.linalg.solve(own, covariance[np.ix_(mask, ~mask)])
+        found[np.ix_(rows, ~mask)] = found[np.ix_(rows, mask)] @ expected
+    return found

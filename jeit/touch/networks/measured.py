@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from jeit.arguments import check_kind
 from jeit.data import Measurement
-from jeit.touch.networks.image_network import ImageNetwork
-from jeit.touch.networks.missing import MOST_MISSING
+from jeit.touch.networks.image_network import MOST_MISSING, ImageNetwork
 
 # Maximum difference, metres, of electrode positions and of the skin's size from those that a network was trained for.
 _OFF = 1e-3

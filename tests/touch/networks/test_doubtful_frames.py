@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.touch.networks.missing import filled
+from jeit.touch.networks.image_network import filled
 from jeit.touch.simulate import Disc, Indent, relative_changes
 
 PLACE = (0.012, -0.02)

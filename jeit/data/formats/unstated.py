@@ -1,0 +1,107 @@
+"""What a description leaves out, found from the voltages: the order of channels, the channels measured, and the sign.
+
+The order is the one that obeys reciprocity. The sign is known wherever electrodes follow each other along an edge, see
+`jeit.data.quality.expected_signs`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Inexact
+
+from jeit.arguments import counted, percent
+from jeit.data.measurement import Measurement
+from jeit.data.quality import boundary_order, expected_signs, reciprocity_error
+from jeit.mesh import Solid
+from jeit.protocol import Protocol
+from jeit.protocol.patterns import shares_electrode
+
+# Reciprocity error above which the described order is doubted, and ratio to it below which another one is taken.
+_DOUBTED, _BETTER = 0.25, 0.4
+# Cosine of the angle between a frame and its reference below which one of them has the opposite sign.
+_OPPOSITE = -0.5
+
+
+def fitting_protocol(
+    frames: Inexact[np.ndarray, "F M"], protocols: Sequence[tuple[Protocol, str]]
+) -> tuple[Protocol | None, tuple[str, ...]]:
+    """The protocol among `protocols`, the described one first, that has as many channels as the frames and obeys
+    reciprocity; and a note if it is not the described one. None if there is none."""
+    if not protocols:
+        return None, ()
+    fitting = [one for one in protocols if one[0].num_measurements == frames.shape[-1]]
+    if not fitting:
+        return protocols[0][0], ()
+    errors = [_error(frames, one) for one, _ in fitting]
+    first, best = errors[0], int(np.argmin(errors))
+    if first <= _DOUBTED or errors[best] > _BETTER * first:
+        best = 0
+    chosen, said = fitting[best]
+    if not said:
+        return chosen, ()
+    reason = f"{counted(frames.shape[-1], 'number')} are in a frame"
+    if best:
+        reason = f"reciprocity is broken by {percent(errors[best])} so, by {percent(first)} in the usual order"
+    return chosen, (f"[protocol] {said} is taken, for {reason}.",)
+
+
+def _error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> float:
+    """Reciprocity error of the mean frame; infinite if nothing is known of it."""
+    values = np.atleast_2d(frames)
+    known = np.isfinite(values).all(axis=0)
+    mean = np.where(known, np.where(np.isfinite(values), values, 0).mean(axis=0), 0)
+    error = reciprocity_error(Measurement(mean[None], known[None], protocol)) if known.any() and mean.any() else None
+    return np.inf if error is None else error
+
+
+def driven_zeros(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> Bool[np.ndarray, " M"]:
+    """Channels (M,) that measure on a driven electrode and are zero in every frame, so were not measured."""
+    shared = shares_electrode(np.asarray(protocol.drive), np.asarray(protocol.measurement))
+    driven = shared[np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)]
+    zero = (np.atleast_2d(frames) == 0).all(axis=0)
+    return driven & zero & ~zero.all()
+
+
+def with_signs(measurement: Measurement, like: Measurement | None = None) -> Measurement:
+    """The measurement with the signs that a passive body gives, if all its voltages have one sign, as magnitudes have,
+    or the opposite sign of those of the same sensor, `like`; with a note if any is changed."""
+    values, usable = np.asarray(measurement.voltages), np.asarray(measurement.mask)
+    if like is not None and like.protocol.same_patterns(measurement.protocol):
+        both = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)
+        ours, theirs = (np.real(np.asarray(one.voltages)).mean(axis=0)[both] for one in (measurement, like))
+        size = np.linalg.norm(ours) * np.linalg.norm(theirs)
+        if size and ours @ theirs < _OPPOSITE * size:
+            said = f"the voltages are reversed, to agree with '{like.name}' (polarity = \"reversed\")."
+            return _changed(measurement, -values, said)
+    known = np.real(values[usable])
+    one_way = (known >= 0).all() or (known <= 0).all()
+    signs = _signs(measurement)
+    if signs is None or not one_way or not (signs[usable.any(axis=0)] != 0).all() or not known.any():
+        return measurement
+    changed = np.abs(np.real(values)) * signs
+    if (changed[usable] == np.real(values)[usable]).all():
+        return measurement
+    if (changed[usable] == -np.real(values)[usable]).all():
+        said = 'all voltages have one sign, the opposite of what a body gives: it is reversed (polarity = "reversed").'
+        return _changed(measurement, -values, said)
+    if np.iscomplexobj(values):
+        return measurement
+    return _changed(measurement, changed, "the voltages are magnitudes: they are given the signs that a body gives.")
+
+
+def _changed(measurement: Measurement, values, said: str) -> Measurement:
+    return replace(measurement, voltages=values, notes=(*measurement.notes, said))
+
+
+def _signs(measurement: Measurement) -> Float[np.ndarray, " M"] | None:
+    """Signs (M,) of the voltages of a passive body, 0 where they depend on it; None if electrodes are not known to
+    follow each other along an edge, or around a solid at one height."""
+    order = boundary_order(measurement)
+    if order is None and isinstance(measurement.domain, Solid) and measurement.electrodes is not None:
+        height = np.asarray(getattr(measurement.electrodes, "position", np.zeros((0, 3))))[:, -1]
+        if len(height) and np.ptp(height) < 1e-9:
+            order = np.arange(len(height))
+    return None if order is None else expected_signs(measurement.protocol, order)

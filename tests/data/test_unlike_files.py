@@ -1,0 +1,195 @@
+"""Voltages in files as people write them: read the same from each, or a question that names what is undecided."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import scipy.io
+
+from jeit import data
+from jeit.data import load_description
+from jeit.data.description import parse_description
+from jeit.protocol import adjacent
+
+TANK = """
+[geometry]
+shape = "disk"
+radius = 0.1
+[electrodes]
+layout = "ring"
+number = 8
+width = 0.01
+contact_impedance = 0.01
+[protocol]
+kind = "adjacent"
+current = 1e-3
+[data]
+"""
+SEPARATORS = {"comma": ",", "spaces": "  ", "tab": "\t", "semicolon": ";", "comma and space": " , "}
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """Three noisy frames of every channel of a ring, (3, 8, 8) volts: drive, measurement."""
+    folder = tmp_path_factory.mktemp("tank")
+    (folder / "tank.toml").write_text(TANK.replace("[data]", "driven_electrodes = true\norder = 'fixed'\n[data]"))
+    model = load_description(folder / "tank.toml").model("a.csv", num_points=300)
+    rest = np.asarray(model.voltages(1e-3))
+    shape = np.random.default_rng(0).normal(size=(3, 8, 8))
+    noise = 1e-3 * (shape + np.swapaxes(shape, 1, 2))
+    return rest.reshape(8, 8) * (1 + noise)
+
+
+def voltages_of(frames, driven, order, reciprocal):
+    """The voltages (3, M) of a protocol, in its order."""
+    protocol = adjacent(8, driven_electrodes=driven, order=order, reciprocal=reciprocal)
+    return frames[:, np.asarray(protocol.drive_index), np.asarray(protocol.measurement_index)], protocol
+
+
+def written(path, values, separator=",", wrap=0, heading=False, decimal=".", times=None, end="", label=""):
+    lines = []
+    for k, frame in enumerate(values):
+        cells = [f"{one:.9e}" for one in frame]
+        if times is not None:
+            cells = [f"{times[k]:.3f}", *cells]
+        for start in range(0, len(cells), wrap or len(cells)):
+            some = cells[start : start + (wrap or len(cells))]
+            lines.append(label + separator.join(some).replace(".", decimal) + end)
+    top = [separator.join(f"channel {k}" for k in range(len(values[0]) + (times is not None)))] if heading else []
+    path.write_text("\n".join([*top, *lines]) + "\n", "utf-8")
+    return path
+
+
+def read(path, extra="", protocol=""):
+    table = TANK.replace("[data]", f"{protocol}\n[data]\n{extra}")
+    path.with_suffix(".toml").write_text(table, "utf-8")
+    return data.read(path)
+
+
+VARIANTS = [
+    *({"separator": one, "wrap": wrap} for one, wrap in product(SEPARATORS.values(), (0, 10))),
+    *({"separator": one, "heading": True} for one in SEPARATORS.values()),
+    *({"separator": one, "decimal": ","} for one in (";", "  ", "\t")),
+    *({"separator": one, "times": [0.0, 0.1, 0.25]} for one in (",", "  ")),
+    {"separator": " ", "end": " "},
+    {"separator": ",", "end": ","},
+    {"separator": " , ", "label": "    magnitudes : "},
+    {"separator": ";", "heading": True, "decimal": ",", "times": [1.0, 2.5, 3.0]},
+]
+
+
+@pytest.mark.parametrize("way", VARIANTS, ids=str)
+def test_text_however_it_is_written(way, frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    found = read(written(tmp_path / "a.txt", values, **way))
+    np.testing.assert_allclose(found.voltages, values, rtol=1e-8)
+    np.testing.assert_allclose(0 if found.times is None else found.times, way.get("times", 0))
+    assert found.mask.all()
+
+
+@pytest.mark.parametrize(
+    ("driven", "order", "reciprocal"), [*product((False, True), ("rotating", "fixed"), ("all", "half"))]
+)
+def test_channels_that_no_description_states(driven, order, reciprocal, frames, tmp_path):
+    """What cannot be told apart is refused later, or reads the same: half of the channels have no reciprocal ones."""
+    values, protocol = voltages_of(frames, driven, order, reciprocal)
+    stated = f'order = "{order}"' if reciprocal == "half" else ""
+    found = read(written(tmp_path / "a.csv", values), protocol=stated)
+    assert found.protocol.same_patterns(adjacent(8, driven_electrodes=driven, order=order, reciprocal=reciprocal))
+    np.testing.assert_allclose(found.voltages, values, rtol=1e-8)
+    assert any("is taken, for" in note for note in found.notes) == (driven or order == "fixed" or reciprocal == "half")
+    assert protocol.num_measurements == found.voltages.shape[1]
+
+
+@pytest.mark.parametrize("driven", [False, True])
+@pytest.mark.parametrize("change", ["reversed", "magnitudes", "zeros"])
+def test_signs_that_no_description_states(change, driven, frames, tmp_path):
+    values, protocol = voltages_of(frames, driven, "rotating", "all")
+    own = (np.asarray(protocol.channel_drive) != 0) & (np.asarray(protocol.channel_measurement) != 0)
+    zero = own.any(axis=1) & (change == "zeros")
+    changed = {"reversed": -values, "magnitudes": np.abs(values), "zeros": np.where(zero, 0, -values)}[change]
+    if change == "reversed" and driven:
+        pytest.skip("voltages of both signs are not reversed unasked: the wiring is questioned")
+    found = read(written(tmp_path / "a.csv", changed))
+    np.testing.assert_allclose(np.asarray(found.voltages)[:, ~zero], values[:, ~zero], rtol=1e-8)
+    np.testing.assert_array_equal(~np.asarray(found.mask), np.tile(zero, (3, 1)))
+    if change != "zeros" or driven:
+        assert any("sign" in note for note in found.notes)
+
+
+def test_a_stated_polarity_is_kept(frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    np.testing.assert_allclose(read(written(tmp_path / "a.csv", -values), 'polarity = "normal"').voltages, -values)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("unit", ["V", "uV"])
+def test_plain_arrays(unit, turned, frames, tmp_path):
+    values, _ = voltages_of(frames, True, "fixed", "all")
+    table = (values if turned else values.T) * {"V": 1, "uV": 1e6}[unit]
+    scipy.io.savemat(tmp_path / "a.mat", {"frames": table.astype(complex), "words": "nothing", "rate": 3.0})
+    found = read(tmp_path / "a.mat", f'unit = "{unit}"')
+    np.testing.assert_allclose(found.voltages, values, rtol=1e-8)
+    np.savez(tmp_path / "b.npz", frames=values, other=values[:1])
+    (tmp_path / "b.toml").write_text(TANK)
+    np.testing.assert_allclose(data.read(tmp_path / "b.npz", key="frames").voltages, values, rtol=1e-8)
+
+
+def test_two_arrays_that_fit_are_a_question(frames, tmp_path):
+    values, _ = voltages_of(frames, True, "fixed", "all")
+    scipy.io.savemat(tmp_path / "a.mat", {"first": values.T, "second": values[:1].T})
+    with pytest.raises(ValueError, match=r"first \(64 × 3\), second \(64 × 1\). Name the array of frames by key="):
+        read(tmp_path / "a.mat")
+    assert data.read(tmp_path / "a.mat", key="second").num_frames == 1
+
+
+def test_the_frames_are_taken_as_their_reference(frames, tmp_path):
+    """An order that noise hides in one frame is that of the reference."""
+    values, _ = voltages_of(frames, True, "fixed", "all")
+    reference = read(written(tmp_path / "reference.csv", -values))
+    noisy = -values + 2 * np.random.default_rng(1).normal(size=values.shape) * np.abs(values).min()
+    found = data.read(written(tmp_path / "frame.csv", noisy), description=tmp_path / "reference.toml", like=reference)
+    assert found.protocol.same_patterns(reference.protocol)
+
+
+def test_a_last_line_that_is_cut_off_is_left_out(frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    for wrap, cut in ((0, -30), (10, -20), (10, -70)):
+        path = written(tmp_path / "a.txt", values, wrap=wrap)
+        path.write_text(path.read_text("utf-8")[:cut])
+        found = read(path)
+        assert found.num_frames == 2
+        assert any("cut off" in note for note in found.notes)
+
+
+SPOILED = {
+    "a word among the numbers": lambda rows: [*rows[:1], rows[1].replace(",", ",abc,", 1), *rows[2:]],
+    "a line that is short": lambda rows: [rows[0], rows[1].rsplit(",", 3)[0], rows[2]],
+    "a line that is long": lambda rows: [rows[0], rows[1] + ",1,2", rows[2]],
+    "an empty cell": lambda rows: [rows[0], rows[1].replace(",", ",,", 1), rows[2]],
+    "two columns too many": lambda rows: [f"{row},1,2" for row in rows],
+    "a column too few": lambda rows: [row.rsplit(",", 1)[0] for row in rows],
+    "decimal commas between commas": lambda rows: [row.replace(".", ",") for row in rows],
+    "lines without numbers": lambda rows: ["nothing"] * 3,
+    "a column that does not rise": lambda rows: [f"{one},{row}" for one, row in zip((3, 1, 2), rows, strict=True)],
+    "another heading half way": lambda rows: [rows[0], "a,b,c", *rows[1:]],
+}
+
+
+@pytest.mark.parametrize("how", SPOILED)
+def test_what_cannot_be_read_is_refused(how, frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    rows = written(tmp_path / "a.csv", values).read_text("utf-8").splitlines()
+    (tmp_path / "a.csv").write_text("\n".join(SPOILED[how](rows)), "utf-8")
+    with pytest.raises(ValueError, match=r"a: the data have shape|a\.csv"):
+        read(tmp_path / "a.csv")
+
+
+def test_hyphens_and_underscores_are_alike():
+    for kind in ("two-terminal", "two_terminal"):
+        table = {"protocol": {"kind": kind, "number": 8, "current": 1e-3}}
+        described = parse_description(table, "a.toml").protocol("a.csv")
+        assert described is not None
+        assert described.num_measurements == 28
+    table = {"protocol": {"kind": "haar", "number": 8, "current": 1e-3, "measurement": "mean_removed"}}
+    assert parse_description(table, "a.toml").protocol("a.csv") is not None
