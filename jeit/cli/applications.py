@@ -11,6 +11,7 @@ from jeit.cli.options import NETWORK
 # Module of each command, by name of the command.
 COMMANDS = {
     "demo": "jeit.cli.commands.demo",
+    "describe": "jeit.cli.commands.describe",
     "reconstruct": "jeit.cli.commands.reconstruct",
     "view": "jeit.cli.commands.view",
     "stream": "jeit.cli.commands.stream",

@@ -22,10 +22,11 @@ Sections of a description (`tank6cm.toml` in this folder is an example; only `[p
   "mean-removed" (minus the mean of all), "mean" (against the mean of the others), "adjacent", or "against" an electrode
   `reference`; alternatively `measurement_key` names a matrix of measurement patterns in the file.
 - `[data]`: `frames_in` = "columns" or "rows"; `delimiter`, `skip_rows`; `time_column`, whether the first number of a
-  frame is its time; `complex_pairs`, `component`; `gain`, `polarity`, `unit`, `saturation`; `frame_names`; `keys`:
-  variables to read from a .mat or .npz file; `axes`: order of the axes of a three-dimensional array (default:
-  electrodes, patterns, frames); `frames` = "all", or "mean" for their average; `frame_rate` in frames per second. What
-  is left out of arrangement and `polarity` is found from the numbers, with a note.
+  frame is its time; `complex_pairs`, `component`; `gain`, or `gains`, one for each measurement pattern of the protocol;
+  `polarity`, `unit`, `saturation`; `frame_names`; `keys`: variables to read from a .mat or .npz file; `axes`: order of
+  the axes of a three-dimensional array (default: electrodes, patterns, frames); `frames` = "all", or "mean" for their
+  average; `frame_rate` in frames per second. What is left out of arrangement and `polarity` is found from the numbers,
+  with a note.
 - `[uncertainty]`: standard deviations of what is described: `position` of electrodes in metres, or `position_degrees`
   on a disk or cylinder; `contact_drift_percent`, from the reference to a frame; `size_percent` of the body;
   `other_percent` of the difference. See `jeit.inverse.Uncertainty`.
@@ -73,6 +74,7 @@ class TableLayout:
     component: str = "real"
     scale: float = 1.0
     polarity: str | None = None
+    gains: tuple[float, ...] = ()
     saturation: float | None = None
     frame_names: tuple[str, ...] = ()
     keys: tuple[str, ...] = ()
@@ -220,6 +222,7 @@ def _layout(data: DataTable) -> TableLayout:
         component=data.component,
         scale=scale,
         polarity=data.polarity,
+        gains=() if data.gains is None else tuple(data.gains.tolist()),
         # The saturation level is given in the numbers of the file, but compared with voltages from which the gain is
         # removed.
         saturation=None if data.saturation is None else data.saturation * abs(scale),

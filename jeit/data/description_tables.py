@@ -30,6 +30,7 @@ Impedances = Annotated[np.ndarray, Numbers(((1, MOST_ELECTRODES),), 1e-15, 1e12,
 Patterns = Annotated[np.ndarray, Numbers(((1, math.inf), (2, MOST_ELECTRODES)), -1e12, 1e12)]
 Pairs = Annotated[np.ndarray, Numbers(((1, math.inf), (2, 2)), 0, MOST_ELECTRODES, kind=int)]
 Indices = Annotated[np.ndarray, Numbers(((1, math.inf),), 0, 2**31 - 1, kind=int)]
+Gains = Annotated[np.ndarray, Numbers(((1, math.inf),), 1e-6, 1e6)]
 Reading = Literal["adjacent", "mean", "mean-removed", "against"]
 Choices = Annotated[np.ndarray, Numbers(((1, math.inf), (1, math.inf)), kind=bool)]
 
@@ -366,6 +367,7 @@ class DataTable(Table):
     complex_pairs: bool = False
     component: Literal["real", "imaginary", "magnitude", "complex"] = "real"
     gain: Annotated[float, Number(1e-12, 1e12)] = 1.0
+    gains: Gains | None = None
     polarity: Literal["normal", "reversed"] | None = None
     unit: Literal["V", "mV", "uV", "µV"] = "V"
     saturation: Annotated[float, Number(1e-12, 1e12, "in the file's unit")] | None = None

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Inexact
 
 from jeit.arguments import listed
-from jeit.data.formats import _matlab
+from jeit.data.formats import matlab
 from jeit.files import check_electrodes, check_memory, npz_arrays
 from jeit.protocol import Protocol, from_matrices, measurement_patterns
 
@@ -78,8 +78,8 @@ def _read(path: Path, keys: tuple[str, ...]) -> list[np.ndarray]:
     if not path.is_file() or path.suffix.lower() not in (".mat", ".npz"):
         raise ValueError(f"kind = 'measured' takes the currents from a .mat or .npz file; {path.name[:60]!r} is none.")
     if path.suffix.lower() == ".mat":
-        content = _matlab.load(path, *keys)
-        return [_matlab.numbers(content, key, path) for key in keys]
+        content = matlab.load(path, *keys)
+        return [matlab.numbers(content, key, path) for key in keys]
     arrays = npz_arrays(path, *keys)
     missing = [key for key in keys if key not in arrays]
     if missing:

@@ -110,13 +110,13 @@ def _recognise(file: Path, description: object) -> str:
         if candidate.recognises(file):
             return name
     if file.suffix.lower() == ".mat":
-        from jeit.data.formats import _matlab, eidors, kit4, ktc2023
+        from jeit.data.formats import eidors, kit4, ktc2023, matlab
 
         if description is not None or eidors.find_description(file) is not None:
             return "eidors"
         raise ValueError(
             f"{file.name} is a .mat file of no known kind; it holds "
-            f"{listed(sorted(_matlab.variable_names(file)))}. `jeit describe {file.name}` finds out what it can, and "
+            f"{listed(sorted(matlab.variable_names(file)))}. `jeit describe {file.name}` finds out what it can, and "
             f"writes a description. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; {eidors.DESCRIPTION}."
         )
     raise ValueError(

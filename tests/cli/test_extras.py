@@ -47,7 +47,7 @@ NEEDED = [
     ("touch watch", "learn", "presses.npz --skin tank.toml --gestures skin.jeit -o out"),
 ]
 NOTHING_NEEDED = {
-    *("calibrate-microphones", "choose", "demo", "info"),
+    *("calibrate-microphones", "choose", "demo", "describe", "info"),
     *("reconstruct", "series", "stream", "touch health", "view"),
 }
 

@@ -5,7 +5,7 @@ import pytest
 import scipy.io
 import scipy.sparse
 
-from jeit.data.formats import _matlab
+from jeit.data.formats import matlab
 
 RNG = np.random.default_rng(0)
 ARRAYS = {
@@ -28,8 +28,8 @@ def test_as_scipy_reads_them(tmp_path, options):
     held = {name: one for name, one in ARRAYS.items() if not (old and name in ("cube", "long", "signed", "flags"))}
     others = {} if old else {"text": "abc", "cell": np.array([1, "a"], object), "record": {"a": 1.0}}
     scipy.io.savemat(tmp_path / "a.mat", held | others, **options)
-    read = _matlab.load(tmp_path / "a.mat", *held, *others)
-    assert set(read[""]) == set(held | others) == _matlab.variable_names(tmp_path / "a.mat")
+    read = matlab.load(tmp_path / "a.mat", *held, *others)
+    assert set(read[""]) == set(held | others) == matlab.variable_names(tmp_path / "a.mat")
     assert set(read) - {""} == set(held)
     by_scipy = scipy.io.loadmat(tmp_path / "a.mat", spmatrix=False)
     for name, one in held.items():
@@ -43,6 +43,6 @@ def test_what_is_not_wanted_is_not_unpacked(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"a": np.ones((2, 2)), "b": np.zeros((3, 3))}, do_compression=True)
     whole = (tmp_path / "a.mat").read_bytes()
     (tmp_path / "a.mat").write_bytes(whole[:-8] + b"\xff" * 8)  # the end of b is no zlib stream any more
-    assert set(_matlab.load(tmp_path / "a.mat", "a")) == {"", "a"}
+    assert set(matlab.load(tmp_path / "a.mat", "a")) == {"", "a"}
     with pytest.raises(ValueError, match=r"not a readable \.mat file"):
-        _matlab.load(tmp_path / "a.mat", "b")
+        matlab.load(tmp_path / "a.mat", "b")

@@ -15,7 +15,7 @@ from readers import READERS
 
 from jeit.cli import main
 from jeit.cli.options import make_folder, remembering_files
-from jeit.data.formats import _matlab
+from jeit.data.formats import matlab
 from jeit.files import check_archive, read_toml
 from jeit.layout import read_layout
 from jeit.mesh import read as read_mesh
@@ -209,7 +209,7 @@ def test_indices_beyond_a_sparse_matrix(tmp_path):
     assert rows in sound
     (tmp_path / "a.mat").write_bytes(sound.replace(rows, struct.pack("<3i", 0, 1, 10**9), 1))
     with pytest.raises(ValueError, match="readable"):
-        _matlab.load(tmp_path / "a.mat", "a")
+        matlab.load(tmp_path / "a.mat", "a")
 
 
 @pytest.mark.parametrize("text", ["[/]", "[bold", "[link=x]", "a\x1b[31mb"])

@@ -15,7 +15,7 @@ import numpy as np
 
 from jeit.arguments import listed
 from jeit.data.description import Description, load_description, parse_description
-from jeit.data.formats import _matlab
+from jeit.data.formats import matlab
 from jeit.data.formats.frames import frames_in_table
 from jeit.data.formats.table import channel_counts, description_like, measurement_in
 from jeit.data.measured_patterns import frames_of
@@ -31,7 +31,7 @@ OBJECT_NAMES = ("v_i", "vi")
 
 def recognises(path: Path) -> bool:
     """True for a .mat file that holds stimulation and measurement patterns."""
-    return path.suffix.lower() == ".mat" and set(PATTERN) <= _matlab.variable_names(path)
+    return path.suffix.lower() == ".mat" and set(PATTERN) <= matlab.variable_names(path)
 
 
 def find_description(path: Path) -> Path | None:
@@ -60,13 +60,13 @@ def read(
     else:
         described = parse_description({}, path.name) if which is None else load_description(which)
     described = described if key is None else replace(described, layout=replace(described.layout, keys=(key,)))
-    own = {} if described.protocol_section is not None or (which is None and like) else _matlab.load(path, *PATTERN)
+    own = {} if described.protocol_section is not None or (which is None and like) else matlab.load(path, *PATTERN)
     protocols = described.protocols(path) or ([(_own_protocol(own, path), "")] if own else [])
     if not protocols and like is not None:
         protocols = [(like.protocol, "")]
-    keys, names, said = _keys(_matlab.shapes(path), described, channel_counts(protocols), path)
-    content = _matlab.load(path, *keys)
-    vectors = [_matlab.numbers(content, key, path) for key in keys]
+    keys, names, said = _keys(matlab.shapes(path), described, channel_counts(protocols), path)
+    content = matlab.load(path, *keys)
+    vectors = [matlab.numbers(content, key, path) for key in keys]
     if vectors[0].ndim == 3 or described.patterns_measured:
         if len(vectors) > 1:
             raise ValueError(f"{path.name}: [data] keys names {len(vectors)} arrays; give one, of all frames.")
@@ -126,7 +126,7 @@ def _own_protocol(content: dict, path: Path) -> Protocol:
             "description gives a [protocol]. Save stim (L, S), meas (M, L) and meas_stim (M) with the data, "
             "or write a description."
         )
-    stim, meas, index = (_matlab.numbers(content, key, path) for key in PATTERN)
+    stim, meas, index = (matlab.numbers(content, key, path) for key in PATTERN)
     index = index.ravel()
     if np.any(index != np.round(index)):
         raise ValueError(f"{path.name}: meas_stim must hold whole numbers, the drive of each measurement, from 1.")

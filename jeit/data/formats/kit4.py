@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jeit.data.formats import _matlab
+from jeit.data.formats import matlab
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.electrodes import BoundaryElectrodes
@@ -22,7 +22,7 @@ CONTACT_IMPEDANCE = 0.08
 def recognises(path: Path) -> bool:
     """True for a .mat file with the three variables of the archive."""
     names = {"Uel", "CurrentPattern", "MeasPattern"}
-    return path.suffix.lower() == ".mat" and names <= _matlab.variable_names(path)
+    return path.suffix.lower() == ".mat" and names <= matlab.variable_names(path)
 
 
 def read(path: Path) -> Measurement:
@@ -35,8 +35,8 @@ def read(path: Path) -> Measurement:
     Raises `ValueError` for a file of another shape.
     """
     keys = "Uel", "CurrentPattern", "MeasPattern"
-    content = _matlab.load(path, *keys)
-    voltages, current, difference = (_matlab.numbers(content, key, path) for key in keys)
+    content = matlab.load(path, *keys)
+    voltages, current, difference = (matlab.numbers(content, key, path) for key in keys)
     electrodes, drives = current.shape
     if difference.shape[0] != electrodes or voltages.shape != (difference.shape[1], drives):
         raise ValueError(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.data.formats import _matlab
+from jeit.data.formats import matlab
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.electrodes import BoundaryElectrodes
@@ -25,7 +25,7 @@ def recognises(path: Path) -> bool:
     """True for a .mat file with the variables of the challenge."""
     if path.suffix.lower() != ".mat":
         return False
-    names = _matlab.variable_names(path)
+    names = matlab.variable_names(path)
     return "Mpat" in names and ({"Inj", "Uel"} <= names or {"Injref", "Uelref"} <= names)
 
 
@@ -38,10 +38,10 @@ def read(path: Path) -> Measurement:
 
     Raises `ValueError` for a file of another shape.
     """
-    suffix = "" if "Inj" in _matlab.variable_names(path) else "ref"
+    suffix = "" if "Inj" in matlab.variable_names(path) else "ref"
     keys = f"Inj{suffix}", f"Uel{suffix}", "Mpat"
-    content = _matlab.load(path, *keys)
-    current, voltages, difference = (_matlab.numbers(content, key, path) for key in keys)
+    content = matlab.load(path, *keys)
+    current, voltages, difference = (matlab.numbers(content, key, path) for key in keys)
     electrodes, drives = current.shape
     channels = drives * difference.shape[1]
     if difference.shape[0] != electrodes or voltages.size != channels:

@@ -131,6 +131,19 @@ def measurement_in(
     return replace(measurement, times=found.times[:: 2 if layout.complex_pairs else 1])
 
 
+def _without_gains(frames: np.ndarray, protocol: Protocol, described: Description) -> np.ndarray:
+    """Frames divided by the gains of their measurement patterns. Raises `ValueError` for another number of these."""
+    gains, number = np.array(described.layout.gains), len(protocol.measurement)
+    if gains.size not in (0, number):
+        raise ValueError(
+            f"{described.origin}: [data] gains must be one for each of the {number} measurement patterns of "
+            f"'{protocol.name}'; they are {gains.size}."
+        )
+    if not gains.size or frames.shape[-1] != protocol.num_measurements:
+        return frames
+    return frames / gains[np.asarray(protocol.measurement_index)]
+
+
 def description_like(like: Measurement) -> Description:
     """Description that consists of the properties of another measurement of the same sensor, without its protocol and
     frame names."""
@@ -163,7 +176,7 @@ def measurement_from(
         raise ValueError(
             f'{described.origin}: no protocol: add a [protocol] section with kind = "adjacent" or another.'
         )
-    notes = described.notes
+    notes, frames = described.notes, _without_gains(frames, protocol, described)
     if described.mean_removed and frames.shape[-1] == protocol.num_measurements:
         frames, mean = less_their_mean(np.atleast_2d(frames), protocol.num_electrodes)
         said = f"the potentials had a mean, {mean * described.layout.scale:.3g} V at most; it is subtracted."

@@ -105,3 +105,27 @@ def _signs(measurement: Measurement) -> Float[np.ndarray, " M"] | None:
         if len(height) and np.ptp(height) < 1e-9:
             order = np.arange(len(height))
     return None if order is None else expected_signs(measurement.protocol, order)
+
+
+def channel_gains(measurement: Measurement) -> tuple[Float[np.ndarray, " K"] | None, float | None]:
+    """Gains of the measurement patterns, with a geometric mean of 1, for which the first frame obeys reciprocity best,
+    and the reciprocity error that is left; None if reciprocity does not determine them."""
+    protocol, values = measurement.protocol, np.asarray(measurement.voltages)[0]
+    pairs, ratio = protocol.reciprocal_pairs()
+    used = np.asarray(measurement.mask)[0] & (values != 0)
+    pairs, ratio = pairs[used[pairs].all(axis=1)], ratio[used[pairs].all(axis=1)]
+    read, number = np.asarray(protocol.measurement_index), len(protocol.measurement)
+    if len(pairs) < number:
+        return None, None
+    # log |v_b / (r v_a)| is the difference of the logarithms of the two gains.
+    first, second = pairs.T
+    apart = np.log(np.abs(values[second] / (ratio * values[first])))
+    rows = np.zeros((len(pairs), number))
+    rows[np.arange(len(pairs)), read[second]] += 1
+    rows[np.arange(len(pairs)), read[first]] -= 1
+    if np.linalg.matrix_rank(rows) < number - 1:
+        return None, None
+    weight = np.sqrt(np.abs(values[first] * values[second]))[:, None]
+    gains = np.exp(np.linalg.lstsq(weight * rows, weight[:, 0] * apart, rcond=None)[0])
+    left = reciprocity_error(replace(measurement, voltages=np.asarray(measurement.voltages) / gains[read]))
+    return gains, left

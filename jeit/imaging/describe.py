@@ -1,0 +1,348 @@
+"""Description of a file of voltages that nobody has described: what it may be, with the evidence.
+
+Protocols of common kinds whose number of channels fits the file are compared: by reciprocity, which needs no model, and
+by the misfit of a uniform body of the given shape (`jeit.imaging.wiring`), in a frame of the empty body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jeit.arguments import counted, did_you_mean, listed, percent
+from jeit.data import Measurement
+from jeit.data.description import Description, parse_description
+from jeit.data.formats import matlab
+from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text
+from jeit.data.formats.table import measurement_in
+from jeit.data.formats.text import read_text
+from jeit.data.formats.unstated import channel_gains
+from jeit.data.quality import reciprocity_error
+from jeit.electrodes.body_mesh import body_mesh
+from jeit.files import npy_array, npz_arrays
+from jeit.forward import ForwardModel
+from jeit.imaging.wiring import Wiring, find_wiring
+from jeit.protocol import Protocol
+
+# Most electrodes that a protocol is looked for; nodes of the mesh on which they are compared, of a sheet and a solid.
+_MOST, _NODES = 64, {2: 700, 3: 4000}
+# Unexplained share of the empty body above which an explanation is not good enough to go on.
+_HOPELESS = 0.5
+# Candidates whose misfit is computed, and how much more than the best an explanation must leave to be ruled out.
+_FEW, _UNDECIDED, _SMALL = 12, 1.3, 0.01
+# Reciprocity error from which gains are estimated, and ratio of the error that they may leave to it.
+_ACCURATE, _GAINED = 0.03, 0.4
+# Contact impedance that a description starts from, times conductivity over the size of the body.
+_CONTACT = 0.01
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What a file may be. **Fields**: `protocol`: the table `[protocol]` of a description, without the current;
+    `frames`: number of frames; `spread`: deviation of the frames of the empty body from their mean, relative;
+    `reciprocity`: error of the mean, None if no two channels are reciprocal; `measurement`: the mean, so read;
+    `wiring`: how a uniform body explains it; `gains`: of its measurement patterns, where these explain what breaks
+    reciprocity."""
+
+    protocol: dict[str, Any]
+    frames: int
+    spread: float
+    reciprocity: float | None
+    measurement: Measurement
+    wiring: Wiring | None = None
+    gains: np.ndarray | None = None
+
+    @property
+    def misfit(self) -> float:
+        """Relative misfit of a uniform body to the mean; infinite if it was not computed."""
+        if self.wiring is None:
+            return np.inf
+        return self.wiring.misfit if self.reversed_signs else self.wiring.described
+
+    @property
+    def reversed_signs(self) -> bool:
+        """Whether a uniform body explains the voltages with the opposite sign, and as they are otherwise."""
+        return self.wiring is not None and self.wiring == Wiring(tuple(range(len(self.wiring.places))), "", True)
+
+    @property
+    def unexplained(self) -> float:
+        """What the explanation leaves of all frames, relative: misfit and spread, and the reciprocity error, which has
+        twice the variance of its noise."""
+        return float(np.sqrt(self.misfit**2 + self.spread**2 + (self.reciprocity or 0) ** 2 / 2))
+
+    @property
+    def name(self) -> str:
+        """The protocol in words."""
+        options = {key: value for key, value in self.protocol.items() if key not in ("kind", "number")}
+        said = ", ".join(f"{key} {str(value).lower()}" for key, value in options.items())
+        return f"{self.protocol['kind']}, {self.protocol['number']} electrodes{said and ', ' + said}"
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found out of a file. **Fields**: `candidates`: the best first; `undecided`: others that explain it as
+    well; `text`: a commented description, TOML, of the best."""
+
+    candidates: tuple[Candidate, ...]
+    undecided: tuple[Candidate, ...]
+    text: str
+
+    @property
+    def fault(self) -> str:
+        """Why the best explanation is not good enough to go on; empty if it is."""
+        best = self.candidates[0]
+        if best.unexplained < _HOPELESS:
+            return ""
+        broken = "" if best.reciprocity is None else f" and breaks reciprocity by {percent(best.reciprocity)}"
+        wired = best.wiring.explanation if best.wiring is not None else ""
+        return (
+            f"the best explanation, {best.name}, misses {percent(best.misfit)} of the empty body{broken}: that is not "
+            f"good enough to go on. {wired or 'Are body and electrodes as given? Name the protocol if you know it.'}"
+        )
+
+
+def find_description(
+    path: Path,
+    geometry: dict[str, Any],
+    electrodes: dict[str, Any],
+    *,
+    reference: Path | None = None,
+    keys: tuple[str | None, str | None] = (None, None),
+    known: dict[str, Any] | None = None,
+    current: float = 1e-3,
+    progress: Callable[[str], None] = lambda step: None,
+) -> Findings:
+    """Find out what a file of voltages may be.
+
+    `geometry`, `electrodes`: tables of a description, metres, the second without the number of electrodes; `reference`:
+    file of the empty body; `keys`: arrays of the file and of the reference, where files hold several; `known`: what is
+    known of `[protocol]`, such as its kind or number; `current`: amperes. Raises `ValueError` for files that cannot be
+    read, several arrays and none named, and if no protocol fits.
+    """
+    progress("read")
+    numbers = _Numbers.read(path, keys[0], other=keys[1] if reference is None else None)
+    rest = numbers if reference is None and keys[1] is None else _Numbers.read(reference or path, keys[1])
+    progress("protocols that fit")
+    found = list(_fitting(numbers, rest, geometry, electrodes, known or {}, current))
+    if not found:
+        raise ValueError(
+            f"{path.name}: no protocol of common kinds has as many channels as there are numbers: {numbers.shape}. "
+            "Write a description with your own [protocol], see docs/data.md."
+        )
+    found.sort(key=lambda one: np.hypot(one.spread, 0.3 if one.reciprocity is None else one.reciprocity))
+    progress("uniform body")
+    models: dict[int, ForwardModel] = {}
+    compared = [_with_misfit(one, models) for one in found[:_FEW]]
+    compared.sort(key=lambda one: (round(one.unexplained, 3), len(one.protocol)))
+    best = compared[0]
+    near = [one for one in compared[1:] if one.unexplained < _UNDECIDED * best.unexplained + _SMALL]
+    best = _with_gains(best, models)
+    compared[0] = best
+    contact = {"contact_impedance": _contact_impedance(best, models[best.protocol["number"]])}
+    tables = {"geometry": geometry, "electrodes": {**contact, **electrodes, "number": best.protocol["number"]}}
+    tables["protocol"] = {**best.protocol, "current": current}
+    return Findings((*compared, *found[_FEW:]), tuple(near), _text(path, numbers.shape, best, near, tables))
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """The numbers of a file: a function that arranges them in frames of one of several numbers of channels, and their
+    shape in words."""
+
+    path: Path
+    frames: Callable[[Sequence[int], Description], Frames]
+    shape: str
+    sizes: tuple[int, ...]
+
+    @classmethod
+    def read(cls, path: Path, key: str | None, other: str | None = None) -> _Numbers:
+        """Read a file; `key`: name of its array; `other`: array that is not the one."""
+        if path.suffix.lower() in (".mat", ".npz", ".npy"):
+            table, usual = _array(path, key, other)
+            said = " × ".join(map(str, table.shape))
+            sizes = tuple(sorted({*table.shape, table.size}, reverse=True))
+            return cls(path, lambda counts, d: frames_in_table(table, counts, d.layout, usual=usual), said, sizes)
+        text = read_text(path)
+        length, lines = int(text.lengths[0]), len(text.lengths)
+        total = len(text.values)
+        parts = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
+        sizes = {length, length - 1, lines, *parts}
+        said = f"{counted(lines, 'line')} of {length}"
+        return cls(path, lambda counts, d: frames_in_text(text, counts, d.layout, path.name), said, tuple(sizes))
+
+
+def _array(path: Path, key: str | None, other: str | None) -> tuple[np.ndarray, str]:
+    """The array of frames in a file, and where its frames usually are."""
+    if path.suffix.lower() == ".npy":
+        return np.atleast_2d(npy_array(path)), "rows"
+    if path.suffix.lower() == ".mat":
+        held, usual = matlab.shapes(path), "columns"
+    else:
+        arrays = npz_arrays(path, *([key] if key else ["voltages"]))
+        held, usual = {one: np.shape(arrays[one]) if one in arrays else () for one in np.ravel(arrays[""])}, "rows"
+    name = key
+    if name is None:
+        long = [one for one, shape in held.items() if one != other and int(np.prod(shape)) > 3]
+        if len(long) != 1:
+            shown = listed([f"{one} ({' × '.join(map(str, held[one]))})" for one in long]) if long else "none"
+            raise ValueError(f"{path.name}: arrays of numbers are {shown}. Name that of the frames by key=.")
+        name = long[0]
+    if name not in held:
+        raise ValueError(f"key: {path.name} has no array {name!r}{did_you_mean(name, held)}; it has {listed(held)}.")
+    if path.suffix.lower() == ".npz":
+        return np.atleast_2d(npz_arrays(path, name)[name]), usual
+    table = matlab.numbers(matlab.load(path, name), name, path)
+    return table.reshape(-1, 1) if 1 in table.shape else table, usual
+
+
+_ORDERS = ("rotating", "fixed")
+
+
+def _protocols(number: int) -> Iterator[dict[str, Any]]:
+    """Tables of the protocols of common kinds of so many electrodes."""
+    plain = {"driven_electrodes": (False, True), "order": _ORDERS}
+    for kind, options in (
+        ("adjacent", {**plain, "reciprocal": ("all", "half")}),
+        ("two_terminal", {}),
+        ("opposite", {**plain, "drives": ("distinct", "all")}),
+        *(("skip", {"skipped": (skipped,), **plain}) for skipped in range(1, number // 2)),
+    ):
+        for values in product(*options.values()):
+            usual = {"driven_electrodes": False, "reciprocal": "all", "drives": "distinct"}
+            given = {key: value for key, value in zip(options, values, strict=True) if usual.get(key) != value}
+            yield {"kind": kind, "number": number, **given}
+
+
+def _fitting(
+    numbers: _Numbers, rest: _Numbers, geometry: dict, electrodes: dict, known: dict, current: float
+) -> Iterator[Candidate]:
+    """Candidates whose frames fit both files, without those that are the same in another order."""
+    counts, seen = set(numbers.sizes), set()
+    for number in [known["number"]] if "number" in known else range(4, _MOST + 1):
+        if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
+            continue
+        for table in _protocols(number):
+            if any(table.get(key, value) != value for key, value in known.items()):
+                continue
+            described = _described(geometry, electrodes, table, current)
+            protocol = _protocol(described, numbers.path)
+            if protocol is None or protocol.num_measurements not in counts:
+                continue
+            same = number, protocol.drive_index.tobytes(), protocol.channel_measurement.tobytes()
+            if same in seen:
+                continue
+            seen.add(same)
+            read = [_measured(one, described, protocol) for one in (numbers, rest)]
+            if read[0] is not None and read[1] is not None:
+                empty = read[1].mean_frame()
+                apart = np.asarray(read[1].filled()) - np.asarray(empty.filled())
+                spread = float(np.linalg.norm(apart) / np.linalg.norm(np.asarray(read[1].filled())))
+                yield Candidate(table, read[0].num_frames, spread, reciprocity_error(empty), empty)
+
+
+def _described(geometry: dict, electrodes: dict, protocol: dict, current: float) -> Description:
+    places = {"contact_impedance": 1.0, **electrodes, "number": protocol["number"]}
+    tables = {"geometry": geometry, "electrodes": places, "protocol": {**protocol, "current": current}}
+    return parse_description(tables, "the description")
+
+
+def _protocol(described: Description, path: Path) -> Protocol | None:
+    try:
+        return described.protocol(path)
+    except ValueError:  # none of its channels is left, or there are too few electrodes
+        return None
+
+
+def _measured(numbers: _Numbers, described: Description, protocol: Protocol) -> Measurement | None:
+    """The measurement of numbers that are of this protocol; None if they do not fit it."""
+    try:
+        found = numbers.frames([protocol.num_measurements], described)
+        if found.table.shape[1] != protocol.num_measurements:
+            return None
+        return measurement_in(numbers.path, described, found, [(protocol, "")])
+    except ValueError:
+        return None
+
+
+def _with_misfit(one: Candidate, models: dict[int, ForwardModel]) -> Candidate:
+    """The candidate with the wiring that explains the empty body best, on a mesh that candidates of as many electrodes
+    share."""
+    number, empty = one.protocol["number"], one.measurement
+    assert empty.domain is not None
+    assert empty.electrodes is not None
+    if number not in models:
+        mesh = body_mesh(empty.domain, empty.electrodes, _NODES[3 if hasattr(empty.domain, "thickness") else 2])
+        models[number] = ForwardModel(mesh, empty.electrodes, empty.protocol)
+    return replace(one, wiring=find_wiring(models[number].with_protocol(empty.protocol), empty))
+
+
+def _with_gains(one: Candidate, models: dict[int, ForwardModel]) -> Candidate:
+    """The candidate with gains of its measurements, if they explain most of what breaks reciprocity."""
+    if one.reciprocity is None or one.reciprocity < _ACCURATE:
+        return one
+    gains, left = channel_gains(one.measurement)
+    if gains is None or left is None or left > _GAINED * one.reciprocity:
+        return one
+    values = np.asarray(one.measurement.voltages) / gains[np.asarray(one.measurement.protocol.measurement_index)]
+    corrected = replace(one, measurement=replace(one.measurement, voltages=values), reciprocity=left, gains=gains)
+    return _with_misfit(corrected, models)
+
+
+def _contact_impedance(best: Candidate, model: ForwardModel) -> float:
+    """A contact impedance to begin with: a hundredth of the size of the body over the conductivity that explains the
+    empty body."""
+    size = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+    there = model.with_protocol(best.measurement.protocol)
+    if not there.electrodes.is_point:
+        there = there.with_electrodes(
+            there.electrodes.with_contact_impedance(np.full(best.protocol["number"], _CONTACT * size))
+        )
+    used = np.asarray(best.measurement.mask)[0]
+    expected, measured = np.asarray(there.voltages(1.0))[used], np.asarray(best.measurement.voltages)[0][used]
+    resistivity = abs(np.vdot(expected, measured)) / np.vdot(expected, expected).real
+    return float(f"{_CONTACT * size * resistivity:.2g}")
+
+
+def _text(path: Path, shape: str, best: Candidate, near: Sequence[Candidate], tables: dict[str, dict[str, Any]]) -> str:
+    """The description in TOML, with the evidence as comments."""
+    notes = [note for note in best.measurement.notes if not note.startswith("[protocol]")]
+    reversed_signs = best.reversed_signs or any("polarity" in note for note in notes)
+    broken = "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"
+    explained = best.wiring.explanation if best.wiring is not None and not best.reversed_signs else ""
+    lines = [
+        f"Written by `jeit describe {path.name}` ({shape} numbers). Lengths are in metres, currents in amperes.",
+        f"{best.name}: a uniform body misses {percent(best.misfit)} of the empty one; reciprocity: {broken}.",
+        *(f"It may as well be {one.name}: {percent(one.misfit)}." for one in near),
+        *notes,
+        *([explained] if explained else []),
+    ]
+    data: dict[str, Any] = {"polarity": "reversed"} if reversed_signs else {}
+    if best.gains is not None:
+        lines.append(f"Gains of the measurements differ by {percent(float(np.std(best.gains)))}, found by reciprocity.")
+        data["gains"] = [round(float(one), 4) for one in best.gains]
+    places = "No voltage says where electrode 1 is, nor which way round: taken at 12 o'clock, counter-clockwise."
+    scale = "The current, and the unit of voltages, scale conductivities alone."
+    parts = [
+        [f"# {line}" for line in lines],
+        _table("geometry", tables["geometry"]),
+        [f"# {places}", *_table("electrodes", tables["electrodes"])],
+        [f"# {scale}", *_table("protocol", tables["protocol"])],
+        *([_table("data", data)] if data else []),
+    ]
+    return "\n\n".join("\n".join(part) for part in parts) + "\n"
+
+
+def _table(name: str, values: dict[str, Any]) -> list[str]:
+    """Lines of a TOML table."""
+
+    def written(value: Any) -> str:
+        if isinstance(value, bool):
+            return str(value).lower()
+        return f'"{value}"' if isinstance(value, str) else repr(value)
+
+    return [f"[{name}]", *(f"{key} = {written(value)}" for key, value in values.items())]

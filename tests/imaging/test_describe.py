@@ -1,0 +1,130 @@
+"""Files that nobody has described: explained, or a question; never a description of something else."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.io
+
+from jeit import data
+from jeit.cli import main
+from jeit.data.description import parse_description
+from jeit.imaging.describe import find_description
+from jeit.mesh import centroids
+
+DISK = {"shape": "disk", "radius": 0.1}
+RING = {"layout": "ring", "width": 0.012}
+
+
+def simulated(protocol, number=8):
+    """Voltages (2, M) of a disk, empty and with a rod at (50, 0) mm, and the protocol that is described."""
+    tables = {
+        "geometry": DISK,
+        "electrodes": {**RING, "number": number, "contact_impedance": 3.0},
+        "protocol": {"current": 1e-3, **protocol},
+    }
+    model = parse_description(tables, "a.toml").model("a.csv", num_points=900)
+    away = np.asarray(centroids(model.mesh)) - [0.05, 0]
+    rod = np.where(np.linalg.norm(away, axis=1) < 0.025, 1e-5, 2e-3)
+    voltages = np.stack([model.voltages(2e-3), model.voltages(rod)])
+    return voltages * (1 + 1e-4 * np.random.default_rng(0).normal(size=voltages.shape)), model.protocol
+
+
+def saved(folder, voltages, separator=","):
+    paths = folder / "empty.csv", folder / "rod.csv"
+    for path, values in zip(paths, voltages, strict=True):
+        np.savetxt(path, values[None], delimiter=separator)
+    return paths
+
+
+KINDS = [
+    {"kind": "adjacent"},
+    {"kind": "adjacent", "order": "fixed"},
+    {"kind": "adjacent", "driven_electrodes": True, "order": "fixed"},
+    {"kind": "skip", "skipped": 1, "order": "fixed"},
+    {"kind": "two_terminal"},
+]
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_the_protocol_is_found(kind, tmp_path):
+    voltages, protocol = simulated(kind)
+    empty, rod = saved(tmp_path, voltages)
+    found = find_description(rod, DISK, RING, reference=empty)
+    assert not found.fault
+    assert not found.undecided
+    best = found.candidates[0]
+    assert best.measurement.protocol.same_patterns(protocol)
+    assert best.misfit < 0.05
+    (tmp_path / "description.toml").write_text(found.text, "utf-8")
+    np.testing.assert_allclose(np.asarray(data.read(rod).voltages)[0], voltages[1])
+
+
+def test_magnitudes_with_gains(tmp_path):
+    """As an instrument with a converter for each pair of electrodes records them."""
+    voltages, protocol = simulated(KINDS[2])
+    gains = np.exp(0.1 * np.random.default_rng(1).normal(size=8))
+    driven = (np.asarray(protocol.channel_drive) != 0) & (np.asarray(protocol.channel_measurement) != 0)
+    raw = 1e4 * np.abs(voltages) * gains[np.asarray(protocol.measurement_index)]
+    raw[:, driven.any(axis=1)] = 0
+    scipy.io.savemat(tmp_path / "a.mat", {"empty": raw[:1].T, "rod": raw[1:].T})
+    found = find_description(tmp_path / "a.mat", DISK, RING, keys=("rod", "empty"))
+    assert not found.fault
+    assert not found.undecided
+    estimated = found.candidates[0].gains
+    np.testing.assert_allclose(estimated / gains, np.mean(estimated / gains), rtol=2e-3)
+    (tmp_path / "description.toml").write_text(found.text, "utf-8")
+    read = data.read(tmp_path / "a.mat", key="rod")
+    inside = ~driven.any(axis=1)
+    ratio = np.asarray(read.voltages)[0, inside] / voltages[1, inside]
+    np.testing.assert_allclose(ratio, ratio.mean(), rtol=2e-3)
+    with pytest.raises(ValueError, match=r"arrays of numbers are empty \(64 × 1\), rod \(64 × 1\)"):
+        find_description(tmp_path / "a.mat", DISK, RING)
+    with pytest.raises(ValueError, match="has no array 'rad' \\(did you mean 'rod'"):
+        find_description(tmp_path / "a.mat", DISK, RING, keys=("rad", "empty"))
+
+
+def test_half_of_the_channels_leaves_the_order_open(tmp_path):
+    """Without reciprocal channels, and in a round body, both orders explain a frame nearly as well: a question."""
+    voltages, protocol = simulated({"kind": "adjacent", "reciprocal": "half", "order": "fixed"})
+    empty, rod = saved(tmp_path, voltages)
+    found = find_description(rod, DISK, RING, reference=empty)
+    same = [one for one in found.candidates if one.measurement.protocol.same_patterns(protocol)]
+    assert same[0] in (found.candidates[0], *found.undecided)
+
+
+def test_what_is_not_good_enough_is_named(tmp_path):
+    random = np.random.default_rng(0).normal(size=(2, 40))
+    empty, rod = saved(tmp_path, random)
+    found = find_description(rod, DISK, RING, reference=empty)
+    assert "not good enough to go on" in found.fault
+    with pytest.raises(ValueError, match=r"1 line of 1\. Write a description"):
+        find_description(saved(tmp_path, random[:, :1])[0], DISK, RING)
+
+
+def test_what_is_known_narrows_the_search(tmp_path):
+    voltages, _ = simulated(KINDS[0])
+    empty, rod = saved(tmp_path, voltages, " ")
+    found = find_description(rod, DISK, RING, reference=empty, known={"kind": "adjacent", "number": 8})
+    assert {one.protocol["kind"] for one in found.candidates} == {"adjacent"}
+    assert {replace(one.measurement).num_frames for one in found.candidates} == {1}
+
+
+def test_command(tmp_path, capsys, monkeypatch):
+    voltages, _ = simulated(KINDS[1])
+    empty, rod = saved(tmp_path, -voltages, "\t")
+    given = ["describe", str(rod), "--reference", str(empty), "--output", str(tmp_path / "out")]
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    assert main(given) == 1
+    assert "--shape: no file says it; give --shape disk:0.1" in capsys.readouterr().err
+    assert main([*given, "--shape", "disk:0.1,3", "--width", "0.012"]) == 1
+    assert "--shape: give one of disk:RADIUS" in capsys.readouterr().err
+    assert main([*given, "--shape", "disk:0.1", "--width", "0.012", "--electrodes", "8"]) == 0
+    said = capsys.readouterr().out
+    assert "adjacent, 8 electrodes, order fixed" in said
+    assert "resistive" in said
+    assert {"description.toml", "image.png", "report.json"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    assert 'polarity = "reversed"' in (tmp_path / "out" / "description.toml").read_text("utf-8")
+    assert main([*given, "--shape", "disk:0.1", "--width", "0.012"]) == 1
+    assert "exists already" in capsys.readouterr().err
