@@ -29,7 +29,8 @@ class ImageSeries:
     """Changes of conductivity over time.
 
     **Fields**: `mesh`; `changes`: (F, m) in S/m (2-D: S), a row of NaN for a frame without an image; `times`: (F,)
-    increasing times in seconds; `background`: the conductivity to which the changes are relative, in S/m (2-D: S).
+    increasing times in seconds; `background`: the conductivity to which the changes are relative, in S/m (2-D: S);
+    `timed`: False if `times` are the numbers of the frames instead.
 
     Raises `ValueError` if shapes disagree, if times do not increase, and if no frame has an image.
     """
@@ -38,6 +39,7 @@ class ImageSeries:
     changes: Real[np.ndarray, "F m"]
     times: Float[np.ndarray, " F"]
     background: float = float("nan")
+    timed: bool = True
 
     def __post_init__(self):
         changes, times = np.asarray(self.changes), np.asarray(self.times, float)
@@ -60,8 +62,15 @@ class ImageSeries:
 
     @property
     def frame_rate(self) -> float | None:
-        """Mean frame rate in frames per second; None for a single frame."""
-        return float((len(self.times) - 1) / (self.times[-1] - self.times[0])) if len(self.times) > 1 else None
+        """Mean frame rate in frames per second; None for a single frame, and if times are not known."""
+        if len(self.times) < 2 or not self.timed:
+            return None
+        return float((len(self.times) - 1) / (self.times[-1] - self.times[0]))
+
+    @property
+    def titles(self) -> list[str]:
+        """The time of each frame, or its number, as text."""
+        return [f"{time:.2f} s" if self.timed else f"frame {time:.0f}" for time in self.times]
 
     @property
     def unit(self) -> str:

@@ -65,7 +65,7 @@ def image_sequence(
     regions: Mapping[str, Callable[[Mesh], Bool[np.ndarray, " m"]]] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ImagedSequence:
-    """Image every frame of a measurement that has times, with one linear method and one λ.
+    """Image every frame of a measurement, with one linear method and one λ. Frames without times are numbered.
 
     - `reference`: the undisturbed body; default: the frame named "reference", or else the mean of all frames, so that
       images show changes relative to the average.
@@ -76,17 +76,14 @@ def image_sequence(
       are raised early.
 
     Channels missing in more than half of the frames are not used; frames that lack any other channel are refused. The
-    images need four bytes per cell and frame. Raises `ValueError` as `image_difference`, for a measurement without
-    times or with one frame, for an iterative method, and for images that would not fit in memory.
+    images need four bytes per cell and frame. Raises `ValueError` as `image_difference`, for a measurement with
+    one frame, for an iterative method, and for images that would not fit in memory.
     """
     check_measurement("measurement", measurement)
     check_real(measurement)
-    if measurement.times is None or measurement.num_frames < 2:
-        untimed = "" if measurement.times is not None else ", without times"
-        raise ValueError(
-            f"'{measurement.name}' has {measurement.num_frames} frames{untimed}; a series takes two at least, and "
-            "their times: give [data] frame_rate in a description."
-        )
+    if measurement.num_frames < 2:
+        raise ValueError(f"'{measurement.name}' has {measurement.num_frames} frame; a series takes two at least.")
+    times = np.arange(measurement.num_frames) if measurement.times is None else np.asarray(measurement.times)
     settings = as_settings(settings)
     if settings.method == AUTO:
         settings = replace(settings, method="one-step")
@@ -129,7 +126,7 @@ def image_sequence(
             difference = as_array(np.where(common, voltages[some] - expected, 0))
             changes[some] = np.asarray(found.image(difference))
     background = float(np.real(prepared.calibration.conductivity))
-    series = ImageSeries(prepared.mesh, changes, np.asarray(measurement.times), background)
+    series = ImageSeries(prepared.mesh, changes, times, background, timed=measurement.times is not None)
     return ImagedSequence(series, prepared, found, refused, chosen)
 
 

@@ -104,10 +104,10 @@ def write_series(
     - `regions`: cells (m,) of each region, by name; default: the whole body.
     - `oscillations`: oscillations of `found.series.changes`.
 
-    The table has the time in seconds and the mean change of each region, S/m (2-D: S), empty for refused frames. The
-    NPZ has `changes` (F, m), `times` (F,), `background`, `points`, `cells`, `functional` (m,), and, for k oscillations,
-    `frequency` (k,), `amplitude` (k, m) and `phase` (k, m) in radians. Raises `ValueError` for names that cannot be a
-    folder or a film.
+    The table has the time in seconds, or the number of the frame, and the mean change of each region, S/m (2-D: S),
+    empty for refused frames. The NPZ has `changes` (F, m), `times` (F,), `background`, `points`, `cells`, `functional`
+    (m,), and, for k oscillations, `frequency` (k,), `amplitude` (k, m) and `phase` (k, m) in radians. Raises
+    `ValueError` for names that cannot be a folder or a film.
     """
     series, model = found.series, found.prepared.model
     chosen = {"whole body": np.ones(series.mesh.num_cells, bool)} if not regions else dict(regions)
@@ -132,11 +132,10 @@ def write_series(
         )
         rows = zip(series.times, *curves.values(), strict=True)
         cells = ([f"{time:.9g}", *("" if np.isnan(one) else f"{one:.6g}" for one in row)] for time, *row in rows)
-        write_rows(made / "regions.csv", ("time_s", *curves), cells)
+        write_rows(made / "regions.csv", ("time_s" if series.timed else "frame", *curves), cells)
         write_json(report, made / "report.json")
         if film is not None:
-            titles = [f"{time:.2f} s" for time in series.times]
-            rate = series.frame_rate
+            titles, rate = series.titles, series.frame_rate
             write_film(made / film, series.mesh, series.changes, model.electrodes, titles=titles, rate=rate)
     return report
 

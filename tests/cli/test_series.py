@@ -61,6 +61,15 @@ def test_what_is_written(recording, tmp_path, capsys):
     assert "1.3 Hz (resolution 0.34 Hz)" in capsys.readouterr().out
 
 
+def test_frames_without_times_are_numbered(recording, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(recording)
+    given = ["--description", "untimed.toml", "--num-points", "250", "-o", str(tmp_path)]
+    assert main(["series", "frames.csv", *given]) == 0
+    assert "30 frames, 0 refused; no times are known (--rate gives them)" in capsys.readouterr().out
+    assert (tmp_path / "regions.csv").read_text().startswith("frame,whole body\n0,")
+    assert json.loads((tmp_path / "report.json").read_text())["frame_rate"] is None
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -70,7 +79,7 @@ def test_what_is_written(recording, tmp_path, capsys):
         (["--region", "ball:1,2,0.1"], "--region 'ball:1,2,0.1': the region is empty"),
         (["--region", "ball:-50,0,25"], "The body spans [-0.1, -0.1] to [0.1, 0.1], metres."),
         (["--region", "left"], "--region: 'left' is no shape and numbers"),
-        (["--description", "untimed.toml"], "without times"),
+        (["--description", "untimed.toml", "--frequency", "1"], "--frequency: 'frames' says no times; give --rate"),
         (["--rate", "-1"], "--rate must be positive"),
         (["--film", "film.txt"], "--film must be"),
     ],

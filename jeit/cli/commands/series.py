@@ -81,8 +81,8 @@ def series(
 ) -> None:
     """Image all frames of DATA against one reference, linearly and in one go, and describe what happens over time.
 
-    Writes series.png (the functional image, maps of amplitude and phase, curves and spectra of regions), series.npz,
-    regions.csv and report.json. Frame after frame as they come: jeit stream.
+    Writes series.png (frames, the functional image, maps of amplitude and phase, curves and spectra of regions),
+    series.npz, regions.csv and report.json. Frame after frame as they come: jeit stream.
 
     In Python: `jeit.imaging.image_sequence`, `jeit.image.oscillation`, `jeit.report.write_series`.
     """
@@ -115,6 +115,8 @@ def series(
         with naming_options({"rate": "--rate"}):
             measured = measured if rate is None else measured.at_rate(rate)
         with naming_options({"frequency": "--frequency"}):
+            if measured.times is None and bands:
+                raise ValueError(f"frequency: '{measured.name}' says no times; give --rate, in frames a second.")
             if measured.times is not None:
                 for one in bands:
                     oscillation(np.zeros((measured.num_frames, 1)), measured.times, one)
@@ -127,7 +129,9 @@ def series(
     if quiet:
         return
     frames, unit = counted(report["frames"], "frame"), report["unit"]
-    console.print(f"\n{frames}, {report['frame_rate']:.4g} a second, {report['refused']} refused")
+    rate_text = "" if report["frame_rate"] is None else f", {report['frame_rate']:.4g} a second"
+    untimed = "" if measured.times is not None else "; no times are known (--rate gives them), frames are numbered"
+    console.print(f"\n{frames}{rate_text}, {report['refused']} refused{untimed}")
     for one in report["oscillations"]:
         console.print(f"{one['frequency']:.4g} Hz (resolution {one['resolution']:.2g} Hz):")
         for name, part in one["regions"].items():

@@ -38,6 +38,8 @@ from jeit_solvers.engines import as_array
 _PIXELS, _GREY = 160, "#dfe2e6"
 SHEET_FRAMES = 12
 """Default of the maximum number of frames of a contact sheet."""
+SERIES_FRAMES, _BESIDE = 12, 6
+"""Number of frames at the beginning of the picture of a series."""
 # Maximum number of refused frames named below a contact sheet.
 _NAMED = 6
 
@@ -60,7 +62,7 @@ class FramePicture:
     """Picture of one frame at a time on `ax`; `show` replaces the image by the next one.
 
     `fitted`: colour scale of all frames; `number`: whether electrodes are numbered; `bar`: whether a scale bar is
-    drawn. Images are sampled on a raster, in a solid at half its height.
+    drawn. Images are sampled on a raster, in a solid at the `height` z in metres, half its own by default.
     """
 
     def __init__(
@@ -72,9 +74,10 @@ class FramePicture:
         *,
         number: bool = True,
         bar: bool = True,
+        height: float | None = None,
     ):
         self.ax, self.fitted = ax, fitted
-        self.raster = Raster.create(mesh, shape=(_PIXELS, _PIXELS))
+        self.raster = Raster.create(mesh, shape=(_PIXELS, _PIXELS), height=height)
         extent, inside = self.raster.extent, np.asarray(self.raster.cell) >= 0
         body = np.where(inside, 0.0, np.nan)
         ax.imshow(body, extent=extent, cmap=ListedColormap([_GREY]), interpolation="nearest", zorder=0)
@@ -184,36 +187,57 @@ def plot_series(
     *,
     height: float | None = None,
 ) -> Figure:
-    """Draw a series of images: the standard deviation over time; amplitude and phase of each oscillation; and the mean
-    change of every region over time, with its spectrum if there are enough frames.
+    """Draw a series of images: evenly spaced frames on one colour scale; the standard deviation over time; amplitude
+    and phase of each oscillation; and the mean change of every region over time, with its spectrum if there are enough
+    frames.
 
     The phase is drawn where the amplitude exceeds three times its noise and 15 % of the maximum. `regions`: (m,)
     booleans by name. `height`: z in metres of the slice through a 3-D mesh; default: half the height.
     """
     check_body(series.mesh, electrodes)
-    rows = max(len(oscillations), 1)
-    figure = Figure(figsize=(11.0, 3.4 * rows + 3.0), layout="constrained")
-    grid = figure.add_gridspec(rows + 1, 3, height_ratios=[1.0] * rows + [0.8])
+    rows = len(oscillations)
+    lines = -(-min(len(series.times), SERIES_FRAMES) // _BESIDE)
+    figure = Figure(figsize=(11.0, 2.2 * lines + 3.4 * rows + 3.4), layout="constrained")
+    sheet, others = figure.subfigures(2, 1, height_ratios=[2.2 * lines, 3.4 * rows + 3.4])
+    _draw_frames(sheet, series, electrodes, lines, height)
+    grid = others.add_gridspec(rows + 1, 3, height_ratios=[1.0] * (rows + 1))
     maps = _Maps(series, electrodes, height)
     functional = ", ".join(filter(None, ["functional image", slice_text(series.mesh, height)]))
     deviation = ColourScale(difference=False, quantity="Standard deviation over time")
-    maps.draw(figure.add_subplot(grid[0, 0]), series.functional(), deviation, functional)
+    maps.draw(others.add_subplot(grid[0, 0]), series.functional(), deviation, functional)
     for row, one in enumerate(oscillations):
         amplitude = ColourScale(difference=False, quantity=f"Amplitude at {one.frequency:.3g} Hz")
         said = f"{one.frequency:.4g} Hz (resolution {one.resolution:.2g} Hz)"
-        maps.draw(figure.add_subplot(grid[row, 1]), one.amplitude, amplitude, said)
+        maps.draw(others.add_subplot(grid[row, 1]), one.amplitude, amplitude, said)
         clear = (one.amplitude > _SHARE * one.amplitude.max()) & (one.amplitude > _NOISE * one.noise)
-        maps.draw_phase(figure.add_subplot(grid[row, 2]), np.where(clear, np.degrees(one.phase), np.nan))
+        maps.draw_phase(others.add_subplot(grid[row, 2]), np.where(clear, np.degrees(one.phase), np.nan))
     means = {name: series.mean_change(region) for name, region in regions.items()}
     largest = max((float(np.nanmax(np.abs(one))) for one in means.values()), default=0.0)
     factor, unit = prefixed(largest or 1.0, series.unit)
-    spectra = {name: _spectrum(factor * mean, series.times) for name, mean in means.items()}
+    spectra = {name: _spectrum(factor * mean, series.times) for name, mean in means.items()} if series.timed else {}
     drawn = {name: one for name, one in spectra.items() if one is not None}
-    below = grid[rows, :].subgridspec(1, 2, width_ratios=[1.6, 1.0])
-    _draw_curves(figure.add_subplot(below[0] if drawn else grid[rows, :]), means, series.times, factor, unit)
+    # Without oscillations, curves stand beside the functional image.
+    below = (grid[rows, :] if rows else grid[0, 1:]).subgridspec(1, 2, width_ratios=[1.6, 1.0])
+    place = below[0] if drawn else below[:]
+    _draw_curves(others.add_subplot(place), means, series, factor, unit)
     if drawn:
-        _draw_spectra(figure.add_subplot(below[1]), drawn, oscillations, unit)
+        _draw_spectra(others.add_subplot(below[1]), drawn, oscillations, unit)
     return figure
+
+
+def _draw_frames(
+    figure, series: ImageSeries, electrodes: AbstractElectrodes | None, lines: int, height: float | None
+) -> None:
+    """Draw evenly spaced frames in so many lines, on one colour scale."""
+    chosen, fitted = chosen_frames(len(series.times), SERIES_FRAMES), fit_scale(series.changes, series.mesh)
+    places = figure.add_gridspec(lines, _BESIDE + 1, width_ratios=[1] * _BESIDE + [0.05])
+    for place, frame in enumerate(chosen):
+        ax = figure.add_subplot(places[place // _BESIDE, place % _BESIDE])
+        picture = FramePicture(ax, series.mesh, electrodes, fitted, number=False, bar=place == 0, height=height)
+        picture.show(series.changes[frame], series.titles[frame])
+        if place == 0:
+            where = figure.add_subplot(places[:, -1])
+            draw_colour_bar(where, picture.drawn, fitted.label, signed=True, place=where)
 
 
 class _Maps:
@@ -256,11 +280,11 @@ def _spectrum(mean: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return (frequencies, amplitude) if len(frequencies) > 1 else None
 
 
-def _draw_curves(ax: Axes, means: Mapping[str, np.ndarray], times: np.ndarray, factor: float, unit: str) -> None:
+def _draw_curves(ax: Axes, means: Mapping[str, np.ndarray], series: ImageSeries, factor: float, unit: str) -> None:
     """Draw the mean change of each region over time."""
     for name, mean in means.items():
-        ax.plot(times, factor * mean, linewidth=1.2, label=name)
-    ax.set(xlabel="Time (s)", ylabel=f"Mean change ({unit})", title="regions over time")
+        ax.plot(series.times, factor * mean, linewidth=1.2, label=name)
+    ax.set(xlabel="Time (s)" if series.timed else "Frame", ylabel=f"Mean change ({unit})", title="regions over time")
     if means:
         ax.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=3)
     _softened(ax)
