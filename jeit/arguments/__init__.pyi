@@ -16,9 +16,11 @@ from .checks import (
     real_array,
     signed_percent,
 )
+from .shown import brief, picture
 
 __all__ = [
     "IN_MILLIMETRES",
+    "brief",
     "check_has_values",
     "check_key",
     "check_kind",
@@ -31,6 +33,7 @@ __all__ = [
     "is_number",
     "listed",
     "percent",
+    "picture",
     "readings",
     "real_array",
     "signed_percent",

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, counted, describe, did_you_mean, is_number
+from jeit.arguments import brief, check_kind, counted, describe, did_you_mean, is_number, picture
 from jeit.electrodes import AbstractElectrodes
 from jeit.inverse.placement import Uncertainty
 from jeit.mesh import Body, Mesh
@@ -106,6 +106,18 @@ class Measurement(eqx.Module):
             )
         if self.times is not None:
             _check_times(np.asarray(self.times), self.voltages.shape[0])
+
+    def __repr__(self) -> str:
+        return brief(
+            lambda: (
+                f"Measurement({self.name!r}: {self.num_frames} frames, {np.sum(~self.mask)} voltages masked,\n"
+                f"  {self.protocol!r}, {self.domain!r})"
+            ),
+            self,
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return picture(self)
 
     @property
     def num_frames(self) -> int:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import operator
+import types
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import equinox as eqx
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Inexact
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind
+from jeit.arguments import brief, check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward.system import System, check_conductivity, field_gradients
@@ -30,15 +31,52 @@ _BLOCK = 250_000
 _CELLS = 4000
 
 
+class _Bound(eqx.Module):
+    """A method of a model that `jax.jit` accepts: hashed by the identity of its model, as no array can be hashed."""
+
+    __func__: Callable[..., Any] = eqx.field(static=True)
+    __self__: eqx.Module
+
+    def __call__(self, *given: Any, **named: Any) -> Any:
+        return self.__func__(self.__self__, *given, **named)
+
+    @property
+    def __wrapped__(self) -> Any:  # what `help` and signatures show
+        return types.MethodType(self.__func__, self.__self__)
+
+    def __hash__(self) -> int:
+        return hash((self.__func__, id(self.__self__)))
+
+    def __eq__(self, other: object) -> Any:
+        return isinstance(other, _Bound) and self.__func__ is other.__func__ and self.__self__ is other.__self__
+
+
+class _Method:
+    def __init__(self, function: Callable[..., Any]):
+        self.function = function
+        self.__doc__ = function.__doc__
+
+    def __get__(self, model: eqx.Module | None, owner: type | None = None) -> Any:
+        return self.function if model is None else _Bound(self.function, model)
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compilable(function: Function) -> Function:
+    """Make a method of a model one that `jax.jit(model.method)` compiles; the model's arrays are constants then."""
+    return cast(Function, _Method(function))
+
+
 class ForwardModel(eqx.Module):
     """Electrode voltages of a body of given conductivity: ∇·(σ∇u) = 0 with the complete (or point) electrode model.
 
     Every method takes a conductivity: a scalar, one value per cell (m,), one per node (n,), or symmetric tensors (m, d,
     d), in siemens per metre (2-D: sheet conductivity in siemens); complex values are admittivities. A conductivity of
     another shape, or one that is not positive or not finite, raises `ValueError`. A method called directly runs at
-    once, in NumPy. Inside `jax.jit`, `jax.vmap` or a derivative it is compiled once, and is two to four times as fast
-    afterwards. All methods are differentiable with respect to the conductivity and every field of the model
-    (`model.electrodes.position`, `.contact_impedance`, `model.mesh.points`, …).
+    once, in NumPy. Inside `jax.jit`, as in `jax.jit(model.voltages)`, `jax.vmap` or a derivative it is compiled once,
+    and is two to four times as fast afterwards. All methods are differentiable with respect to the conductivity and
+    every field of the model (`model.electrodes.position`, `.contact_impedance`, `model.mesh.points`, …).
 
     **Fields**: `mesh`, `electrodes`, `protocol`; `system`: sparsity pattern and linear solver; `at_once`: whether
     methods run in NumPy where possible.
@@ -71,6 +109,15 @@ class ForwardModel(eqx.Module):
         # user chose.
         self.at_once = isinstance(solver, str) and solver == "auto" and isinstance(self.system.solver, SparseCholesky)
 
+    def __repr__(self) -> str:
+        return brief(
+            lambda: (
+                f"ForwardModel({self.mesh!r},\n  {type(self.electrodes).__name__}, {self.protocol!r}, "
+                f"{type(self.system.solver).__name__})"
+            ),
+            self,
+        )
+
     def with_electrodes(self, electrodes: AbstractElectrodes) -> "ForwardModel":
         """The same model with other electrodes of the same kind and number; works under jit. Raises `ValueError` for
         electrodes of another kind or number, and for electrodes that do not fit the mesh."""
@@ -87,6 +134,7 @@ class ForwardModel(eqx.Module):
         _check(self.mesh, self.electrodes, protocol)
         return eqx.tree_at(lambda model: model.protocol, self, protocol)
 
+    @compilable
     def voltages(self, conductivity: ArrayLike) -> Inexact[Array, " M"]:
         """Voltages (M,) of the protocol's channels, in volts.
 
@@ -94,6 +142,7 @@ class ForwardModel(eqx.Module):
         """
         return evaluate(self, voltages_of, check_conductivity(self.mesh, conductivity))
 
+    @compilable
     def transfer_impedance(self, conductivity: ArrayLike) -> Inexact[Array, "L L"]:
         """Transfer impedance Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
 
@@ -101,6 +150,7 @@ class ForwardModel(eqx.Module):
         """
         return evaluate(self, transfer_impedance_of, check_conductivity(self.mesh, conductivity))
 
+    @compilable
     def fields(self, conductivity: ArrayLike) -> tuple[Inexact[Array, "n L"], Inexact[Array, "L L"]]:
         """Potentials F (n, L) of the nodes, in ohms, for a unit current into each electrode that leaves through all
         electrodes in equal parts; and the transfer impedance Z (L, L).
@@ -109,6 +159,7 @@ class ForwardModel(eqx.Module):
         """
         return evaluate(self, fields_of, check_conductivity(self.mesh, conductivity))
 
+    @compilable
     def potentials(self, conductivity: ArrayLike) -> Inexact[Array, "S n"]:
         """Potentials (S, n) at the nodes for every drive pattern, in volts; the mean over the electrodes is zero.
 
@@ -116,6 +167,7 @@ class ForwardModel(eqx.Module):
         """
         return evaluate(self, potentials_of, check_conductivity(self.mesh, conductivity))
 
+    @compilable
     def jacobian(self, conductivity: ArrayLike) -> Inexact[Array, "M m"]:
         """Jacobian ∂(voltage)/∂(conductivity), in volts per siemens per metre (2-D: volts per siemens).
 
@@ -124,6 +176,7 @@ class ForwardModel(eqx.Module):
         """
         return self.voltages_and_jacobian(conductivity)[1]
 
+    @compilable
     def voltages_and_jacobian(self, conductivity: ArrayLike) -> tuple[Inexact[Array, " M"], Inexact[Array, "M m"]]:
         """The results of `voltages` and `jacobian` from a single factorisation and one solve per electrode.
 

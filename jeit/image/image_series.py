@@ -20,7 +20,7 @@ import scipy.optimize
 from jaxtyping import Bool, Float, Real
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_name, describe, is_number
+from jeit.arguments import brief, check_name, describe, is_number, picture
 from jeit.mesh import Mesh, measures
 
 
@@ -54,6 +54,15 @@ class ImageSeries:
         object.__setattr__(self, "times", times)
         if not self.imaged.any():
             raise ValueError("changes: no frame has an image.")
+
+    def __repr__(self) -> str:
+        return brief(
+            lambda: f"ImageSeries({len(self.times)} frames, {self.mesh!r})",
+            self,
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return picture(self)
 
     @property
     def imaged(self) -> Bool[np.ndarray, " F"]:

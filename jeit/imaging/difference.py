@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Array, Float, Inexact, UInt8
 
-from jeit.arguments import percent
+from jeit.arguments import brief, percent, picture
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
 from jeit.electrodes import AbstractElectrodes
@@ -25,10 +25,10 @@ from jeit.imaging.method import AUTO, METHODS, Asked, ImagingSettings, as_settin
 from jeit.imaging.preparation import Clock, prepare_difference, threads_for
 from jeit.imaging.wiring import Wiring
 from jeit.inverse.calibration import Calibration
-from jeit.inverse.image_noise import image_noise
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import KINDS, Ellipsoid, ShapeReconstruction, Star
+from jeit.inverse.uncertainty import image_noise
 from jeit.mesh import Mesh
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array
@@ -85,6 +85,20 @@ class ImagedDifference:
     timings: dict[str, float] = field(default_factory=dict)
     frame: int = 0
     num_frames: int = 1
+
+    def __repr__(self) -> str:
+        return brief(
+            lambda: (
+                f"ImagedDifference({self.measurement.name!r}, by {self.settings.method}: "
+                f"{len(self.inclusions)} inclusions in {self.mesh.num_cells} cells,\n"
+                f"  background {complex(self.calibration.conductivity).real:.3g}, "
+                f"misfit {percent(float(self.calibration.misfit))})"
+            ),
+            self,
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return picture(self)
 
     @property
     def lowest(self) -> float:

@@ -13,7 +13,7 @@ import optimistix as optx
 import scipy
 from jaxtyping import Array, Bool, Float, Inexact, Int
 
-from jeit.arguments import check_name
+from jeit.arguments import brief, check_name, percent
 from jeit.forward import ForwardModel
 from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import check_model, select_channels
@@ -136,6 +136,15 @@ class Calibration(eqx.Module):
     reason: str = eqx.field(static=True, default="")
     shift: Float[Array, "L a"] | None = None
     model_error: Any = None
+
+    def __repr__(self) -> str:
+        return brief(
+            lambda: (
+                f"Calibration({self.status}: conductivity {complex(self.conductivity).real:.3g}, "
+                f"misfit {percent(float(self.misfit))},\n  {type(self.model.electrodes).__name__}, {self.model.mesh!r})"
+            ),
+            self,
+        )
 
     @property
     def status(self) -> Status:

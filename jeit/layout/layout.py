@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jeit.arguments import brief, picture
 from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions
 from jeit.mesh import Domain
@@ -62,6 +63,15 @@ class Layout(eqx.Module):
     outline: Domain | None
     labels: tuple[str, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return brief(
+            lambda: f"Layout({self.name!r}: {len(self.centres)} electrodes)",
+            self,
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return picture(self)
 
     def __init__(
         self,

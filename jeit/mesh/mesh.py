@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
+from jeit.arguments import brief, picture
 from jeit.mesh import _checks, topology
 from jeit_solvers.engines import as_array, has_values
 
@@ -31,6 +32,18 @@ class Mesh(eqx.Module):
     cells: Int[Array, "m k"]
     facets: Int[Array, "b d"]
     tags: dict[str, Int[Array, " t"]]
+
+    def __repr__(self) -> str:
+        return brief(
+            lambda: (
+                f"Mesh({self.num_points} nodes, {self.num_cells} cells, {self.dimension}-D"
+                + (f", {len(self.tags)} groups of facets)" if self.tags else ")")
+            ),
+            self,
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return picture(self)
 
     @property
     def dimension(self) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import did_you_mean
+from jeit.arguments import brief, did_you_mean
 from jeit.protocol.reciprocity import reciprocal_channel_pairs
 from jeit_solvers.engines import as_array, either_engine, has_values
 
@@ -191,6 +191,15 @@ class Protocol(eqx.Module):
                 f"Protocol: drive_index has {self.drive_index.shape[0]} entries and measurement_index "
                 f"{self.measurement_index.shape[0]}. Both need one entry per channel."
             )
+
+    def __repr__(self) -> str:
+        return brief(
+            lambda: (
+                f"Protocol({self.name!r}: {self.num_electrodes} electrodes, {self.num_drives} drives, "
+                f"{self.num_measurements} channels)"
+            ),
+            self,
+        )
 
     @property
     def num_electrodes(self) -> int:

@@ -17,7 +17,7 @@ from jeit.imaging import ImagingSettings, automatic, preparation, prepare_differ
 from jeit.imaging.automatic import unsound
 from jeit.imaging.method import METHODS
 from jeit.inverse import Gaussian, calibrate, reconstruct
-from jeit.inverse.image_noise import image_noise
+from jeit.inverse.uncertainty import image_noise
 from jeit.layout import ring
 from jeit.mesh import Disk, centroids, cylinder
 from jeit.protocol import adjacent

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -10,9 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import check_kind, check_metres
+from jeit.arguments import IN_MILLIMETRES, brief, check_kind, check_metres, picture
 from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
-from jeit.design.skin.cell_size import check_cell_size, smallest_diameter
 from jeit.design.skin.indentation import AbstractIndentation, Bell
 from jeit.design.skin.protocol import skin_protocol
 from jeit.design.skin.reached_cells import touched_surface
@@ -25,9 +25,16 @@ from jeit.forward.system import check_conductivity
 from jeit.layout import Layout, SurfaceLayout
 from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.mesh import Domain, Mesh, Rectangle, layer, shell
+from jeit.mesh.generate.unstructured import MOST_POINTS
 from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
 from jeit_solvers.engines import host
+
+# Number of nodes of a plane mesh, multiplied by (cell size)² / area: 1.155 for equilateral cells, and slightly more due
+# to the nodes on the edge.
+_NODES = 1.2
+# Maximum cell size, relative to the smallest diameter of the electrodes.
+_COARSEST = 1.5
 
 # Maximum thickness of a layer of cells, relative to the depth of a touch: the uppermost centroids are at a quarter of
 # the thickness of their layer.
@@ -88,6 +95,15 @@ class Skin(eqx.Module):
         self.num_layers, self.cell_size = num_layers, cell_size
         checked = check_conductivity(model.mesh, conductivity)
         self.conductivity = jnp.asarray(conductivity, checked.dtype)
+
+    def __repr__(self) -> str:
+        return brief(
+            lambda: f"Skin({self.layout!r},\n  {self.model!r})",
+            self,
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return picture(self)
 
     @classmethod
     def create(
@@ -323,3 +339,35 @@ def _check_electrodes(layout: Layout, electrodes, mesh: Mesh, cell_size: float |
                 "give less."
             )
         raise ValueError(said) from None
+
+
+def check_cell_size(
+    name: str, cell_size: float, layout: Layout | SurfaceLayout, area: float, num_layers: int = 0
+) -> None:
+    """Raise `ValueError` if cells of size `cell_size` (metres) are too large for the electrodes of `layout`, or if
+    there would be too many cells.
+
+    `name`: name of the size in the error message; `area`: area of the skin, m²; `num_layers`: number of layers of
+    cells, 0 for a sheet.
+    """
+    check_metres(name, cell_size)
+    smallest = smallest_diameter(layout)
+    most = _COARSEST * smallest
+    if cell_size > (1 + 1e-9) * most:
+        end = f"; {IN_MILLIMETRES}" if cell_size**2 > area else "."
+        raise ValueError(
+            f"{name} is {1e3 * cell_size:g} mm; give no more than {1e3 * most:.3g} mm, as electrodes of "
+            f"'{layout.name}' are {1e3 * smallest:.3g} mm across{end}"
+        )
+    plane = _NODES * area * (num_layers + 1)
+    number = plane / cell_size**2
+    if number > MOST_POINTS:
+        least = 1.05e3 * math.sqrt(plane / MOST_POINTS)
+        raise ValueError(
+            f"{name} is {1e3 * cell_size:g} mm, which makes about {number:.2g} nodes; give {least:.2g} mm or more."
+        )
+
+
+def smallest_diameter(layout: Layout | SurfaceLayout) -> float:
+    """Smallest diameter of the electrodes, metres."""
+    return float(np.asarray(layout.diameters).min())

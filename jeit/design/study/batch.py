@@ -17,10 +17,9 @@ from jaxtyping import Array, Float
 from jeit.design.defaults import OPTIMALITY
 from jeit.design.scores import TouchPrior, layout_scores
 from jeit.design.sensitivity import SensitivityMap
-from jeit.design.skin.cell_size import smallest_diameter
 from jeit.design.skin.reached_cells import touched_surface
 from jeit.design.skin.sheet_touches import SheetTouches
-from jeit.design.skin.skin import Skin, model_conductivity
+from jeit.design.skin.skin import Skin, model_conductivity, smallest_diameter
 from jeit.design.skin.touch_grid import SurfaceGrid, TouchGrid, touch_grid
 from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.voltage_changes import touch_changes

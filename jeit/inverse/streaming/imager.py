@@ -18,7 +18,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import describe, is_number
+from jeit.arguments import brief, describe, is_number
 from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
@@ -98,6 +98,15 @@ class Imager(eqx.Module):
     tied: tuple[Int[Array, "P 2"], Float[Array, " P"]]
     solver: AbstractSolver
     persistence: float = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return brief(
+            lambda: (
+                f"Imager({type(self.solver).__name__}: {int(np.sum(self.mask))} of {len(self.mask)} channels,\n"
+                f"  {self.inversion.model!r})"
+            ),
+            self,
+        )
 
     @classmethod
     def create(

@@ -7,7 +7,7 @@ All images of a stream have one colour scale. A refused frame has no image; its 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -198,7 +198,8 @@ def plot_series(
     rows = len(oscillations)
     lines = -(-min(len(series.times), SERIES_FRAMES) // _BESIDE)
     figure = Figure(figsize=(11.0, 2.2 * lines + 3.4 * rows + 3.4), layout="constrained")
-    sheet, others = figure.subfigures(2, 1, height_ratios=[2.2 * lines, 3.4 * rows + 3.4])
+    parts: Any = figure.subfigures(2, 1, height_ratios=[2.2 * lines, 3.4 * rows + 3.4])
+    sheet, others = parts
     _draw_frames(sheet, series, electrodes, lines, height)
     grid = others.add_gridspec(rows + 1, 3, height_ratios=[1.0] * (rows + 1))
     maps = _Maps(series, electrodes, height)

@@ -1,0 +1,98 @@
+"""Pictures of objects in notebooks: images, meshes, layouts, measurements and series."""
+
+from __future__ import annotations
+
+import importlib
+import io
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jeit_solvers.engines import has_values
+
+# Dots per inch, and frames of a measurement that are drawn.
+_DPI, _FRAMES = 90, 12
+
+
+def picture(one: Any) -> bytes | None:
+    """PNG of an object; None for one of another kind, and inside `jax.jit` or a derivative."""
+    draw = _DRAWN.get(type(one).__name__)
+    if draw is None or not has_values(one):
+        return None
+    file = io.BytesIO()
+    draw(one).savefig(file, dpi=_DPI, format="png")
+    return file.getvalue()
+
+
+def _image(result: Any) -> Figure:
+    # The report of an image has the function that draws it.
+    return importlib.import_module("jeit.report.image").draw_image(result)
+
+
+def _mesh(mesh: Any) -> Figure:
+    if mesh.is_surface:
+        from jeit.plot.solid.shaded_surface import plot_surface
+
+        figure = Figure(figsize=(5.0, 4.6), layout="constrained")
+        plot_surface(np.asarray(mesh.points), np.asarray(mesh.cells), ax=figure.subplots())
+        return figure
+    from jeit.plot.imaging.image import plot_mesh
+
+    figure = Figure(figsize=(5.0, 4.6), layout="constrained")
+    title = f"{mesh.num_points:,} nodes, {mesh.num_cells:,} cells"
+    plot_mesh(mesh, title=title, ax=figure.subplots())
+    return figure
+
+
+def _layout(layout: Any) -> Figure:
+    from matplotlib.patches import Circle
+
+    from jeit.plot.axes import INK, SOFT, bare
+
+    figure = Figure(figsize=(5.0, 4.6), layout="constrained")
+    ax = figure.subplots()
+    centres, radii = np.asarray(layout.centres), np.asarray(layout.diameters) / 2
+    if layout.outline is not None:
+        for loop in layout.outline.loops():
+            ax.plot(*np.concatenate([loop, loop[:1]]).T, color=INK, linewidth=1)
+    for centre, radius, label in zip(centres, radii, layout.labels, strict=True):
+        ax.add_patch(Circle(tuple(centre), float(radius), facecolor="none", edgecolor=SOFT))
+        ax.annotate(label, tuple(centre), ha="center", va="center", fontsize=7)
+    x, y = np.asarray(ax.dataLim.intervalx), np.asarray(ax.dataLim.intervaly)
+    bare(ax, (x[0], x[1], y[0], y[1]), numbered=False)
+    ax.set_title(layout.name, fontsize=10)
+    return figure
+
+
+def _measurement(measurement: Any) -> Figure:
+    from jeit.plot.axes import prefixed
+
+    figure = Figure(figsize=(7.0, 3.2), layout="constrained")
+    ax = figure.subplots()
+    shown = np.unique(np.linspace(0, measurement.num_frames - 1, _FRAMES).round().astype(int))
+    values = np.where(measurement.mask, np.real(np.asarray(measurement.voltages)), np.nan)[shown]
+    factor, unit = prefixed(float(np.nanmax(np.abs(values))), "V")
+    ax.plot(factor * values.T, linewidth=0.8)
+    ax.set(xlabel="Channel", ylabel=f"Voltage ({unit})")
+    few = "" if len(shown) == measurement.num_frames else f"{len(shown)} of "
+    ax.set_title(f"{measurement.name}: {few}{measurement.num_frames} frames", fontsize=10)
+    ax.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _series(series: Any) -> Figure:
+    from jeit.plot.imaging.series import plot_frames
+
+    return plot_frames(series.mesh, series.changes, titles=series.titles)
+
+
+_DRAWN: dict[str, Callable[[Any], Figure]] = {
+    "ImagedDifference": _image,
+    "Mesh": _mesh,
+    "Layout": _layout,
+    "Measurement": _measurement,
+    "ImageSeries": _series,
+    "Skin": lambda skin: _layout(skin.layout),
+}
