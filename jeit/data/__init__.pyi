@@ -1,5 +1,5 @@
 from .description import load_description
-from .export import write_table
+from .exchange import from_eidors, from_pyeit, write_table
 from .gesture_set import FrameRecording, GestureSet, join, read_frame_recording
 from .imageable import check_imageable
 from .measurement import Measurement
@@ -17,6 +17,8 @@ __all__ = [
     "check_imageable",
     "driven_by",
     "estimate_noise",
+    "from_eidors",
+    "from_pyeit",
     "impossible_signs",
     "join",
     "load_description",

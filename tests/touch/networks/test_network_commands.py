@@ -9,7 +9,7 @@ from small_networks import SHAPE, SKIN
 
 from jeit.cli import main
 from jeit.data import Measurement, screen
-from jeit.data.export import write_table
+from jeit.data.exchange import write_table
 from jeit.protocol import adjacent
 from jeit.touch.simulate import Disc, Indent, relative_changes
 
