@@ -132,7 +132,7 @@ def read_file(
     """Read the measured file given as `option`, "DATA" or "--reference", which is named in error messages."""
     from jeit.data import read
 
-    with naming_options({"path": option, "key": "--key"}):
+    with naming_options({"path": option, "key": "--reference-key" if option == "--reference" else "--key"}):
         return read(path, format, description, like=like, key=key)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from jeit.arguments import listed
+from jeit.arguments import check_kind, listed
 from jeit.data.described_body import ELECTRODES
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.measurement import Measurement
@@ -140,14 +140,17 @@ def from_eidors(path: str | Path, variable: str | None = None) -> ForwardModel:
     Lengths are those of the file, in metres. Raises `ValueError` for files without a model, and for electrodes of no
     boundary facets.
     """
+    check_kind("path", path, (str, Path), "the name of a .mat file")
     file = Path(path)
-    check_memory(file.name, file.stat().st_size if file.is_file() else 0)
+    if not file.is_file():
+        raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
+    check_memory(file.name, file.stat().st_size)
     with read_as(f"{file.name} is not a readable .mat file of version 7 or less"):
         held = scipy.io.loadmat(str(file), simplify_cells=True, spmatrix=False)
     models = {name: found for name, one in held.items() if (found := _forward_model(one)) is not None}
     if variable is None and len(models) != 1:
-        named = listed(sorted(models)) if models else "none"
-        raise ValueError(f"variable: models in {file.name} are {named}; save a fwd_model, or name one.")
+        said = f"has the models {listed(sorted(models))}; name one" if models else "has no model; save a fwd_model"
+        raise ValueError(f"variable: {file.name} {said}.")
     name = next(iter(models)) if variable is None else variable
     if name not in models:
         raise ValueError(f"variable: {file.name} has no model {name!r}; it has {listed(sorted(models)) or 'none'}.")

@@ -15,6 +15,8 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Body, Mesh
 from jeit.protocol import Protocol
 
+# Columns beside voltages that a table may have by mistake.
+_COLUMNS = 4
 # Maximum plausible voltage on an electrode, in volts.
 _LARGEST = 1000.0
 
@@ -100,6 +102,8 @@ def _as_frames(voltages, protocol: Protocol, name: str) -> np.ndarray:
     channels = protocol.num_measurements
     if values.ndim != 2 or values.shape[0] == 0 or values.shape[1] != channels:
         hint = " It looks transposed: give one row per frame." if values.shape[0] == channels else ""
+        if values.ndim == 2 and 0 < (more := values.shape[1] - channels) <= _COLUMNS:
+            hint = f" There are {more} too many: are there times, counters or states among them? Leave them out."
         raise ValueError(
             f"{name}: the data have shape {values.shape}, but the protocol '{protocol.name}' has {channels} "
             f"channels, so (frames, {channels}) is needed.{hint} Otherwise choose the protocol that the data "

@@ -29,10 +29,14 @@ from jeit.forward import ForwardModel
 from jeit.imaging.wiring import Wiring, find_wiring
 from jeit.protocol import Protocol
 
-# Most electrodes that a protocol is looked for; nodes of the mesh on which they are compared, of a sheet and a solid.
-_MOST, _NODES = 64, {2: 700, 3: 4000}
+# Fewest and most electrodes of the protocols that are tried; nodes of the mesh on which these are compared, of a sheet
+# and a solid.
+_FEWEST, _MOST, _NODES = 4, 64, {2: 700, 3: 4000}
 # Unexplained share of the empty body above which an explanation is not good enough to go on.
 _HOPELESS = 0.5
+# Spread of the frames of the empty body above which they are none of one; channels needed for each electrode: a few fit
+# anything.
+_UNLIKE, _LEAST_CHANNELS = 0.2, 2
 # Candidates whose misfit is computed, and how much more than the best an explanation must leave to be ruled out.
 _FEW, _UNDECIDED, _SMALL = 12, 1.3, 0.01
 # Reciprocity error from which gains are estimated, and ratio of the error that they may leave to it.
@@ -96,8 +100,14 @@ class Findings:
     def fault(self) -> str:
         """Why the best explanation is not good enough to go on; empty if it is."""
         best = self.candidates[0]
-        if best.unexplained < _HOPELESS:
+        if best.unexplained < _HOPELESS and best.spread < _UNLIKE:
             return ""
+        if best.spread >= _UNLIKE:
+            return (
+                f"the best explanation, {best.name}, makes frames of the empty body differ by {percent(best.spread)}: "
+                "that is not good enough to go on. Are there columns of other things than voltages, or is the "
+                "reference one of another sensor? Name the protocol if you know it."
+            )
         broken = "" if best.reciprocity is None else f" and breaks reciprocity by {percent(best.reciprocity)}"
         wired = best.wiring.explanation if best.wiring is not None else ""
         return (
@@ -124,15 +134,21 @@ def find_description(
     known of `[protocol]`, such as its kind or number; `current`: amperes. Raises `ValueError` for files that cannot be
     read, several arrays and none named, and if no protocol fits.
     """
+    number = (known or {}).get("number")
+    if number is not None and not _FEWEST <= number <= _MOST:
+        raise ValueError(f"number must be from {_FEWEST} to {_MOST} electrodes; it is {number}.")
     progress("read")
     numbers = _Numbers.read(path, keys[0], other=keys[1] if reference is None else None)
     rest = numbers if reference is None and keys[1] is None else _Numbers.read(reference or path, keys[1])
     progress("protocols that fit")
     found = list(_fitting(numbers, rest, geometry, electrodes, known or {}, current))
     if not found:
+        counts = _channel_counts(geometry, electrodes, known or {}, current)
+        wanted = f" (of what is known: {listed(counts)})" if counts else ""
         raise ValueError(
-            f"{path.name}: no protocol of common kinds has as many channels as there are numbers: {numbers.shape}. "
-            "Write a description with your own [protocol], see docs/data.md."
+            f"{path.name}: no protocol of common kinds has as many channels{wanted} as there are numbers: "
+            f"{numbers.shape}. Are there columns of other things? Otherwise write a description with your own "
+            "[protocol], see docs/data.md."
         )
     found.sort(key=lambda one: np.hypot(one.spread, 0.3 if one.reciprocity is None else one.reciprocity))
     progress("uniform body")
@@ -167,6 +183,8 @@ class _Numbers:
             said = " × ".join(map(str, table.shape))
             sizes = tuple(sorted({*table.shape, table.size}, reverse=True))
             return cls(path, lambda counts, d: frames_in_table(table, counts, d.layout, usual=usual), said, sizes)
+        if key is not None:
+            raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
         text = read_text(path)
         length, lines = int(text.lengths[0]), len(text.lengths)
         total = len(text.values)
@@ -223,7 +241,7 @@ def _fitting(
 ) -> Iterator[Candidate]:
     """Candidates whose frames fit both files, without those that are the same in another order."""
     counts, seen = set(numbers.sizes), set()
-    for number in [known["number"]] if "number" in known else range(4, _MOST + 1):
+    for number in [known["number"]] if "number" in known else range(_FEWEST, _MOST + 1):
         if not any(number * (number - 4) / 4 <= count <= number**2 for count in counts):
             continue
         for table in _protocols(number):
@@ -232,6 +250,8 @@ def _fitting(
             described = _described(geometry, electrodes, table, current)
             protocol = _protocol(described, numbers.path)
             if protocol is None or protocol.num_measurements not in counts:
+                continue
+            if protocol.num_measurements < _LEAST_CHANNELS * number:
                 continue
             same = number, protocol.drive_index.tobytes(), protocol.channel_measurement.tobytes()
             if same in seen:
@@ -243,6 +263,14 @@ def _fitting(
                 apart = np.asarray(read[1].filled()) - np.asarray(empty.filled())
                 spread = float(np.linalg.norm(apart) / np.linalg.norm(np.asarray(read[1].filled())))
                 yield Candidate(table, read[0].num_frames, spread, reciprocity_error(empty), empty)
+
+
+def _channel_counts(geometry: dict, electrodes: dict, known: dict, current: float) -> list[int]:
+    """Numbers of channels of the protocols that agree with what is known, if the number of electrodes is."""
+    tables = _protocols(known["number"]) if "number" in known else ()
+    fitting = [one for one in tables if all(one.get(key, value) == value for key, value in known.items())]
+    made = [_protocol(_described(geometry, electrodes, one, current), Path("a")) for one in fitting]
+    return sorted({one.num_measurements for one in made if one is not None})
 
 
 def _described(geometry: dict, electrodes: dict, protocol: dict, current: float) -> Description:

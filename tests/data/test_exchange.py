@@ -42,7 +42,7 @@ def test_voltages_of_an_eidors_model(case, reference_folder, tmp_path):
 
 def test_files_that_hold_no_model(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"x": 1.0})
-    with pytest.raises(ValueError, match=r"variable: models in a\.mat are none; save a fwd_model"):
+    with pytest.raises(ValueError, match=r"variable: a\.mat has no model; save a fwd_model"):
         from_eidors(tmp_path / "a.mat")
     (tmp_path / "b.mat").write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"b\.mat is not a readable \.mat file"):

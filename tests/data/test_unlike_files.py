@@ -162,6 +162,35 @@ def test_a_last_line_that_is_cut_off_is_left_out(frames, tmp_path):
         assert any("cut off" in note for note in found.notes)
 
 
+def test_as_spreadsheets_write_it(frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    rows = [";".join(f'"{one:.9e}"'.replace(".", ",") for one in frame) for frame in values]
+    (tmp_path / "a.txt").write_text("\r\n".join(rows) + "\r\n", "utf-16")
+    np.testing.assert_allclose(read(tmp_path / "a.txt").voltages, values, rtol=1e-8)
+
+
+def test_whole_numbers_of_an_unknown_unit_are_no_times(frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    found = read(written(tmp_path / "a.csv", values, times=[1000, 1050, 1100]))
+    assert found.times is None
+    assert any("rises by 50; its unit is not known" in note for note in found.notes)
+
+
+def test_a_number_that_may_be_cut_off_is_noted(frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    path = written(tmp_path / "a.csv", values)
+    path.write_text(path.read_text("utf-8")[:-8])
+    assert any("is it cut off?" in note for note in read(path).notes)
+
+
+def test_a_column_too_many_and_an_array_of_no_file(frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    with pytest.raises(ValueError, match="There are 2 too many: are there times, counters or states"):
+        read(written(tmp_path / "a.csv", np.column_stack([values, np.ones((3, 2))])))
+    with pytest.raises(ValueError, match=r"key: a\.csv has no arrays"):
+        data.read(tmp_path / "a.csv", key="rod")
+
+
 SPOILED = {
     "a word among the numbers": lambda rows: [*rows[:1], rows[1].replace(",", ",abc,", 1), *rows[2:]],
     "a line that is short": lambda rows: [rows[0], rows[1].rsplit(",", 3)[0], rows[2]],

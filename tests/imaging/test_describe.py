@@ -99,8 +99,29 @@ def test_what_is_not_good_enough_is_named(tmp_path):
     empty, rod = saved(tmp_path, random)
     found = find_description(rod, DISK, RING, reference=empty)
     assert "not good enough to go on" in found.fault
-    with pytest.raises(ValueError, match=r"1 line of 1\. Write a description"):
+    with pytest.raises(ValueError, match=r"1 line of 1\. Are there columns of other things"):
         find_description(saved(tmp_path, random[:, :1])[0], DISK, RING)
+
+
+def test_a_column_of_something_else_is_not_explained_away(tmp_path):
+    """Frames of the empty body are alike; and a few channels are explained by anything."""
+    voltages, _ = simulated(KINDS[0])
+    for path, values in zip((tmp_path / "empty.csv", tmp_path / "rod.csv"), voltages, strict=True):
+        np.savetxt(path, np.tile(np.append(values, 0.01), (6, 1)), delimiter=",")
+    try:
+        fault = find_description(tmp_path / "rod.csv", DISK, RING, reference=tmp_path / "empty.csv").fault
+    except ValueError as error:
+        fault = str(error)
+    assert "columns of other things" in fault
+    with pytest.raises(ValueError, match=r"of what is known: 20, 36, 40, 64\) as there are numbers: 6 lines of 41"):
+        find_description(tmp_path / "rod.csv", DISK, RING, known={"kind": "adjacent", "number": 8})
+    np.savetxt(tmp_path / "wide.csv", np.random.default_rng(0).random((2, 3000)), delimiter=",")
+    with pytest.raises(ValueError, match="no protocol of common kinds"):
+        find_description(tmp_path / "wide.csv", DISK, RING)
+    with pytest.raises(ValueError, match="number must be from 4 to 64 electrodes; it is 3"):
+        find_description(tmp_path / "wide.csv", DISK, RING, known={"number": 3})
+    with pytest.raises(ValueError, match=r"key: wide\.csv has no arrays"):
+        find_description(tmp_path / "wide.csv", DISK, RING, keys=("a", None))
 
 
 def test_what_is_known_narrows_the_search(tmp_path):

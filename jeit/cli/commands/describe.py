@@ -83,7 +83,7 @@ def describe(
         raise ValueError(f"--output: {target} exists already; move it, or give another folder.")
     console = plain_console()
     given = {name: value for name, value in known.items() if value is not None}
-    with Steps(console, quiet=quiet) as step, naming_options({"key": "--key"}):
+    with Steps(console, quiet=quiet) as step, naming_options({"key": "--key", "number": "--electrodes"}):
         found = find_description(
             data,
             geometry,
@@ -94,9 +94,6 @@ def describe(
             current=current,
             progress=step,
         )
-        step("write")
-        with written_whole(target) as file:
-            file.write(found.text.encode())
     if not quiet:
         _show(console, data, found)
     if found.fault:
@@ -104,9 +101,11 @@ def describe(
     if found.undecided:
         others = "; ".join(one.name for one in found.undecided)
         raise ValueError(
-            f"undecided: {found.candidates[0].name}, or {others} explain the voltages as well. {target} has the first; "
-            "decide by --electrodes, --protocol or --order."
+            f"undecided: {found.candidates[0].name}, or {others} explain the voltages as well. Decide by --electrodes, "
+            "--protocol or --order."
         )
+    with written_whole(target) as file:
+        file.write(found.text.encode())
     if reference is None and reference_key is None:
         console.print(f"Written: {target}. Give --reference, a file of the empty body, to image it.")
         return

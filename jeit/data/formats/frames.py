@@ -12,6 +12,9 @@ from jeit.arguments import counted
 from jeit.data.description import TableLayout
 from jeit.data.formats.text import Text, rectangle
 
+# Whole numbers that rise by as much as this may be milliseconds as well as seconds.
+_STEP = 5
+
 
 class Frames(NamedTuple):
     """**Fields**: `table`: frames in rows; `times`: of the rows, seconds, if a column has them; `notes`: what was found
@@ -100,6 +103,9 @@ def _times(column: Float[np.ndarray, " F"], named: str) -> tuple[Float[np.ndarra
         return None, ""
     if (column == column[0] + np.arange(len(column))).all():
         return None, "the first number of each frame counts frames, and is left out."
+    if not named and (column == np.round(column)).all() and np.median(np.diff(column)) >= _STEP:
+        step = float(np.median(np.diff(column)))
+        return None, f"the first number of each frame rises by {step:g}; its unit is not known, and it is left out."
     unit = 1e-3 if "ms" in named.lower() else 1e-6 if "us" in named.lower() or "µs" in named.lower() else 1.0
     said = {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds"}[unit]
     return unit * column, f"the first number of each frame is taken for its time, in {said}."

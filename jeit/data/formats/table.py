@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.arguments import counted, listed
+from jeit.arguments import listed
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
 from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text
@@ -67,6 +67,8 @@ def read(
             f"beside it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one; "
             f"`jeit describe {path.name}` finds out what it can, and writes one."
         )
+    if key is not None and path.suffix.lower() != ".npz":
+        raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
     if key is not None:
         described = replace(described, layout=replace(described.layout, keys=(key,)))
     protocols = described.protocols(path) or ([] if like is None else [(like.protocol, "")])
@@ -117,13 +119,16 @@ def measurement_in(
         protocols = sorted(protocols, key=lambda one: not one[0].same_patterns(like.protocol))
     protocol, said = fitting_protocol(frames, protocols)
     described = replace(described, layout=layout, notes=(*notes, *said))
+    reason = ""
     if protocol is not None and frames.shape[-1] == protocol.num_measurements:
         unread = driven_zeros(frames, protocol)
         if unread.any():
             mask = ~unread if mask is None else np.asarray(mask) & ~unread
-            said = f"{counted(int(unread.sum()), 'channel')} of driven electrodes are zero in every frame."
-            described = replace(described, notes=(*described.notes, said))
+            reason = "they read driven electrodes, and are zero in every frame."
     measurement = measurement_from(path, described, frames, protocol, mask)
+    if reason:
+        notes = [note.replace("excluded by the mask given.", reason) for note in measurement.notes]
+        measurement = replace(measurement, notes=tuple(notes))
     if layout.polarity is None:
         measurement = with_signs(measurement, like)
     if found.times is None or layout.averaged or layout.frame_rate is not None:

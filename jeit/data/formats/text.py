@@ -50,7 +50,7 @@ class _Way(NamedTuple):
         line = _LABEL.sub("", line, count=1)
         if self.decimal_comma:
             line = line.replace(",", ".")
-        cells = [cell.strip() for cell in line.strip(" \r\n").split(self.delimiter)]
+        cells = [cell.strip(' \t"') for cell in line.strip(" \r\n").split(self.delimiter)]
         while cells and not cells[-1]:
             cells.pop()
         return cells
@@ -83,7 +83,7 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     way = _Way(_given(delimiter), False) if delimiter is not None else _way_of(lines)
     heading = 0 if skip_rows is not None else _heading(way, lines)
     values, lengths, label = array("d"), array("q"), ""
-    rest = islice(_content(path, skipped), heading, None)
+    rest, line, cells = islice(_content(path, skipped), heading, None), "\n", []
     for place, line in rest:
         cells = way.cells(line)
         try:
@@ -102,8 +102,10 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     notes = [f"numbers are separated by {way}."] if delimiter is None and way != _PLAIN else []
     notes += [f"the first {heading} line{'s are' if heading > 1 else ' is'} a heading, skipped."] if heading else []
     notes += [f"{label!r} stands before each line, and is left out."] if label else []
-    cells = tuple(way.cells(lines[heading - 1])) if heading else ()
-    return Text(np.array(values), np.array(lengths), cells, tuple(notes))
+    if not line.endswith("\n") and len(cells) > 1 and len(cells[-1]) < min(map(len, cells[:-1])):
+        notes.append(f"no line end follows the last number, {cells[-1][:20]}: is it cut off?")
+    named = tuple(way.cells(lines[heading - 1])) if heading else ()
+    return Text(np.array(values), np.array(lengths), named, tuple(notes))
 
 
 def rectangle(text: Text, name: str) -> Float[np.ndarray, "R C"]:
@@ -134,7 +136,8 @@ def _way_of(lines: Sequence[str]) -> _Way:
 def _has_decimal_commas(way: _Way, lines: Sequence[str]) -> bool:
     """Whether commas stand within numbers alone: in most cells that have one, between digits."""
     cells = [cell for line in lines for cell in _LABEL.sub("", line, count=1).split(way.delimiter) if "," in cell]
-    return bool(cells) and sum(bool(_DECIMAL_COMMA.fullmatch(cell.strip())) for cell in cells) > 0.9 * len(cells)
+    within = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell.strip(' \t\r\n"'))]
+    return len(within) > 0.9 * len(cells)
 
 
 def _heading(way: _Way, lines: Sequence[str]) -> int:
@@ -150,12 +153,14 @@ def _heading(way: _Way, lines: Sequence[str]) -> int:
 
 def _content(path: Path, skipped: int) -> Iterator[tuple[int, str]]:
     """Lines of a text file that are neither empty nor comments, with their numbers from 1, after those skipped."""
+    with path.open("rb") as file:
+        wide = file.read(2) in (b"\xff\xfe", b"\xfe\xff")  # as spreadsheets write "Unicode text"
     try:
-        with path.open(encoding="utf-8-sig") as file:
+        with path.open(encoding="utf-16" if wide else "utf-8-sig") as file:
             for number, line in enumerate(file, start=1):
                 if number > skipped and line.strip() and not line.lstrip().startswith(_COMMENTS):
                     yield number, line
-    except UnicodeDecodeError:
+    except UnicodeError:
         raise ValueError(f"{path.name} is not a text file. If it is a spreadsheet, export it as CSV.") from None
 
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Inexact
 
-from jeit.arguments import counted, percent
+from jeit.arguments import counted, percent, readings
 from jeit.data.measurement import Measurement
 from jeit.data.quality import boundary_order, expected_signs, reciprocity_error
 from jeit.mesh import Solid
@@ -50,7 +50,7 @@ def fitting_protocol(
 
 def _error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> float:
     """Reciprocity error of the mean frame; infinite if nothing is known of it."""
-    values = np.atleast_2d(frames)
+    values = readings(np.atleast_2d(frames))
     known = np.isfinite(values).all(axis=0)
     mean = np.where(known, np.where(np.isfinite(values), values, 0).mean(axis=0), 0)
     error = reciprocity_error(Measurement(mean[None], known[None], protocol)) if known.any() and mean.any() else None
