@@ -7,7 +7,7 @@ by the misfit of a uniform body of the given shape (`jeit.imaging.wiring`), in a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from jeit.protocol import Protocol
 # and a solid.
 _FEWEST, _MOST, _NODES = 4, 64, {2: 700, 3: 4000}
 # Unexplained share of the empty body above which an explanation is not good enough to go on.
-_HOPELESS = 0.5
+_HOPELESS = 0.25
 # Spread of the frames of the empty body above which they are none of one; channels needed for each electrode: a few fit
 # anything.
 _UNLIKE, _LEAST_CHANNELS = 0.2, 2
@@ -162,18 +162,19 @@ def find_description(
     contact = {"contact_impedance": _contact_impedance(best, models[best.protocol["number"]])}
     tables = {"geometry": geometry, "electrodes": {**contact, **electrodes, "number": best.protocol["number"]}}
     tables["protocol"] = {**best.protocol, "current": current}
-    return Findings((*compared, *found[_FEW:]), tuple(near), _text(path, numbers.shape, best, near, tables))
+    return Findings((*compared, *found[_FEW:]), tuple(near), _text(path, numbers, best, near, tables))
 
 
 @dataclass(frozen=True)
 class _Numbers:
-    """The numbers of a file: a function that arranges them in frames of one of several numbers of channels, and their
-    shape in words."""
+    """The numbers of a file: a function that arranges them in frames of one of several numbers of channels, their shape
+    in words, numbers that a frame may have, and what a description has to say of their arrangement."""
 
     path: Path
     frames: Callable[[Sequence[int], Description], Frames]
     shape: str
     sizes: tuple[int, ...]
+    data: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def read(cls, path: Path, key: str | None, other: str | None = None) -> _Numbers:
@@ -187,11 +188,21 @@ class _Numbers:
             raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
         text = read_text(path)
         length, lines = int(text.lengths[0]), len(text.lengths)
-        total = len(text.values)
+        total, said = len(text.values), f"{counted(lines, 'line')} of {length}"
         parts = {total // k for k in range(1, 1 + total // max(length, 1)) if length < total // k}
-        sizes = {length, length - 1, lines, *parts}
-        said = f"{counted(lines, 'line')} of {length}"
-        return cls(path, lambda counts, d: frames_in_text(text, counts, d.layout, path.name), said, tuple(sizes))
+        table = text.values.reshape(lines, length) if total == lines * length else np.zeros((0, 0))
+        sizes = tuple({length, length - 1, lines, *parts})
+        if lines == length == len(table) and _spread(table.T) < _spread(table):  # alike are the columns
+            data = {"frames_in": "columns"}
+            return cls(path, lambda counts, d: frames_in_table(table.T, counts, d.layout), said, sizes, data)
+        return cls(path, lambda counts, d: frames_in_text(text, counts, d.layout, path.name), said, sizes)
+
+
+def _spread(rows: np.ndarray) -> float:
+    """Deviation of rows from their mean, relative."""
+    known = np.where(np.isfinite(rows), rows, 0)
+    size = float(np.linalg.norm(known))
+    return float(np.linalg.norm(known - known.mean(axis=0))) / size if size else 0.0
 
 
 def _array(path: Path, key: str | None, other: str | None) -> tuple[np.ndarray, str]:
@@ -336,20 +347,22 @@ def _contact_impedance(best: Candidate, model: ForwardModel) -> float:
     return float(f"{_CONTACT * size * resistivity:.2g}")
 
 
-def _text(path: Path, shape: str, best: Candidate, near: Sequence[Candidate], tables: dict[str, dict[str, Any]]) -> str:
+def _text(
+    path: Path, numbers: _Numbers, best: Candidate, near: Sequence[Candidate], tables: dict[str, dict[str, Any]]
+) -> str:
     """The description in TOML, with the evidence as comments."""
     notes = [note for note in best.measurement.notes if not note.startswith("[protocol]")]
     reversed_signs = best.reversed_signs or any("polarity" in note for note in notes)
     broken = "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"
     explained = best.wiring.explanation if best.wiring is not None and not best.reversed_signs else ""
     lines = [
-        f"Written by `jeit describe {path.name}` ({shape} numbers). Lengths are in metres, currents in amperes.",
+        f"Written by `jeit describe {path.name}` ({numbers.shape} numbers). Lengths in metres, currents in amperes.",
         f"{best.name}: a uniform body misses {percent(best.misfit)} of the empty one; reciprocity: {broken}.",
         *(f"It may as well be {one.name}: {percent(one.misfit)}." for one in near),
         *notes,
         *([explained] if explained else []),
     ]
-    data: dict[str, Any] = {"polarity": "reversed"} if reversed_signs else {}
+    data = {**numbers.data, **({"polarity": "reversed"} if reversed_signs else {})}
     if best.gains is not None:
         lines.append(f"Gains of the measurements differ by {percent(float(np.std(best.gains)))}, found by reciprocity.")
         data["gains"] = [round(float(one), 4) for one in best.gains]

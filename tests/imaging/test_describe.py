@@ -124,6 +124,30 @@ def test_a_column_of_something_else_is_not_explained_away(tmp_path):
         find_description(tmp_path / "wide.csv", DISK, RING, keys=("a", None))
 
 
+def test_a_square_table_is_turned_where_its_columns_are_alike(tmp_path):
+    voltages, protocol = simulated(KINDS[0])
+    noise = 1 + 1e-4 * np.random.default_rng(2).normal(size=(2, 40, 40))
+    for name, values, own in zip(("empty", "rod"), voltages, noise, strict=True):
+        np.savetxt(tmp_path / f"{name}.csv", (values * own).T, delimiter=",")
+    found = find_description(tmp_path / "rod.csv", DISK, RING, reference=tmp_path / "empty.csv")
+    assert not found.fault
+    assert not found.undecided
+    assert found.candidates[0].measurement.protocol.same_patterns(protocol)
+    (tmp_path / "description.toml").write_text(found.text, "utf-8")
+    np.testing.assert_allclose(data.read(tmp_path / "rod.csv").mean_frame().voltages[0], voltages[1], rtol=1e-3)
+
+
+def test_a_frame_of_16_lines_that_are_alike(tmp_path):
+    """A line for each drive of a ring: the same from every electrode."""
+    voltages, protocol = simulated(KINDS[0])
+    paths = tmp_path / "empty.txt", tmp_path / "rod.txt"
+    for path, values in zip(paths, voltages, strict=True):
+        np.savetxt(path, values.reshape(8, 5))
+    found = find_description(paths[1], DISK, RING, reference=paths[0])
+    assert not found.fault
+    assert found.candidates[0].measurement.protocol.same_patterns(protocol)
+
+
 def test_what_is_known_narrows_the_search(tmp_path):
     voltages, _ = simulated(KINDS[0])
     empty, rod = saved(tmp_path, voltages, " ")
