@@ -133,7 +133,9 @@ class Wiring:
         """The wiring found, in a sentence, with electrodes numbered from 1; empty if it is the described one."""
         found = [_exchanged_places(self.places, self._cycles())]
         found.append(self.order and f"the channels look ordered {self.order}")
-        found.append("all voltages look to have the opposite sign" if self.reversed_signs else "")
+        found.append(
+            'all voltages look to have the opposite sign ([data] polarity = "reversed")' if self.reversed_signs else ""
+        )
         said = ", and ".join(one for one in found if one)
         return (
             said and f"{said}: so taken the misfit is {percent(self.misfit)}, as described {percent(self.described)}."
@@ -200,8 +202,11 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
     first = np.asarray(protocol.measurement).argmax(axis=1)[measurement]
     source, sink = (choose(np.asarray(protocol.drive), axis=1)[drive] for choose in (np.argmax, np.argmin))
     ways = {
-        "from electrode 1 on in every drive (fixed)": (first, drive),
-        "from the driven electrodes on in every drive (rotating)": ((first - source) % protocol.num_electrodes, drive),
+        'from electrode 1 on in every drive (order = "fixed")': (first, drive),
+        'from the driven electrodes on in every drive (order = "rotating")': (
+            (first - source) % protocol.num_electrodes,
+            drive,
+        ),
         "from the second driven electrode on in every drive (rotating)": (
             (first - sink) % protocol.num_electrodes,
             drive,

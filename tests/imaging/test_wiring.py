@@ -103,7 +103,9 @@ def test_a_sign_that_explains_a_frame_alone_is_told_alone_and_with_no_way_out_th
     turned = tuple((k + 1) % COUNT for k in range(COUNT))
     empty = measured(model, oval, turned, sign=-1)
     assert find_wiring(model, empty).places == PLACES
-    with pytest.raises(ValueError, match=r"opposite sign: .* Mend the wires or the description\.$"):
+    with pytest.raises(
+        ValueError, match=r"opposite sign \(\[data\] polarity = .reversed.\): .* Mend the wires or the description\.$"
+    ):
         prepare_difference(measured(model, oval, turned, sign=-1, conductivity=0.03), empty)
 
 
