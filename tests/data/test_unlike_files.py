@@ -9,6 +9,7 @@ import scipy.io
 from jeit import data
 from jeit.data import load_description
 from jeit.data.description import parse_description
+from jeit.data.formats.unstated import fitting_protocol
 from jeit.protocol import adjacent
 
 TANK = """
@@ -91,7 +92,7 @@ def test_text_however_it_is_written(way, frames, tmp_path):
     ("driven", "order", "reciprocal"), [*product((False, True), ("rotating", "fixed"), ("all", "half"))]
 )
 def test_channels_that_no_description_states(driven, order, reciprocal, frames, tmp_path):
-    """What cannot be told apart is refused later, or reads the same: half of the channels have no reciprocal ones."""
+    """Half of the channels have no reciprocal ones, so that their order must be stated."""
     values, protocol = voltages_of(frames, driven, order, reciprocal)
     stated = f'order = "{order}"' if reciprocal == "half" else ""
     found = read(written(tmp_path / "a.csv", values), protocol=stated)
@@ -101,15 +102,15 @@ def test_channels_that_no_description_states(driven, order, reciprocal, frames, 
     assert protocol.num_measurements == found.voltages.shape[1]
 
 
-@pytest.mark.parametrize("driven", [False, True])
-@pytest.mark.parametrize("change", ["reversed", "magnitudes", "zeros"])
+CHANGES = [("reversed", False), *product(("magnitudes", "zeros"), (False, True))]
+
+
+@pytest.mark.parametrize(("change", "driven"), CHANGES)
 def test_signs_that_no_description_states(change, driven, frames, tmp_path):
     values, protocol = voltages_of(frames, driven, "rotating", "all")
     own = (np.asarray(protocol.channel_drive) != 0) & (np.asarray(protocol.channel_measurement) != 0)
     zero = own.any(axis=1) & (change == "zeros")
     changed = {"reversed": -values, "magnitudes": np.abs(values), "zeros": np.where(zero, 0, -values)}[change]
-    if change == "reversed" and driven:
-        pytest.skip("voltages of both signs are not reversed unasked: the wiring is questioned")
     found = read(written(tmp_path / "a.csv", changed))
     np.testing.assert_allclose(np.asarray(found.voltages)[:, ~zero], values[:, ~zero], rtol=1e-8)
     np.testing.assert_array_equal(~np.asarray(found.mask), np.tile(zero, (3, 1)))
@@ -189,6 +190,34 @@ def test_a_column_too_many_and_an_array_of_no_file(frames, tmp_path):
         read(written(tmp_path / "a.csv", np.column_stack([values, np.ones((3, 2))])))
     with pytest.raises(ValueError, match=r"key: a\.csv has no arrays"):
         data.read(tmp_path / "a.csv", key="rod")
+
+
+@pytest.mark.parametrize("last", ["END", "1.5,2.5,x: 3"])
+def test_words_after_the_numbers_are_refused(last, frames, tmp_path):
+    """A word is left out before the numbers of a line, and nowhere else."""
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    path = written(tmp_path / "a.csv", values)
+    path.write_text(path.read_text("utf-8") + last + "\n", "utf-8")
+    with pytest.raises(ValueError, match=r"a\.csv, line 4.*is no number"):
+        read(path)
+
+
+def test_a_protocol_without_reciprocal_channels_stays_as_described(frames):
+    """Nothing speaks against it, whatever another one of as many channels breaks."""
+    values, described = voltages_of(frames, False, "rotating", "half")
+    other = adjacent(8, order="fixed").subset(np.arange(20))
+    random = np.random.default_rng(0).normal(size=values.shape)
+    assert fitting_protocol(random, [(described, ""), (other, "order")]) == (described, ())
+
+
+def test_a_frame_has_the_sign_of_its_reference(frames, tmp_path):
+    """Also where the frame alone has voltages of one sign, and the reference, for its noise, has not."""
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    reference = read(written(tmp_path / "reference.csv", -values[:1]), 'polarity = "normal"')
+    written(tmp_path / "frame.csv", -values[1:])
+    (tmp_path / "frame.toml").write_text(TANK, "utf-8")
+    found = data.read(tmp_path / "frame.csv", like=reference)
+    np.testing.assert_allclose(found.voltages, -values[1:], rtol=1e-8)
 
 
 SPOILED = {

@@ -72,13 +72,13 @@ def frames_in_table(
 ) -> Frames:
     """Frames of an array. `counts` as for `frames_in_text`; `heading`: names of the columns; `usual`: where frames are
     if the numbers of channels do not decide, "rows" or "columns"."""
-    told = layout.frames_in
-    turned = told == "columns" if told else _are_columns(table.shape, counts, usual)
+    stated = layout.frames_in
+    turned = stated == "columns" if stated else _are_columns(table.shape, counts, usual)
     rows = table.T if turned else table
     notes: tuple[str, ...] = ()
-    if told is None and turned and usual == "rows":
+    if stated is None and turned and usual == "rows":
         notes = ("frames are taken from its columns.",)
-    if told is None and not turned and usual == "columns" and min(table.shape) > 1:
+    if stated is None and not turned and usual == "columns" and min(table.shape) > 1:
         notes = ("frames are taken from its rows.",)
     times = None
     if rows.shape[1] - 1 in counts and rows.shape[1] not in counts and layout.time_column is not False:

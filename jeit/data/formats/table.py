@@ -115,9 +115,7 @@ def measurement_in(
     layout = replace(described.layout, frames_in="rows")
     frames = frames_from(found.table, layout, path.name)
     notes = (*described.notes, *found.notes, *part_of(found.table, layout))
-    if like is not None:  # what was found of the reference holds for the frames
-        protocols = sorted(protocols, key=lambda one: not one[0].same_patterns(like.protocol))
-    protocol, said = fitting_protocol(frames, protocols)
+    protocol, said = fitting_protocol(frames, protocols, like)
     described = replace(described, layout=layout, notes=(*notes, *said))
     reason = ""
     if protocol is not None and frames.shape[-1] == protocol.num_measurements:

@@ -23,7 +23,9 @@ from jeit.files import check_memory
 _IN_MEMORY = 8
 # Lines from which separators are found out, and the greatest number of lines of a heading.
 _SAMPLE, _MOST_HEADING = 40, 100
-_LABEL = re.compile(r"\s*([A-Za-z_][\w ()/\[\].-]*?)\s*[:=]\s*(?=[-+.\d])")
+# A word before the numbers of a line; the end of a number that is cut off.
+_LABEL = re.compile(r"\s{0,40}([A-Za-z_][\w ()/\[\].-]{0,60})[:=]\s{0,40}(?=[-+.\d])")
+_CUT_NUMBER = re.compile(r"[-+]?\d*[.,]?\d*([eE][-+]?)?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _COMMENTS = ("#", "%", "//")
 _SET = "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
@@ -47,7 +49,7 @@ class _Way(NamedTuple):
 
     def cells(self, line: str) -> list[str]:
         """Cells of a line, without a label before them and without a separator after them."""
-        line = _LABEL.sub("", line, count=1)
+        line = _unlabelled(line)
         if self.decimal_comma:
             line = line.replace(",", ".")
         cells = [cell.strip(' \t"') for cell in line.strip(" \r\n").split(self.delimiter)]
@@ -83,18 +85,18 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     way = _Way(_given(delimiter), False) if delimiter is not None else _way_of(lines)
     heading = 0 if skip_rows is not None else _heading(way, lines)
     values, lengths, label = array("d"), array("q"), ""
-    rest, line, cells = islice(_content(path, skipped), heading, None), "\n", []
+    rest, line, cells, ended = islice(_content(path, skipped), heading, None), "\n", [], False
     for place, line in rest:
         cells = way.cells(line)
         try:
             row = [float(cell) for cell in cells]
         except ValueError:
-            ends_here = lengths and all(map(_is_number, cells[:-1])) and next(rest, None) is None
-            if not ends_here:
+            cut = lengths and all(map(_is_number, cells[:-1])) and _CUT_NUMBER.fullmatch(cells[-1])
+            if not cut or next(rest, None) is not None:
                 raise ValueError(f"{path.name}, line {place}{_no_number(cells, way, first=not lengths)}") from None
-            row = [float(cell) for cell in cells[:-1]]  # the file is cut off within a number
+            row, ended = [float(cell) for cell in cells[:-1]], True
         if not lengths and (named := _LABEL.match(line)):
-            label = named[1]
+            label = named[1].strip()
         values.extend(row)
         lengths.append(len(row))
     if not values:
@@ -102,7 +104,9 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     notes = [f"numbers are separated by {way}."] if delimiter is None and way != _PLAIN else []
     notes += [f"the first {heading} line{'s are' if heading > 1 else ' is'} a heading, skipped."] if heading else []
     notes += [f"{label!r} stands before each line, and is left out."] if label else []
-    if not line.endswith("\n") and len(cells) > 1 and len(cells[-1]) < min(map(len, cells[:-1])):
+    if ended:
+        notes.append(f"the last number, {cells[-1][:20]!r}, is cut off, and left out.")
+    elif not line.endswith("\n") and len(cells) > 1 and len(cells[-1]) < min(map(len, cells[:-1])):
         notes.append(f"no line end follows the last number, {cells[-1][:20]}: is it cut off?")
     named = tuple(way.cells(lines[heading - 1])) if heading else ()
     return Text(np.array(values), np.array(lengths), named, tuple(notes))
@@ -116,6 +120,12 @@ def rectangle(text: Text, name: str) -> Float[np.ndarray, "R C"]:
             f"{name}: row {other[0] + 1} has length {text.lengths[other[0]]}, the first {length}. Is the file cut off?"
         )
     return text.values.reshape(-1, length)
+
+
+def _unlabelled(line: str) -> str:
+    """A line without the word before its numbers."""
+    label = _LABEL.match(line)
+    return line if label is None else line[label.end() :]
 
 
 def _given(delimiter: str) -> str | None:
@@ -135,7 +145,7 @@ def _way_of(lines: Sequence[str]) -> _Way:
 
 def _has_decimal_commas(way: _Way, lines: Sequence[str]) -> bool:
     """Whether commas stand within numbers alone: in most cells that have one, between digits."""
-    cells = [cell for line in lines for cell in _LABEL.sub("", line, count=1).split(way.delimiter) if "," in cell]
+    cells = [cell for line in lines for cell in _unlabelled(line).split(way.delimiter) if "," in cell]
     within = [cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell.strip(' \t\r\n"'))]
     return len(within) > 0.9 * len(cells)
 

@@ -26,26 +26,31 @@ _OPPOSITE = -0.5
 
 
 def fitting_protocol(
-    frames: Inexact[np.ndarray, "F M"], protocols: Sequence[tuple[Protocol, str]]
+    frames: Inexact[np.ndarray, "F M"], protocols: Sequence[tuple[Protocol, str]], like: Measurement | None = None
 ) -> tuple[Protocol | None, tuple[str, ...]]:
     """The protocol among `protocols`, the described one first, that has as many channels as the frames and obeys
-    reciprocity; and a note if it is not the described one. None if there is none."""
+    reciprocity; and a note if it is not the described one. None if there is none.
+
+    The described one is kept unless it breaks reciprocity and another does not. With a measurement of the same sensor,
+    `like`, its protocol comes first: what was found of the reference holds for the frames.
+    """
     if not protocols:
         return None, ()
     fitting = [one for one in protocols if one[0].num_measurements == frames.shape[-1]]
     if not fitting:
         return protocols[0][0], ()
-    errors = [_error(frames, one) for one, _ in fitting]
-    first, best = errors[0], int(np.argmin(errors))
-    if first <= _DOUBTED or errors[best] > _BETTER * first:
-        best = 0
-    chosen, said = fitting[best]
-    if not said:
-        return chosen, ()
-    reason = f"{counted(frames.shape[-1], 'number')} are in a frame"
-    if best:
-        reason = f"reciprocity is broken by {percent(errors[best])} so, by {percent(first)} in the usual order"
-    return chosen, (f"[protocol] {said} is taken, for {reason}.",)
+    reason = f"for {counted(frames.shape[-1], 'number')} are in a frame"
+    if like is not None and (same := [one for one in fitting if one[0].same_patterns(like.protocol)]):
+        fitting, reason = [*same, *fitting], f"as of '{like.name}'"
+    chosen, said = fitting[0]
+    first = _error(frames, chosen)
+    if _DOUBTED < first < np.inf:
+        errors = [_error(frames, one) for one, _ in fitting]
+        best = int(np.argmin(errors))
+        if errors[best] < min(_DOUBTED, _BETTER * first):
+            chosen, said = fitting[best]
+            reason = f"for reciprocity is broken by {percent(errors[best])} so, by {percent(first)} in the usual order"
+    return chosen, (f"[protocol] {said} is taken, {reason}.",) if said else ()
 
 
 def _error(frames: Inexact[np.ndarray, "F M"], protocol: Protocol) -> float:
@@ -73,6 +78,8 @@ def with_signs(measurement: Measurement, like: Measurement | None = None) -> Mea
         both = usable.all(axis=0) & np.asarray(like.mask).all(axis=0)
         ours, theirs = (np.real(np.asarray(one.voltages)).mean(axis=0)[both] for one in (measurement, like))
         size = np.linalg.norm(ours) * np.linalg.norm(theirs)
+        if size and ours @ theirs > -_OPPOSITE * size:
+            return measurement  # as of the reference, whatever that says of the sign
         if size and ours @ theirs < _OPPOSITE * size:
             said = f"the voltages are reversed, to agree with '{like.name}' (polarity = \"reversed\")."
             return _changed(measurement, -values, said)
