@@ -1,7 +1,7 @@
 """How objects are shown in consoles and notebooks: in a line or two, and as a picture.
 
-Pictures are drawn by `jeit.plot.notebook`, which is imported by its name when the first is drawn: the objects are of
-lower layers than plots.
+Pictures are drawn by `jeit.report.notebook`, which is imported by its name when the first is drawn: the objects are of
+lower layers than reports.
 """
 
 from __future__ import annotations
@@ -22,4 +22,4 @@ def brief(described: Callable[[], str], one: Any) -> str:
 
 def picture(one: Any) -> bytes | None:
     """PNG of an object for a notebook (`_repr_png_`), or None if it has none, such as a traced one."""
-    return importlib.import_module("jeit.plot.notebook").picture(one)
+    return importlib.import_module("jeit.report.notebook").picture(one)

@@ -38,18 +38,18 @@ def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]
         raise ValueError(f"write_table: {file.name} must end in .npz.")
     lines = [f"title = {_toml(measurement.name)}"]
     if measurement.domain is not None:
-        lines += ["", "[geometry]", *_assignments(_geometry(measurement.domain))]
+        lines += ["", "[geometry]", *assignments(_geometry(measurement.domain))]
     if measurement.electrodes is not None:
-        lines += ["", "[electrodes]", *_assignments(_electrodes(measurement.electrodes))]
+        lines += ["", "[electrodes]", *assignments(_electrodes(measurement.electrodes))]
     protocol = measurement.protocol
-    lines += ["", "[protocol]", *_assignments(_protocol(protocol))]
+    lines += ["", "[protocol]", *assignments(_protocol(protocol))]
     if (known := measurement.uncertainty) is not None:
         shares = {"contact_drift": known.drift, "size": known.size, "other": known.other}
         said = {} if known.position is None else {"position": known.position}
         said |= {f"{name}_percent": 100 * share for name, share in shares.items()}
-        lines += ["", "[uncertainty]", *_assignments(said)]
+        lines += ["", "[uncertainty]", *assignments(said)]
     component = "complex" if np.iscomplexobj(measurement.voltages) else "real"
-    lines += ["", "[data]", *_assignments({"frames_in": "rows", "component": component, "polarity": "normal"})]
+    lines += ["", "[data]", *assignments({"frames_in": "rows", "component": component, "polarity": "normal"})]
     arrays: dict[str, Any] = {part: np.asarray(getattr(protocol, part)) for part in PROTOCOL_ARRAYS}
     if measurement.times is not None:
         arrays["times"] = np.asarray(measurement.times)
@@ -98,7 +98,8 @@ def _protocol(protocol: Protocol) -> dict:
     return {"kind": "channels", "name": protocol.name, **parts}
 
 
-def _assignments(section: dict) -> list[str]:
+def assignments(section: dict[str, Any]) -> list[str]:
+    """Lines of a TOML table, one for each key; values are text, booleans, numbers and nested lists."""
     return [f"{key} = {_toml(value)}" for key, value in section.items()]
 
 

@@ -16,7 +16,8 @@ import numpy as np
 
 from jeit.arguments import counted, did_you_mean, listed, percent
 from jeit.data import Measurement
-from jeit.data.description import Description, parse_description
+from jeit.data.description import Description, TableLayout, parse_description
+from jeit.data.exchange import assignments
 from jeit.data.formats import matlab
 from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text
 from jeit.data.formats.table import measurement_in
@@ -27,6 +28,7 @@ from jeit.electrodes.body_mesh import body_mesh
 from jeit.files import npy_array, npz_arrays
 from jeit.forward import ForwardModel
 from jeit.imaging.wiring import Wiring, find_wiring
+from jeit.mesh import Solid
 from jeit.protocol import Protocol
 
 # Fewest and most electrodes of the protocols that are tried; nodes of the mesh on which these are compared, of a sheet
@@ -41,6 +43,8 @@ _UNLIKE, _LEAST_CHANNELS = 0.2, 2
 _FEW, _UNDECIDED, _SMALL = 12, 1.3, 0.01
 # Reciprocity error from which gains are estimated, and ratio of the error that they may leave to it.
 _ACCURATE, _GAINED = 0.03, 0.4
+# An arrangement of which nothing is stated.
+_FOUND_OUT = TableLayout()
 # Contact impedance that a description starts from, times conductivity over the size of the body.
 _CONTACT = 0.01
 
@@ -127,12 +131,17 @@ def find_description(
     current: float = 1e-3,
     progress: Callable[[str], None] = lambda step: None,
 ) -> Findings:
-    """Find out what a file of voltages may be.
+    """Find out what a file of voltages may be: compare the protocols that fit it, and describe the best.
 
-    `geometry`, `electrodes`: tables of a description, metres, the second without the number of electrodes; `reference`:
-    file of the empty body; `keys`: arrays of the file and of the reference, where files hold several; `known`: what is
-    known of `[protocol]`, such as its kind or number; `current`: amperes. Raises `ValueError` for files that cannot be
-    read, several arrays and none named, and if no protocol fits.
+    - `geometry`, `electrodes`: tables of a description, metres, the second without the number of electrodes and without
+      the contact impedance, ohm·m (on a solid ohm·m²), which is estimated roughly unless given.
+    - `reference`: file of the empty body; without it, the mean of all frames stands for it.
+    - `keys`: arrays of the file and of the reference, where files hold several.
+    - `known`: what is known of `[protocol]`, such as its kind or number.
+    - `current`: amplitude, amperes.
+    - `progress`: called with the name of each step when it begins.
+
+    Raises `ValueError` for files that cannot be read, several arrays and none named, and if no protocol fits.
     """
     number = (known or {}).get("number")
     if number is not None and not _FEWEST <= number <= _MOST:
@@ -171,7 +180,7 @@ class _Numbers:
     in words, numbers that a frame may have, and what a description has to say of their arrangement."""
 
     path: Path
-    frames: Callable[[Sequence[int], Description], Frames]
+    frames: Callable[[Sequence[int]], Frames]
     shape: str
     sizes: tuple[int, ...]
     data: dict[str, Any] = field(default_factory=dict)
@@ -183,7 +192,7 @@ class _Numbers:
             table, usual = _array(path, key, other)
             said = " × ".join(map(str, table.shape))
             sizes = tuple(sorted({*table.shape, table.size}, reverse=True))
-            return cls(path, lambda counts, d: frames_in_table(table, counts, d.layout, usual=usual), said, sizes)
+            return cls(path, lambda counts: frames_in_table(table, counts, _FOUND_OUT, usual=usual), said, sizes)
         if key is not None:
             raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
         text = read_text(path)
@@ -194,8 +203,8 @@ class _Numbers:
         sizes = tuple({length, length - 1, lines, *parts})
         if lines == length == len(table) and _spread(table.T) < _spread(table):  # alike are the columns
             data = {"frames_in": "columns"}
-            return cls(path, lambda counts, d: frames_in_table(table.T, counts, d.layout), said, sizes, data)
-        return cls(path, lambda counts, d: frames_in_text(text, counts, d.layout, path.name), said, sizes)
+            return cls(path, lambda counts: frames_in_table(table.T, counts, _FOUND_OUT), said, sizes, data)
+        return cls(path, lambda counts: frames_in_text(text, counts, _FOUND_OUT, path.name), said, sizes)
 
 
 def _spread(rows: np.ndarray) -> float:
@@ -229,12 +238,9 @@ def _array(path: Path, key: str | None, other: str | None) -> tuple[np.ndarray, 
     return table.reshape(-1, 1) if 1 in table.shape else table, usual
 
 
-_ORDERS = ("rotating", "fixed")
-
-
 def _protocols(number: int) -> Iterator[dict[str, Any]]:
     """Tables of the protocols of common kinds of so many electrodes."""
-    plain = {"driven_electrodes": (False, True), "order": _ORDERS}
+    plain = {"driven_electrodes": (False, True), "order": ("rotating", "fixed")}
     for kind, options in (
         ("adjacent", {**plain, "reciprocal": ("all", "half")}),
         ("two_terminal", {}),
@@ -271,8 +277,7 @@ def _fitting(
             read = [_measured(one, described, protocol) for one in (numbers, rest)]
             if read[0] is not None and read[1] is not None:
                 empty = read[1].mean_frame()
-                apart = np.asarray(read[1].filled()) - np.asarray(empty.filled())
-                spread = float(np.linalg.norm(apart) / np.linalg.norm(np.asarray(read[1].filled())))
+                spread = _spread(np.asarray(read[1].filled()))
                 yield Candidate(table, read[0].num_frames, spread, reciprocity_error(empty), empty)
 
 
@@ -300,7 +305,7 @@ def _protocol(described: Description, path: Path) -> Protocol | None:
 def _measured(numbers: _Numbers, described: Description, protocol: Protocol) -> Measurement | None:
     """The measurement of numbers that are of this protocol; None if they do not fit it."""
     try:
-        found = numbers.frames([protocol.num_measurements], described)
+        found = numbers.frames([protocol.num_measurements])
         if found.table.shape[1] != protocol.num_measurements:
             return None
         return measurement_in(numbers.path, described, found, [(protocol, "")])
@@ -315,7 +320,8 @@ def _with_misfit(one: Candidate, models: dict[int, ForwardModel]) -> Candidate:
     assert empty.domain is not None
     assert empty.electrodes is not None
     if number not in models:
-        mesh = body_mesh(empty.domain, empty.electrodes, _NODES[3 if hasattr(empty.domain, "thickness") else 2])
+        solid = isinstance(empty.domain, Solid)
+        mesh = body_mesh(empty.domain, empty.electrodes, _NODES[3 if solid else 2])
         models[number] = ForwardModel(mesh, empty.electrodes, empty.protocol)
     return replace(one, wiring=find_wiring(models[number].with_protocol(empty.protocol), empty))
 
@@ -337,10 +343,8 @@ def _contact_impedance(best: Candidate, model: ForwardModel) -> float:
     empty body."""
     size = float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
     there = model.with_protocol(best.measurement.protocol)
-    if not there.electrodes.is_point:
-        there = there.with_electrodes(
-            there.electrodes.with_contact_impedance(np.full(best.protocol["number"], _CONTACT * size))
-        )
+    each = np.full(best.protocol["number"], _CONTACT * size)
+    there = there.with_electrodes(there.electrodes.with_contact_impedance(each))
     used = np.asarray(best.measurement.mask)[0]
     expected, measured = np.asarray(there.voltages(1.0))[used], np.asarray(best.measurement.voltages)[0][used]
     resistivity = abs(np.vdot(expected, measured)) / np.vdot(expected, expected).real
@@ -370,20 +374,9 @@ def _text(
     scale = "The current, and the unit of voltages, scale conductivities alone."
     parts = [
         [f"# {line}" for line in lines],
-        _table("geometry", tables["geometry"]),
-        [f"# {places}", *_table("electrodes", tables["electrodes"])],
-        [f"# {scale}", *_table("protocol", tables["protocol"])],
-        *([_table("data", data)] if data else []),
+        ["[geometry]", *assignments(tables["geometry"])],
+        [f"# {places}", "[electrodes]", *assignments(tables["electrodes"])],
+        [f"# {scale}", "[protocol]", *assignments(tables["protocol"])],
+        *([["[data]", *assignments(data)]] if data else []),
     ]
     return "\n\n".join("\n".join(part) for part in parts) + "\n"
-
-
-def _table(name: str, values: dict[str, Any]) -> list[str]:
-    """Lines of a TOML table."""
-
-    def written(value: Any) -> str:
-        if isinstance(value, bool):
-            return str(value).lower()
-        return f'"{value}"' if isinstance(value, str) else repr(value)
-
-    return [f"[{name}]", *(f"{key} = {written(value)}" for key, value in values.items())]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from jeit.report.image import draw_image
 from jeit_solvers.engines import has_values
 
 # Dots per inch, and frames of a measurement that are drawn.
@@ -24,11 +24,6 @@ def picture(one: Any) -> bytes | None:
     file = io.BytesIO()
     draw(one).savefig(file, dpi=_DPI, format="png")
     return file.getvalue()
-
-
-def _image(result: Any) -> Figure:
-    # The report of an image has the function that draws it.
-    return importlib.import_module("jeit.report.image").draw_image(result)
 
 
 def _mesh(mesh: Any) -> Figure:
@@ -73,7 +68,7 @@ def _measurement(measurement: Any) -> Figure:
     ax = figure.subplots()
     shown = np.unique(np.linspace(0, measurement.num_frames - 1, _FRAMES).round().astype(int))
     values = np.where(measurement.mask, np.real(np.asarray(measurement.voltages)), np.nan)[shown]
-    factor, unit = prefixed(float(np.nanmax(np.abs(values))), "V")
+    factor, unit = prefixed(float(np.abs(values[np.isfinite(values)]).max(initial=0)) or 1.0, "V")
     ax.plot(factor * values.T, linewidth=0.8)
     ax.set(xlabel="Channel", ylabel=f"Voltage ({unit})")
     few = "" if len(shown) == measurement.num_frames else f"{len(shown)} of "
@@ -89,7 +84,7 @@ def _series(series: Any) -> Figure:
 
 
 _DRAWN: dict[str, Callable[[Any], Figure]] = {
-    "ImagedDifference": _image,
+    "ImagedDifference": draw_image,
     "Mesh": _mesh,
     "Layout": _layout,
     "Measurement": _measurement,
