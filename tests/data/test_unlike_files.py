@@ -8,7 +8,8 @@ import scipy.io
 
 from jeit import data
 from jeit.data import load_description
-from jeit.data.description import parse_description
+from jeit.data.description import TableLayout, parse_description
+from jeit.data.formats.frames import frames_in_table
 from jeit.data.formats.unstated import fitting_protocol
 from jeit.protocol import adjacent
 
@@ -118,6 +119,12 @@ def test_signs_that_no_description_states(change, driven, frames, tmp_path):
         assert any("sign" in note for note in found.notes)
 
 
+def test_a_zero_of_an_undriven_channel_is_a_voltage(frames, tmp_path):
+    values = voltages_of(frames, True, "fixed", "all")[0].copy()
+    values[:, 20] = 0  # of drive 3, between electrodes 5 and 6
+    assert read(written(tmp_path / "a.csv", values)).mask.all()
+
+
 def test_a_stated_polarity_is_kept(frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     np.testing.assert_allclose(read(written(tmp_path / "a.csv", -values), 'polarity = "normal"').voltages, -values)
@@ -168,6 +175,21 @@ def test_as_spreadsheets_write_it(frames, tmp_path):
     rows = [";".join(f'"{one:.9e}"'.replace(".", ",") for one in frame) for frame in values]
     (tmp_path / "a.txt").write_text("\r\n".join(rows) + "\r\n", "utf-16")
     np.testing.assert_allclose(read(tmp_path / "a.txt").voltages, values, rtol=1e-8)
+
+
+def test_times_in_the_unit_of_their_heading(frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    path = written(tmp_path / "a.csv", values, heading=True, times=[1000, 1050, 1100])
+    path.write_text(path.read_text("utf-8").replace("channel 0", "t_ms", 1), "utf-8")
+    np.testing.assert_allclose(read(path).times, [1, 1.05, 1.1])
+
+
+def test_a_first_channel_that_rises_is_no_time():
+    """Where frames of as many numbers are described, though others have one fewer."""
+    table = np.column_stack([[1.0, 2.5, 4.0], np.ones((3, 4))])
+    found = frames_in_table(table, [5, 4], TableLayout())
+    assert found.times is None
+    np.testing.assert_array_equal(found.table, table)
 
 
 def test_whole_numbers_of_an_unknown_unit_are_no_times(frames, tmp_path):
@@ -222,6 +244,7 @@ def test_a_frame_has_the_sign_of_its_reference(frames, tmp_path):
 
 SPOILED = {
     "a word among the numbers": lambda rows: [*rows[:1], rows[1].replace(",", ",abc,", 1), *rows[2:]],
+    "a word in the first line": lambda rows: [rows[0].replace(",", ",abc,", 1).rsplit(",", 1)[0], *rows[1:]],
     "a line that is short": lambda rows: [rows[0], rows[1].rsplit(",", 3)[0], rows[2]],
     "a line that is long": lambda rows: [rows[0], rows[1] + ",1,2", rows[2]],
     "an empty cell": lambda rows: [rows[0], rows[1].replace(",", ",,", 1), rows[2]],

@@ -13,7 +13,15 @@ from jeit.electrodes.body_mesh import body_mesh
 from jeit.forward import ForwardModel
 from jeit.image import Raster
 from jeit.image.segmentation import CONDUCTIVE
-from jeit.imaging import ImagedDifference, ImagingSettings, automatic, difference, method
+from jeit.imaging import (
+    ImagedDifference,
+    ImagingSettings,
+    automatic,
+    difference,
+    imaging_mesh,
+    method,
+    prepare_difference,
+)
 from jeit.inverse import Laplace
 from jeit.inverse.shapes import Ellipsoid, Quantities, ShapeReconstruction
 from jeit.inverse.shapes.quantities import including
@@ -80,6 +88,18 @@ def test_a_ball_is_fitted_beside_a_smooth_field(monkeypatch):
     assert (one.area, one.area_interval) == (body.volume, known.measure_interval)
     ratio = 1 + known.change
     assert known.strength == pytest.approx(body.volume * (ratio - 1) / (ratio + 2), rel=0.05)
+
+
+def test_strengths_in_a_solid_count_its_cells():
+    """A reference that the model explains exactly leaves the discretisation."""
+    tank = Solid(Disk(0.1), 0.08)
+    angle = 2 * np.pi * np.arange(8) / 8
+    places = np.column_stack([0.1 * np.cos(angle), 0.1 * np.sin(angle), np.full(8, 0.04)])
+    electrodes = FacePatches(places, 0.03, 0.04, 0.01)
+    model = ForwardModel(imaging_mesh(tank, electrodes, 700), electrodes, skip(8, 1))
+    empty, other = (measured(model, one, 0, tank) for one in (BATH, 1.1 * BATH))
+    accuracy = prepare_difference(other, empty, num_points=700).accuracy
+    assert accuracy.strength == pytest.approx(0.03, abs=5e-3)
 
 
 def prepared(dimension, strongest, noise):
