@@ -44,7 +44,7 @@ def _mesh(mesh: Any) -> Figure:
 def _layout(layout: Any) -> Figure:
     from matplotlib.patches import Circle
 
-    from jeit.plot.axes import INK, SOFT, bare
+    from jeit.plot.axes import INK, SOFT, bare, draw_scale_bar
 
     figure = Figure(figsize=(5.0, 4.6), layout="constrained")
     ax = figure.subplots()
@@ -56,7 +56,9 @@ def _layout(layout: Any) -> Figure:
         ax.add_patch(Circle(tuple(centre), float(radius), facecolor="none", edgecolor=SOFT))
         ax.annotate(label, tuple(centre), ha="center", va="center", fontsize=7)
     x, y = np.asarray(ax.dataLim.intervalx), np.asarray(ax.dataLim.intervaly)
-    bare(ax, (x[0], x[1], y[0], y[1]), numbered=False)
+    extent = (x[0], x[1], y[0], y[1])
+    bare(ax, extent, numbered=False)
+    draw_scale_bar(ax, extent)
     ax.set_title(layout.name, fontsize=10)
     return figure
 
