@@ -15,7 +15,7 @@ from jeit.arguments import check_kind, check_name, describe, is_number
 from jeit.image import find_inclusions
 from jeit.imaging.preparation import PreparedDifference
 from jeit.inverse import RULES, TotalVariation, back_projection, one_step, reconstruct
-from jeit.inverse.hyperparameter.defaults import EDGE_PRICE, ITERATED, RULE
+from jeit.inverse.hyperparameter.choice import EDGE_PRICE, ITERATED, RULE
 from jeit.inverse.hyperparameter.rules import Rule, discrepancy
 from jeit.inverse.linear.one_step import LinearReconstruction
 from jeit.inverse.nonlinear import GaussNewton, LevenbergMarquardt

@@ -8,8 +8,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jeit.forward import ForwardModel
-from jeit.inverse.hyperparameter.choice import Choice
-from jeit.inverse.hyperparameter.defaults import RULE
+from jeit.inverse.hyperparameter.choice import RULE, Choice
 from jeit.inverse.hyperparameter.rules import RULES, Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import brief, check_has_values
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
-from jeit.inverse.hyperparameter.choice import Choice
-from jeit.inverse.hyperparameter.defaults import RULE
+from jeit.inverse.hyperparameter.choice import RULE, Choice
 from jeit.inverse.hyperparameter.rules import Rule, choose
 from jeit.inverse.linearisation import Linearisation
 from jeit.inverse.prior.priors import AbstractPrior

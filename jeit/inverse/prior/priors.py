@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from scipy.spatial.distance import cdist
 
 from jeit.arguments import check_has_values, check_kind
-from jeit.inverse.hyperparameter.defaults import RULE
+from jeit.inverse.hyperparameter.choice import RULE
 from jeit.inverse.prior.bases import AbstractBasis, DenseBasis, DiagonalBasis, Regions
 from jeit.inverse.prior.low_rank import GriddedGaussian, pivoted_cholesky, traced_pivoted_cholesky
 from jeit.inverse.prior.nodal import NodalSystem, by_columns

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.inverse.hyperparameter.defaults import EDGE_PRICE
+from jeit.inverse.hyperparameter.choice import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis, NodalBasis
 from jeit.inverse.prior.nodal import in_columns
 from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
