@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Inexact
 
 from jeit.arguments import listed
-from jeit.data.formats import matlab
-from jeit.files import check_electrodes, check_memory, npz_arrays
+from jeit.files import check_electrodes, check_memory, matlab, npz_arrays
 from jeit.protocol import Protocol, from_matrices, measurement_patterns
 
 if TYPE_CHECKING:

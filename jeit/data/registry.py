@@ -110,7 +110,8 @@ def _recognise(file: Path, description: object) -> str:
         if candidate.recognises(file):
             return name
     if file.suffix.lower() == ".mat":
-        from jeit.data.formats import eidors, kit4, ktc2023, matlab
+        from jeit.data.formats import eidors, kit4, ktc2023
+        from jeit.files import matlab
 
         if description is not None or eidors.find_description(file) is not None:
             return "eidors"

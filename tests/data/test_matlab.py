@@ -5,7 +5,7 @@ import pytest
 import scipy.io
 import scipy.sparse
 
-from jeit.data.formats import matlab
+from jeit.files import matlab
 
 RNG = np.random.default_rng(0)
 ARRAYS = {

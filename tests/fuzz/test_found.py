@@ -15,8 +15,7 @@ from readers import READERS
 
 from jeit.cli import main
 from jeit.cli.options import make_folder, remembering_files
-from jeit.data.formats import matlab
-from jeit.files import check_archive, read_toml
+from jeit.files import check_archive, matlab, read_toml
 from jeit.layout import read_layout
 from jeit.mesh import read as read_mesh
 from jeit.report.folder import results

@@ -15,11 +15,11 @@ import numpy as np
 
 from jeit.arguments import listed
 from jeit.data.description import Description, load_description, parse_description
-from jeit.data.formats import matlab
 from jeit.data.formats.frames import frames_in_table
 from jeit.data.formats.table import channel_counts, description_like, measurement_in
 from jeit.data.measured_patterns import frames_of
 from jeit.data.measurement import Measurement
+from jeit.files import matlab
 from jeit.protocol import Protocol, from_channels
 
 DESCRIPTION = "EIDORS-style vectors (.mat with stim, meas, meas_stim, or any with a TOML description)"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jeit.data.formats import matlab
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.electrodes import BoundaryElectrodes
+from jeit.files import matlab
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import from_matrices

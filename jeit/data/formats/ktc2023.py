@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jeit.data.formats import matlab
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.electrodes import BoundaryElectrodes
+from jeit.files import matlab
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import from_matrices

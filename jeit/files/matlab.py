@@ -17,7 +17,7 @@ import numpy as np
 import scipy.io
 
 from jeit.arguments import listed
-from jeit.files import check_memory, read_as
+from jeit.files.limits import check_memory, read_as
 
 # Length in bytes of the file header, and of the beginning of an element, which holds flags, shape and name; type
 # numbers of elements.
