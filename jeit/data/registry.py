@@ -51,6 +51,7 @@ FORMATS: dict[str, Format] = {
     "carefusion": Format("carefusion", (".eit",), described=True),
     "swisstom": Format("swisstom", (".eit",), described=True),
     "goettingen": Format("goettingen", (".get",), described=True),
+    "openeit": Format("openeit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
     "table": Format("table", _TABLES, described=True, borrows=True),
     # A table of 208 rows of real and imaginary pairs, with the bundled description; used only if named explicitly.
     "tank6cm": Format("table", (), bundled="tank6cm"),
@@ -69,7 +70,7 @@ def read(
 
     - `path`: the data file; or a folder of Sciospec files, one per frame, which are read in the order of their names.
     - `format`: a name in `FORMATS` ("kit4", "ktc2023", "eidors", "sciospec", "draeger", "carefusion", "swisstom",
-      "goettingen", "table", "tank6cm"); by default it is recognised from the content.
+      "goettingen", "openeit", "table", "tank6cm"); by default it is recognised from the content.
     - `description`: a TOML file, or the name of a bundled one, that states the meaning of the numbers (tables, EIDORS
       files) or the body measured (files of instruments). By default it is looked for beside the data.
     - `like`: a measurement of the same sensor, such as the reference, whose description applies to a table that has

@@ -66,6 +66,60 @@ def test_adjacent_voltages_come_back_in_order(kind, tmp_path):
     assert any("not" in note for note in found.notes)
 
 
+@pytest.mark.parametrize(
+    ("made", "table"),
+    [
+        (protocol.opposite(8, drives="all", order="fixed"), "number = 8\n"),
+        (protocol.opposite(16, drives="all", order="fixed"), "number = 16\n"),
+        (protocol.adjacent(32, order="fixed"), "number = 32\n"),
+        (protocol.two_terminal(8), "number = 8\n"),
+    ],
+    ids=lambda one: getattr(one, "name", ""),
+)
+def test_lines_of_openeit(made, table, tmp_path):
+    """With line ends of every kind or none, zeros of open circuits, and a last frame that is cut off; signs come from
+    the body."""
+    ohms = made.channel_measurement @ impedance(made.num_electrodes) * made.channel_drive
+    ohms = np.asarray(ohms.sum(axis=1)) / 1e-3
+    line = "magnitudes :" + "".join(f"{abs(one):12.4f} ," for one in ohms)
+    (tmp_path / "empty.bin").write_bytes(f"\r\n{line}\r{line} \r\n{line}{line[:54]}".encode())
+    (tmp_path / "empty.toml").write_text(RING + table)
+    found = data.read(tmp_path / "empty.bin")
+    assert found.num_frames == 3
+    assert found.protocol.same_patterns(made)
+    np.testing.assert_allclose(found.voltages, np.tile(1e-3 * ohms, (3, 1)), atol=1e-7)
+    assert any("cut off after 3 numbers" in note for note in found.notes)
+    first = f"{abs(ohms[0]):.4f}"
+    (tmp_path / "rod.txt").write_text(line.replace(first, "0", 1))
+    rod = data.read(tmp_path / "rod.txt", like=found)
+    assert np.asarray(rod.mask)[0].tolist() == [False] + [True] * (len(ohms) - 1)
+    np.testing.assert_allclose(rod.voltages[0, 1:], found.voltages[0, 1:])
+    # A protocol that is described takes precedence, and numbers are what it takes them for.
+    kind = '[protocol]\nkind = "two-terminal"\ncurrent = 1.0\n'
+    (tmp_path / "rod.toml").write_text(RING + "number = 8\n" + kind)
+    if made.num_measurements == 28:
+        np.testing.assert_allclose(data.read(tmp_path / "rod.txt").voltages[0, 1:], ohms[1:], atol=1e-4)
+    else:
+        with pytest.raises(ValueError, match="28"):
+            data.read(tmp_path / "rod.txt")
+
+
+def test_what_openeit_does_not_write_is_refused(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("magnitudes: 1, 2, 3")
+    with pytest.raises(ValueError, match="a frame has 3 numbers; the firmware sends 32 \\(8 electrodes\\)"):
+        data.read(path, "openeit")
+    frame = "magnitudes: " + "1, " * 32
+    path.write_text(frame + "\n" + frame.replace("1", "x", 1))
+    with pytest.raises(ValueError, match="frame 2: 'x' is no number"):
+        data.read(path)
+    path.write_text(frame + frame + "4," + frame)
+    with pytest.raises(ValueError, match="frame 2 has length 33, most have 32"):
+        data.read(path)
+    with pytest.raises(ValueError, match="no arrays to choose from"):
+        data.read(path, key="a")
+
+
 def test_channels_that_reciprocity_repeats_may_be_left_out(tmp_path):
     made = frames()
     later = [(p, r) for p, _, r, _ in adjacent_channels()]

@@ -233,6 +233,12 @@ _instrument("carefusion", ".eit", 16, lambda path: write_carefusion(path, _ADJAC
 _instrument(
     "swisstom", ".eit", 32, lambda path: write_swisstom(path, np.random.default_rng(0).random((2, 32, 32)), [0, 20_000])
 )
+_instrument(
+    "openeit",
+    ".txt",
+    8,
+    lambda path: path.write_text(2 * ("magnitudes: " + ", ".join(f"{one}.5" for one in range(1, 33)) + "\n")),
+)
 _instrument("sciospec", ".eit", 8, lambda path: write_sciospec(path, np.array([np.eye(8)] * 2), [(1, 3), (2, 4)]))
 
 
