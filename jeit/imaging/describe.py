@@ -18,6 +18,7 @@ from jeit.arguments import counted, did_you_mean, listed, percent
 from jeit.data import Measurement
 from jeit.data.description import Description, TableLayout, parse_description
 from jeit.data.exchange import assignments
+from jeit.data.formats import openeit
 from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text
 from jeit.data.formats.table import measurement_in
 from jeit.data.formats.text import read_text
@@ -33,8 +34,9 @@ from jeit.protocol import Protocol
 # Fewest and most electrodes of the protocols that are tried; nodes of the mesh on which these are compared, of a sheet
 # and a solid.
 _FEWEST, _MOST, _NODES = 4, 64, {2: 700, 3: 4000}
-# Unexplained share of the empty body above which an explanation is not good enough to go on.
-_HOPELESS = 0.25
+# Unexplained share of the empty body above which an explanation is not good enough to go on; and that above which it is
+# not although the kind of protocol is known, or any other order of the channels leaves `_ORDERED` times as much.
+_HOPELESS, _HOPELESS_EVEN_SO, _ORDERED = 0.25, 0.5, 2.0
 # Spread of the frames of the empty body above which they are none of one; channels needed for each electrode: a few fit
 # anything.
 _UNLIKE, _LEAST_CHANNELS = 0.2, 2
@@ -83,6 +85,14 @@ class Candidate:
         return float(np.sqrt(self.misfit**2 + self.spread**2 + (self.reciprocity or 0) ** 2 / 2))
 
     @property
+    def ordered(self) -> bool:
+        """Whether the same voltages in another order of the channels would be explained far worse: a share of
+        √(1 - r²) would be left on the average, with r the square of their mean over the mean of their squares."""
+        values = np.asarray(self.measurement.voltages)[np.asarray(self.measurement.mask)]
+        alike = abs(values.mean()) ** 2 / np.mean(np.abs(values) ** 2)
+        return bool(_ORDERED * self.unexplained < np.sqrt(1 - alike**2))
+
+    @property
     def name(self) -> str:
         """The protocol in words."""
         options = {key: value for key, value in self.protocol.items() if key not in ("kind", "number")}
@@ -93,17 +103,19 @@ class Candidate:
 @dataclass(frozen=True)
 class Findings:
     """What was found out of a file. **Fields**: `candidates`: the best first; `undecided`: others that explain it as
-    well; `text`: a commented description, TOML, of the best."""
+    well; `text`: a commented description, TOML, of the best; `known`: whether the kind of the protocol was known."""
 
     candidates: tuple[Candidate, ...]
     undecided: tuple[Candidate, ...]
     text: str
+    known: bool = False
 
     @property
     def fault(self) -> str:
         """Why the best explanation is not good enough to go on; empty if it is."""
         best = self.candidates[0]
-        if best.unexplained < _HOPELESS and best.spread < _UNLIKE:
+        bound = _HOPELESS_EVEN_SO if self.known or best.ordered else _HOPELESS
+        if best.unexplained < bound and best.spread < _UNLIKE:
             return ""
         if best.spread >= _UNLIKE:
             return (
@@ -142,6 +154,8 @@ def find_description(
 
     Raises `ValueError` for files that cannot be read, several arrays and none named, and if no protocol fits.
     """
+    if not known and openeit.recognises(path):
+        known = openeit.protocol_table(path)
     number = (known or {}).get("number")
     if number is not None and not _FEWEST <= number <= _MOST:
         raise ValueError(f"number must be from {_FEWEST} to {_MOST} electrodes; it is {number}.")
@@ -170,7 +184,8 @@ def find_description(
     contact = {"contact_impedance": _contact_impedance(best, models[best.protocol["number"]])}
     tables = {"geometry": geometry, "electrodes": {**contact, **electrodes, "number": best.protocol["number"]}}
     tables["protocol"] = {**best.protocol, "current": current}
-    return Findings((*compared, *found[_FEW:]), tuple(near), _text(path, numbers, best, near, tables))
+    text = _text(path, numbers, best, near, tables)
+    return Findings((*compared, *found[_FEW:]), tuple(near), text, known="kind" in (known or {}))
 
 
 @dataclass(frozen=True)

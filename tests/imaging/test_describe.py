@@ -107,6 +107,27 @@ def test_what_is_not_good_enough_is_named(tmp_path):
         find_description(saved(tmp_path, random[:, :1])[0], DISK, RING)
 
 
+@pytest.mark.parametrize(
+    ("kind", "deviation", "said"),
+    [
+        ({"kind": "adjacent", "reciprocal": "half"}, 0.2, ""),
+        ({"kind": "two_terminal"}, 0.3, "not good enough to go on"),
+    ],
+    ids=str,
+)
+def test_the_order_of_unlike_channels_speaks_for_an_explanation(kind, deviation, said, tmp_path):
+    """A tank that is far from its description is explained; voltages that are all alike are explained by anything."""
+    voltages, _ = simulated(kind)
+    factors = np.exp(deviation * np.random.default_rng(3).normal(size=voltages.shape[1]))
+    empty, rod = saved(tmp_path, voltages * factors)
+    found = find_description(rod, DISK, RING, reference=empty)
+    assert 0.25 < found.candidates[0].misfit < 0.4
+    assert said in found.fault
+    assert bool(said) == bool(found.fault)
+    if said:
+        assert not find_description(rod, DISK, RING, reference=empty, known=kind).fault
+
+
 def test_a_column_of_something_else_is_not_explained_away(tmp_path):
     """Frames of the empty body are alike; and a few channels are explained by anything."""
     voltages, _ = simulated(KINDS[0])
