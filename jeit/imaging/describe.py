@@ -209,6 +209,10 @@ class _Numbers:
             return cls(path, lambda counts: frames_in_table(table, counts, _FOUND_OUT, usual=usual), said, sizes)
         if key is not None:
             raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
+        if openeit.recognises(path):
+            table = openeit.numbers(path)[0]
+            said, sizes = f"{counted(len(table), 'line')} of {table.shape[1]}", table.shape[1:]
+            return cls(path, lambda counts: frames_in_table(table, counts, _FOUND_OUT), said, sizes)
         text = read_text(path)
         length, lines = int(text.lengths[0]), len(text.lengths)
         total, said = len(text.values), f"{counted(lines, 'line')} of {length}"

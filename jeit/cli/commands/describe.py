@@ -57,12 +57,14 @@ def describe(
     """Find out what a file that nobody has described may be: electrodes, protocol, order of channels, signs, frames.
 
     Lists the explanations with the evidence for each, writes a commented description.toml, and images the first frame
-    against REFERENCE, or against the array --reference-key. In Python: `jeit.imaging.describe.find_description`.
+    that differs from REFERENCE, or from the array --reference-key. In Python:
+    `jeit.imaging.describe.find_description`.
     """
     from jeit.arguments import check_name
     from jeit.cli.commands.reconstruct import show
     from jeit.cli.console import Steps, plain_console, say_written
     from jeit.data import read
+    from jeit.data.imageable import assess
     from jeit.files.whole import written_whole
     from jeit.imaging import image_difference
     from jeit.imaging.describe import find_description
@@ -111,7 +113,9 @@ def describe(
         return
     with Steps(console, quiet=quiet) as step:
         base = read(data if reference is None else reference, description=target, key=reference_key)
-        result = image_difference(read(data, description=target, like=base, key=key), base, progress=step)
+        measured = read(data, description=target, like=base, key=key)
+        sound = [k for k, one in enumerate(assess(measured, base.mean_frame())) if one.imageable]
+        result = image_difference(measured, base, frame=sound[0] if sound else None, progress=step)
         step("write the first image")
         write_image(result, output)
     if not quiet:

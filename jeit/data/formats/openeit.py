@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jeit.arguments import counted, listed
 from jeit.data.description import parse_description
@@ -54,37 +55,49 @@ def read(
     """Read all frames. A `[protocol]` in the description takes precedence; without a description, the body is that of
     `like`, a measurement of the same sensor.
 
-    A frame that is cut off at the end is left out. Raises `ValueError` for frames of unequal length, numbers that are
-    of no protocol of the firmware, anything but numbers, and a `key`, for there are no arrays.
+    Raises `ValueError` as `numbers`, and for a `key`, for there are no arrays.
     """
     if key is not None:
         raise ValueError(f"key: {path.name} has no arrays to choose from; leave it out.")
-    lines = _frames(path)
-    count = _usual(lines)
-    if count not in _PROTOCOLS:
-        known = listed([f"{channels} ({one['number']} electrodes)" for channels, one in _PROTOCOLS.items()])
-        raise ValueError(
-            f"{path.name}: a frame has {counted(count, 'number')}; the firmware sends {known}. Read it as a table."
-        )
-    notes: tuple[str, ...] = ()
-    if len(lines) > 1 and len(lines[-1]) < count:
-        notes = (*notes, f"the last frame is cut off after {counted(len(lines.pop()), 'number')}, and left out.")
-    if other := [k for k, line in enumerate(lines, start=1) if len(line) != count]:
-        raise ValueError(f"{path.name}: frame {other[0]} has length {len(lines[other[0] - 1])}, most have {count}.")
-    values = np.array([[_number(cell, frame, path) for cell in line] for frame, line in enumerate(lines, start=1)])
-    if zeros := int((values == 0).sum()):
-        notes = (*notes, f"{counted(zeros, 'reading')} of zero, as of an open circuit: left out.")
+    values, notes = numbers(path)
     if like is not None and description is None and find_description(path) is None:
         described = description_like(like)
     else:
         described = description_of(path, description)
-    protocol = parse_description({"protocol": {**_PROTOCOLS[count], "current": _CURRENT}}, path.name).protocol(path)
+    table = {**_PROTOCOLS[values.shape[1]], "current": _CURRENT}
+    protocol = parse_description({"protocol": table}, path.name).protocol(path)
     assert protocol is not None
-    values = np.where(values == 0, np.nan, values)
     if described.protocol_section is None:
         values, notes = _CURRENT * values, (_NOTE, *notes)
     recording = Recording(values, protocol, notes=notes)
     return with_signs(measurement_of(path, recording, described), like)
+
+
+def numbers(path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
+    """The numbers of each frame, and notes. NaN where there is none: of a reading of zero, as of an open circuit, of a
+    cell that is no number, and of a whole frame that is longer or shorter than most, for characters were lost.
+
+    Raises `ValueError` if most frames are of no protocol of the firmware.
+    """
+    frames = _frames(path)
+    count = _usual(frames)
+    if count not in _PROTOCOLS or 2 * sum(len(one) == count for one in frames) <= len(frames):
+        known = listed([f"{channels} ({one['number']} electrodes)" for channels, one in _PROTOCOLS.items()])
+        raise ValueError(
+            f"{path.name}: most frames have {counted(count, 'number')}; the firmware sends {known}. Read it as a table."
+        )
+    notes = []
+    if len(frames[-1]) < count:
+        notes.append(f"the last frame is cut off after {counted(len(frames.pop()), 'number')}, and left out.")
+    whole = [len(one) == count for one in frames]
+    lost = [str(k) for k, one in enumerate(whole, start=1) if not one]
+    values = np.full((len(frames), count), np.nan)
+    values[whole] = [[_number(cell) for cell in one] for one, kept in zip(frames, whole, strict=True) if kept]
+    if lost:
+        notes.append(f"characters are lost in frame{'s' * (len(lost) > 1)} {listed(lost)}: masked.")
+    if gone := int((values == 0).sum()) + int(np.isnan(values[whole]).sum()):
+        notes.append(f"{counted(gone, 'reading')} of zero, as of an open circuit, or illegible: masked.")
+    return np.where(values == 0, np.nan, values), tuple(notes)
 
 
 def _frames(path: Path) -> list[list[bytes]]:
@@ -98,11 +111,12 @@ def _usual(frames: list[list[bytes]]) -> int:
     return Counter(map(len, frames)).most_common(1)[0][0] if frames else 0
 
 
-def _number(cell: bytes, frame: int, path: Path) -> float:
+def _number(cell: bytes) -> float:
+    """The number in a cell, NaN if there is none."""
     try:
         return float(cell)
     except ValueError:
-        raise ValueError(f"{path.name}, frame {frame}: {cell.decode(errors='replace')[:40]!r} is no number.") from None
+        return np.nan
 
 
 def protocol_table(path: Path) -> dict[str, Any]:
