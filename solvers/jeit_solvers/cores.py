@@ -34,6 +34,14 @@ def number_of_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def memory_of_machine() -> float:
+    """Memory of the machine in bytes; 8 GB where the system does not state it."""
+    try:
+        return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, ValueError, OSError):
+        return 8e9
+
+
 def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], number: int, size: int) -> Array:
     """Rows of `function` for the parts 0 … `number` - 1, computed in groups of `size` parts and concatenated; if the
     groups do not divide evenly, the rows of the last part are repeated at the end.
@@ -84,7 +92,8 @@ def _workers(process: int) -> ThreadPoolExecutor:
 
 @functools.cache
 def blas() -> threadpoolctl.ThreadpoolController:
-    """Controller of the BLAS libraries that are loaded at the first call, which include NumPy's."""
+    """Controller of the BLAS libraries of NumPy and of SciPy, which are two."""
+
     return threadpoolctl.ThreadpoolController().select(user_api="blas")
 
 
@@ -97,6 +106,8 @@ def one_thread_of_blas() -> Iterator[None]:
     """Limit the BLAS to one thread while this context, or another one of this kind, is active. Takes a few
     microseconds."""
     with _limits_lock:
+        if not _active_limits:
+            _take_control()
         _active_limits.append(None if _active_limits else blas().limit(limits=1))
     try:
         yield
@@ -104,4 +115,13 @@ def one_thread_of_blas() -> Iterator[None]:
         with _limits_lock:
             limit = _active_limits.pop()
             if limit is not None:  # the first context holds the original limits, and is the last to be removed
+                _take_control()
                 limit.restore_original_limits()
+
+
+def _take_control() -> None:
+    """Let this thread set the number of threads of BLAS: from version 3.8 on, threadpoolctl obeys only the thread that
+    set it first."""
+    for library in blas().lib_controllers:
+        if isinstance(library, threadpoolctl.OpenBLASController) and hasattr(library, "clear_controlling_thread"):
+            library.clear_controlling_thread(force=True)

@@ -1,5 +1,6 @@
 """Work of NumPy's that is shared between cores: the same whoever does it, and the BLAS as it was before."""
 
+import threading
 import warnings
 
 import numpy as np
@@ -8,7 +9,7 @@ import sparse_problems
 import threadpoolctl
 
 from jeit_solvers import analyse, factorise, on_cores
-from jeit_solvers.cores import blas, parts_for_cores
+from jeit_solvers.cores import blas, one_thread_of_blas, parts_for_cores
 from jeit_solvers.engines import on_host
 from jeit_solvers.sparse import multifrontal
 
@@ -34,6 +35,32 @@ def test_every_part_is_done_with_one_thread_of_blas_and_its_own_parts_at_once():
         assert 2 in before
         assert threads_of_blas() == before
     np.testing.assert_array_equal(found, np.arange(6)[:, None] + 10 * np.arange(3))
+
+
+def test_any_thread_may_limit_the_blas():
+    """Also one after the other, and where the first to begin is not the last to end."""
+    with one_thread_of_blas():
+        pass
+    begun, ended, seen = threading.Event(), threading.Event(), []
+
+    def long():
+        with one_thread_of_blas():
+            begun.set()
+            ended.wait(10)
+        seen.append(threads_of_blas())
+
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        before = threads_of_blas()
+        other = threading.Thread(target=long)
+        other.start()
+        begun.wait(10)
+        assert set(threads_of_blas()) == {1}
+        with one_thread_of_blas():
+            ended.set()
+            other.join()
+            assert set(threads_of_blas()) == {1}
+        assert set(seen[0]) == {1}
+        assert threads_of_blas() == before
 
 
 def test_a_part_that_fails_is_told_of_and_the_blas_has_its_threads_again():
