@@ -134,8 +134,8 @@ def test_solvers_know_no_physics():
         ({"attic/box.py": ""}, "is in no room"),
         ({"mesh/up.py": "from jeit.forward import ForwardModel"}, "looks up"),
         ({"mesh/up.py": "def f():\n    from jeit.forward.model import ForwardModel"}, "looks up"),
-        ({"forward/sly.py": "from jeit.mesh._checks import check_points"}, "is private"),
-        ({"forward/sly.py": "from jeit.mesh import _checks"}, "is private"),
+        ({"forward/sly.py": "from jeit.mesh._surface import orient_surface"}, "is private"),
+        ({"forward/sly.py": "from jeit.mesh import _surface"}, "is private"),
     ],
 )
 def test_a_fault_is_found(tmp_path, files, fault):

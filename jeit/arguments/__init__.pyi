@@ -1,5 +1,6 @@
 from .checks import (
     IN_MILLIMETRES,
+    brief,
     check_has_values,
     check_key,
     check_kind,
@@ -12,11 +13,11 @@ from .checks import (
     is_number,
     listed,
     percent,
+    picture,
     readings,
     real_array,
     signed_percent,
 )
-from .shown import brief, picture
 
 __all__ = [
     "IN_MILLIMETRES",

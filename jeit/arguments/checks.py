@@ -1,8 +1,9 @@
-"""Checks of arguments, and helpers that word the error messages."""
+"""Checks of arguments, and helpers that word messages and what consoles and notebooks show of objects."""
 
 from __future__ import annotations
 
 import difflib
+import importlib
 import math
 from collections.abc import Callable, Iterable
 from numbers import Real
@@ -189,3 +190,20 @@ def check_has_values(name: str, given: Any, use: str, instead: str) -> None:
         raise ValueError(
             f"{name} is traced, inside jax.jit, jax.vmap or a derivative, and {use} its values: {instead}."
         )
+
+
+def brief(described: Callable[[], str], one: Any) -> str:
+    """The text of an object from `described`, or its class alone where it cannot be described: JAX puts other things
+    in place of arrays for a while."""
+    try:
+        return described()
+    except Exception:
+        return f"<{type(one).__name__}>"
+
+
+def picture(one: Any) -> bytes | None:
+    """PNG of an object for a notebook (`_repr_png_`), or None if it has none, such as a traced one.
+
+    The report that draws it is imported by its name, for the objects are of lower layers.
+    """
+    return importlib.import_module("jeit.report.notebook").picture(one)

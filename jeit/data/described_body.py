@@ -18,8 +18,8 @@ from jeit.files import check_electrodes
 from jeit.layout import perimeter, ring
 from jeit.mesh import Body, Disk, Domain, OwnMesh, Rectangle, Solid
 from jeit.mesh import read as read_mesh
+from jeit.mesh.checks import LARGE, size_checked
 from jeit.mesh.outline import OUTLINES
-from jeit.mesh.sizes import LARGE, size_checked
 
 if TYPE_CHECKING:
     from jeit.data.description_tables import ElectrodesTable, FacetsTable, GeometryTable, MeshTable, PlacedTable

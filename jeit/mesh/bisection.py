@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jeit.arguments import check_kind, describe
-from jeit.mesh._checks import MOST_POINTS
+from jeit.mesh.checks import MOST_POINTS, size_checked
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.sizes import size_checked
 
 # Maximum distance from the end of an edge to the point where a surface crosses the edge, divided by the edge's length,
 # at which the end is moved onto the surface.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import brief, picture
-from jeit.mesh import _checks, topology
+from jeit.mesh import checks, topology
 from jeit_solvers.engines import as_array, has_values
 
 
@@ -100,23 +100,23 @@ class Mesh(eqx.Module):
                 "cells: the boundary cannot be found from traced node indices. Create the mesh outside the "
                 "transformed function and pass it in, or replace its points with equinox.tree_at."
             )
-        coordinates = _checks.check_points(points) if has_values(points) else None
+        coordinates = checks.check_points(points) if has_values(points) else None
         num_points, space = np.shape(points if coordinates is None else coordinates)
-        indices = _checks.check_cells(cells, num_points, space)
+        indices = checks.check_cells(cells, num_points, space)
         dimension = indices.shape[1] - 1
         if coordinates is not None:
-            _checks.check_coinciding(coordinates)
-            indices = _checks.orient(coordinates, indices)
+            checks.check_coinciding(coordinates)
+            indices = checks.orient(coordinates, indices)
         if space > dimension:
             from jeit.mesh import _surface
 
             indices = _surface.orient_surface(indices, coordinates)
         first, second, single = topology.pair_facets(indices)
-        _checks.check_connected(first // (dimension + 1), second // (dimension + 1), len(indices))
+        checks.check_connected(first // (dimension + 1), second // (dimension + 1), len(indices))
         facets = topology.cell_facets(indices)[single]
         if dimension == 2:
             facets = topology.order_loops(facets, coordinates) if len(facets) else facets
-        located = _checks.locate_tags(tags or {}, facets)
+        located = checks.locate_tags(tags or {}, facets)
         return Mesh(
             points=as_array(points if coordinates is None else coordinates),
             cells=as_array(indices.astype(np.int32)),

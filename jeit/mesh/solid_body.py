@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind
+from jeit.mesh.checks import size_checked
 from jeit.mesh.generate.refine import Refinement, nodes_of_solid
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Domain
 from jeit.mesh.outline.domain import Body, check_length
-from jeit.mesh.sizes import size_checked
 from jeit_solvers.engines import as_array
 
 

@@ -7,12 +7,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jeit.mesh.checks import size_checked
 from jeit.mesh.generate import unstructured
 from jeit.mesh.generate.refine import Refinement, nodes_of_solid
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import Disk, Polygon, Rectangle
 from jeit.mesh.outline.domain import check_length
-from jeit.mesh.sizes import size_checked
 
 
 def disk(

@@ -17,7 +17,7 @@ from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.files import need, npz_arrays
 from jeit.image import Inclusion, Plane, SolidForm
 from jeit.mesh import Mesh
-from jeit.mesh.sizes import size_checked
+from jeit.mesh.checks import size_checked
 from jeit.report.folder import results
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from jeit.design.study import open_results, read_study, run_study
 from jeit.design.study.batch import check_points
 from jeit.layout import SurfaceLayout, read_surface_layout, write_layout
 from jeit.mesh import forearm, measures, sphere, tube, write
+from jeit.mesh.checks import size_checked
 from jeit.mesh.geodesic import Triangles
-from jeit.mesh.sizes import size_checked
 
 TUBE = 'kind = "tube"\nradius_mm = 30\nheight_mm = 80'
 SKIN = f'[surface]\n{TUBE}\n[electrodes]\nlayout = "inner-8"\ndiameter_mm = 10\n[mesh]\ncell_mm = 8\n'

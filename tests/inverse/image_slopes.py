@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeit.inverse.nonlinear.implicit import as_solution
+from jeit.inverse.nonlinear.problem import as_solution
 from jeit.inverse.nonlinear.solvers import AbstractSolver, Solved
 from jeit_solvers import Status
 

@@ -12,7 +12,7 @@ import numpy as np
 from jeit.arguments import describe
 from jeit.layout.layout import LARGEST, SMALLEST
 from jeit.mesh import Mesh, bend, cap, forearm, from_gmsh, measures, read, rectangle, sphere, tube
-from jeit.mesh.sizes import size_checked
+from jeit.mesh.checks import size_checked
 
 if TYPE_CHECKING:
     from jeit.design.skin.surface_tables import SurfaceTable

@@ -16,8 +16,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from jeit.arguments import check_kind, check_name, counted
-from jeit.inverse.nonlinear.implicit import as_solution
-from jeit.inverse.nonlinear.problem import Inversion, check_steps, check_tolerance
+from jeit.inverse.nonlinear.problem import Inversion, as_solution, check_steps, check_tolerance
 from jeit_solvers import BoundedMinimum, Descent, Status, ended, ended_number, lbfgsb, projected_gradient
 from jeit_solvers.engines import as_array, has_values, on_host, undifferentiated
 

@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
+from jeit.mesh.checks import size_checked
 from jeit.mesh.generate import structured
 from jeit.mesh.generate.curve import circle
 from jeit.mesh.generate.refine import Refine, Refinement
 from jeit.mesh.generate.unstructured import Target, check_count, check_positions, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position, numerics
-from jeit.mesh.sizes import size_checked
 from jeit_solvers.engines import as_array
 
 

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.arguments import describe
+from jeit.mesh.checks import warn_large
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
-from jeit.mesh.sizes import warn_large
 from jeit_solvers.engines import has_values
 
 

@@ -10,13 +10,13 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.mesh import topology
+from jeit.mesh.checks import size_checked, warn_large
 from jeit.mesh.generate.curve import closed_line
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.generate.unstructured import Target, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
 from jeit.mesh.outline.domain import Domain, Pen, check_near_origin
-from jeit.mesh.sizes import size_checked, warn_large
 from jeit_solvers.engines import as_array, has_values
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
+from jeit.mesh.checks import size_checked
 from jeit.mesh.generate import structured
 from jeit.mesh.generate.curve import closed_line
 from jeit.mesh.generate.refine import Refinement
@@ -16,7 +17,6 @@ from jeit.mesh.generate.unstructured import Target, check_total, mesh_within
 from jeit.mesh.mesh import Mesh
 from jeit.mesh.outline import polyline
 from jeit.mesh.outline.domain import Domain, Pen, check_length, check_near_origin, check_position
-from jeit.mesh.sizes import size_checked
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 
 

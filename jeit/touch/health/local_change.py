@@ -26,7 +26,7 @@ from jeit.forward.model import evaluate, solved_system_of
 from jeit.forward.system import gradients
 from jeit.forward.transfer import SolvedSystem, centred, electrode_impedance, unit_fields
 from jeit.mesh import Mesh, centroids, check_flat, measures
-from jeit.mesh.sizes import size_checked
+from jeit.mesh.checks import size_checked
 from jeit_solvers.engines import on_host
 
 # Maximum number of times that a cell is halved.

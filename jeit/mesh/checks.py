@@ -1,8 +1,11 @@
-"""Checks of the arrays that define a mesh; each error names the fault and its remedy."""
+"""Checks of the arrays that define a mesh, and of its size; each error names the fault and its remedy."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +14,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from jeit.mesh import topology
-from jeit.mesh.sizes import warn_large
 
 # Minimum area or volume of a cell, relative to that power of its longest edge: gradients on flatter cells are
 # inaccurate in double precision.
@@ -179,3 +181,37 @@ def _match(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
             "of the mesh. Tags group boundary facets only."
         )
     return order[place]
+
+
+LARGE = 10.0
+"""Size in metres above which a warning is given: no tank or skin is larger."""
+_CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
+
+
+@contextmanager
+def size_checked() -> Iterator[None]:
+    """Context, or decorator of a function, in which sizes are not warned about: for meshes made from a body or another
+    mesh, whose size has been checked before."""
+    before = _CHECKED.set(True)
+    try:
+        yield
+    finally:
+        _CHECKED.reset(before)
+
+
+def warn_large(extent: float, name: str, across: float = 1.0, *, of_file: bool = False) -> None:
+    """Warn if a length of `extent` metres is probably in another unit, because the object is too large.
+
+    `across`: size of the object divided by this length; `of_file`: whether the length may come from a file, for which
+    the message suggests a scale. Inside `size_checked` there is no warning.
+    """
+    if not across * extent > LARGE or _CHECKED.get():
+        return
+    scale = [f" (a file is read with scale={one})" if of_file else "" for one in ("1e-3", "1e-2", "0.0254")]
+    warnings.warn(
+        f"{name}: {extent:g} m is large for what electrodes are put on. If the lengths are millimetres, give "
+        f"{1e-3 * extent:g}{scale[0]}, if centimetres, {1e-2 * extent:g}{scale[1]}, if inches, "
+        f"{0.0254 * extent:g}{scale[2]}: jeit computes in metres.",
+        UserWarning,
+        stacklevel=4,
+    )
