@@ -22,7 +22,7 @@ from jeit.forward.system import System, check_conductivity, field_gradients
 from jeit.forward.transfer import ElectrodeImpedance, electrode_fields, impedance_parts, solved_system
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
-from jeit_solvers import SparseCholesky, in_turn
+from jeit_solvers import in_turn
 from jeit_solvers.engines import Recent, gather, has_values, host, namespace, on_device, on_host, sum_into
 
 # Maximum number of entries of a block of the Jacobian, so that the block fits in the cache of a core.
@@ -107,7 +107,7 @@ class ForwardModel(eqx.Module):
             self.system = System.create(mesh, electrodes, solver)
         # Models are compiled with conjugate gradients, for systems too large to factorise, and with any solver that the
         # user chose.
-        self.at_once = isinstance(solver, str) and solver == "auto" and isinstance(self.system.solver, SparseCholesky)
+        self.at_once = self.system.fronts is not None
 
     def __repr__(self) -> str:
         return brief(

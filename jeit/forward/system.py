@@ -18,16 +18,19 @@ from jeit.electrodes.electrodes import Contact
 from jeit.mesh import Mesh, gradients, measures, normals
 from jeit_solvers import (
     ConjugateGradient,
+    DirectSolver,
+    Fronts,
     SparseCholesky,
     SparseSymmetric,
     SparsityPattern,
     analyse,
     choose_solver,
     factorise,
+    factorise_fronts,
+    find_fronts,
     quadratic_form,
-    solve,
 )
-from jeit_solvers.engines import gather, has_values, namespace, undifferentiated
+from jeit_solvers.engines import Recent, gather, has_values, host, namespace, undifferentiated
 
 
 def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
@@ -94,13 +97,26 @@ def _check_values(conductivity: Any, normal: Any) -> None:
         )
 
 
+def _geometry(mesh: Mesh) -> tuple[Inexact[Array, "m k s"], Inexact[Array, " m"]]:
+    """Gradients (m, d + 1, s) of the basis functions, and measures (m,) of the cells. In NumPy, those of the mesh that
+    was used last are kept."""
+    return _last_geometry(mesh) if namespace(mesh) is np else _gradients_and_measures(mesh)
+
+
+def _gradients_and_measures(mesh: Mesh):
+    return gradients(mesh), measures(mesh)
+
+
+_last_geometry = Recent(_gradients_and_measures, 1)
+
+
 def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Array, "p m"]:
     """Element stiffness ∫ ∇φ_i·σ∇φ_j for a conductivity per cell in S/m (2-D: S): lower triangles (p, m) in siemens, p
     = (d+1)(d+2)/2."""
     xp = namespace(mesh, conductivity)
-    gradient = gradients(mesh)  # (m, d + 1, d)
+    gradient, measure = _geometry(mesh)
     flux = gradient if conductivity.ndim == 1 else xp.einsum("mij,mkj->mki", conductivity, gradient)
-    weight = measures(mesh) * (conductivity if conductivity.ndim == 1 else 1)
+    weight = measure * (conductivity if conductivity.ndim == 1 else 1)
     rows, columns = np.tril_indices(mesh.dimension + 1)
     return xp.stack(
         [
@@ -117,7 +133,8 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
     With this weight the product of two gradients is the integral ∫_e ∇u·∇w.
     """
     xp = namespace(mesh, fields)
-    weighted = gradients(mesh) * xp.sqrt(measures(mesh))[:, None, None]
+    gradient, measure = _geometry(mesh)
+    weighted = gradient * xp.sqrt(measure)[:, None, None]
     corners = [gather(fields, mesh.cells[:, k]) for k in range(mesh.dimension + 1)]
     return xp.stack(
         [
@@ -128,35 +145,40 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
 
 
 class System(eqx.Module):
-    """Sparsity pattern of the system matrix, and the lineax solver for systems with this pattern.
+    """Sparsity pattern of the system matrix, and the solvers of systems with this pattern.
 
     Made once for a mesh and a kind of electrode (`System.create`). It holds no physical quantities, so one system
     serves every conductivity, contact impedance, electrode position and size.
+
+    **Fields**: `pattern`; `solver`: lineax solver, of compiled programs; `fronts`: by which matrices with known values
+    are factorised in NumPy, None if only `solver` is to be used.
     """
 
     pattern: SparsityPattern
     solver: lx.AbstractLinearSolver
+    fronts: Fronts | None = eqx.field(static=True, default=None)
 
     @classmethod
     def create(cls, mesh: Mesh, electrodes: AbstractElectrodes, solver: str | lx.AbstractLinearSolver = "auto"):
-        """Make the system for a mesh and electrodes. `solver`: "auto" (by predicted work and memory), "cholesky", "cg",
-        or any lineax solver.
+        """Make the system for a mesh and electrodes. `solver`: "auto" (by predicted memory), "cholesky", "cg", or any
+        lineax solver.
 
         Raises `ValueError` for another name.
         """
         groups = [np.asarray(nodes) for nodes in (mesh.cells, *electrodes.contact_nodes(mesh))]
         pattern = SparsityPattern.from_elements(groups, size=mesh.num_points)
-        if isinstance(solver, str):
-            coordinates = np.asarray(mesh.points)
-            if solver == "auto":
-                solver = choose_solver(pattern, coordinates)
-            elif solver == "cholesky":
-                solver = SparseCholesky(analyse(pattern, coordinates))
-            elif solver == "cg":
-                solver = ConjugateGradient()
-            else:
-                raise ValueError(f"solver must be 'auto', 'cholesky', 'cg' or a lineax solver, not '{solver}'.")
-        return cls(pattern, solver)
+        if not isinstance(solver, str):
+            return cls(pattern, solver)
+        coordinates = np.asarray(mesh.points)
+        if solver == "auto":
+            fronts = find_fronts(pattern, coordinates)
+            chosen = choose_solver(pattern, coordinates)
+            return cls(pattern, chosen, fronts if isinstance(chosen, DirectSolver) else None)
+        if solver == "cholesky":
+            return cls(pattern, SparseCholesky(analyse(pattern, coordinates)))
+        if solver == "cg":
+            return cls(pattern, ConjugateGradient())
+        raise ValueError(f"solver must be 'auto', 'cholesky', 'cg' or a lineax solver, not '{solver}'.")
 
     def grounded(
         self, mesh: Mesh, conductivity, electrodes: AbstractElectrodes, contact: Contact
@@ -178,15 +200,16 @@ class System(eqx.Module):
         """Solution A⁻¹ load, one column per load. Differentiable by implicit differentiation, whichever solver is
         used."""
         load = load.astype(operator.values.dtype)
-        if isinstance(self.solver, SparseCholesky) and isinstance(load, np.ndarray):
-            return solve(self.solver.plan, factorise(self.solver.plan, operator.values), load)
+        if self.fronts is not None and isinstance(load, np.ndarray):
+            found: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).solve(load)
+            return found.astype(load.dtype)
         constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not through the factor
         state = self.solver.init(constant, {})
-        if isinstance(self.solver, SparseCholesky):  # all columns at once; lineax solves one by one
-            plan = self.solver.plan
+        direct = self.solver
+        if isinstance(direct, DirectSolver):  # all columns at once; lineax solves one by one
 
             def solve_columns(_, columns):
-                return solve(plan, state, columns)
+                return direct.solve_columns(state, columns)
 
             def multiply(columns):
                 return operator.pattern.multiply(operator.values, columns)
@@ -201,6 +224,9 @@ class System(eqx.Module):
     def quadratic_form(self, operator: SparseSymmetric, load: Inexact[Array, "n c"]) -> Inexact[Array, "c c"]:
         """The product loadᵀ A⁻¹ load; with a direct solver it takes half the work of `solve`."""
         load = load.astype(operator.values.dtype)
+        if self.fronts is not None and isinstance(load, np.ndarray):
+            found: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).quadratic_form(load)
+            return found.astype(load.dtype)
         if isinstance(self.solver, SparseCholesky):
             return quadratic_form(self.solver.plan, factorise(self.solver.plan, operator.values), load)
         return load.T @ self.solve(operator, load)

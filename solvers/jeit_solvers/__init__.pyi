@@ -31,7 +31,9 @@ from .optimise.small_problems import (
     solve_small,
     symmetric_small,
 )
-from .sparse.choose import ConjugateGradient, SparseCholesky, choose_solver
+from .sparse.choose import ConjugateGradient, DirectSolver, FrontalCholesky, SparseCholesky, choose_solver
+from .sparse.frontal import FrontalFactor, factorise_fronts
+from .sparse.fronts import Fronts, find_fronts
 from .sparse.multifrontal import Factor, factorise, half_solve, inverse_entries, inverse_root, quadratic_form, solve
 from .sparse.near_inverse import NearInverse, Strips, near_inverse
 from .sparse.operator import SparseSymmetric
@@ -42,8 +44,12 @@ __all__ = [
     "BoundedMinimum",
     "ConjugateGradient",
     "Descent",
+    "DirectSolver",
     "Factor",
     "FactorisationPlan",
+    "FrontalCholesky",
+    "FrontalFactor",
+    "Fronts",
     "KMeans",
     "Minimum",
     "NearInverse",
@@ -60,6 +66,8 @@ __all__ = [
     "ended",
     "ended_number",
     "factorise",
+    "factorise_fronts",
+    "find_fronts",
     "gradient_small",
     "half_solve",
     "hessian_small",

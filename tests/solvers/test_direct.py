@@ -13,12 +13,10 @@ from scipy.sparse.linalg import splu
 from sparse_problems import dense
 
 from jeit_solvers import (
-    ConjugateGradient,
     SparseCholesky,
     SparseSymmetric,
     SparsityPattern,
     analyse,
-    choose_solver,
     factorise,
     half_solve,
     inverse_entries,
@@ -201,23 +199,6 @@ def test_lineax_throws_on_an_indefinite_matrix():
     solver = SparseCholesky(analyse(pattern, coordinates))
     with pytest.raises(Exception, match="positive definiteness"):
         lineax.linear_solve(SparseSymmetric(-values, pattern), jnp.ones(pattern.size), solver)
-
-
-def test_choice_follows_the_limits_and_says_why():
-    pattern, values, coordinates = sparse_problems.box()
-    vector = np.arange(1.0, pattern.size + 1)
-    direct = choose_solver(pattern, coordinates)
-    assert isinstance(direct, SparseCholesky)
-    assert direct.reason.startswith("direct: ")
-    little_memory = choose_solver(pattern, coordinates, memory_limit=1e3)
-    assert isinstance(little_memory, ConjugateGradient)
-    assert "MB allowed" in little_memory.reason
-    little_time = choose_solver(pattern, coordinates, operations_limit=1e3)
-    assert isinstance(little_time, ConjugateGradient)
-    assert "operations allowed" in little_time.reason
-    found = lineax.linear_solve(SparseSymmetric(values, pattern), jnp.asarray(vector), little_time).value
-    expected = np.linalg.solve(dense(pattern, values), vector)
-    np.testing.assert_allclose(found, expected, rtol=1e-7)
 
 
 @pytest.mark.slow

@@ -10,11 +10,20 @@ import jax.numpy as jnp
 import lineax
 from jaxtyping import Array, Bool, Inexact, Int
 
+from jeit_solvers.cores import memory_of_machine
 from jeit_solvers.engines import has_values
+from jeit_solvers.sparse.frontal import solve_at_once
+from jeit_solvers.sparse.fronts import Fronts, find_fronts
 from jeit_solvers.sparse.multifrontal import Factor, factorise, solve
 from jeit_solvers.sparse.operator import SparseSymmetric, require_sparse_symmetric
 from jeit_solvers.sparse.pattern import SparsityPattern
-from jeit_solvers.sparse.plan import FactorisationPlan, elimination_tree, plan_of_tree
+from jeit_solvers.sparse.plan import FactorisationPlan, analyse
+
+# Operations of a factorisation up to which a compiled program is made of it: on a CPU, compiling one of more takes
+# longer than it ever saves; on an accelerator, its padded index maps have to fit.
+_COMPILED_ON_CPU, _COMPILED = 5e7, 2e10
+# What takes the time that is stated, as measured on two cores.
+_OPERATIONS_PER_SECOND, _SECONDS_OF_GRADIENTS = 4e10, 1e-5
 
 
 class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
@@ -150,6 +159,10 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
             )
         return factorise(self.plan, operator.values)
 
+    def solve_columns(self, state: Factor, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
+        """Solutions for several right-hand sides."""
+        return solve(self.plan, state, columns)
+
     def compute(
         self, state: Factor, vector: Inexact[Array, " n"], options: dict[str, Any]
     ) -> tuple[Inexact[Array, " n"], lineax.RESULTS, dict[str, Any]]:
@@ -170,36 +183,91 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
         return True
 
 
+class FrontalCholesky(lineax.AbstractLinearSolver[SparseSymmetric]):
+    """Direct solver for large real or complex `SparseSymmetric` operators, with fronts of their own size, found by
+    `find_fronts`. It runs in NumPy: compiled programs call it, and are compiled in no time.
+
+    A matrix that is not positive definite gives `RESULTS.singular`.
+    """
+
+    fronts: Fronts = eqx.field(static=True)
+    reason: str = eqx.field(static=True, default="chosen by the user")
+
+    def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> SparseSymmetric:
+        """Return the matrix itself, which is factorised when it is needed. Raises `ValueError` if its pattern is not
+        that of the fronts."""
+        del options
+        operator = require_sparse_symmetric(operator, "FrontalCholesky")
+        if (operator.pattern.size, operator.pattern.num_entries) != (self.fronts.size, self.fronts.num_entries):
+            raise ValueError(
+                f"FrontalCholesky: the fronts are for a pattern of {self.fronts.size} rows and "
+                f"{self.fronts.num_entries} entries, the operator has {operator.pattern.size} rows and "
+                f"{operator.pattern.num_entries} entries. Find them with `find_fronts(operator.pattern)`."
+            )
+        return operator
+
+    def solve_columns(self, state: SparseSymmetric, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
+        """Solutions for several right-hand sides."""
+        return solve_at_once(self.fronts, state.values, columns)
+
+    def compute(
+        self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]
+    ) -> tuple[Inexact[Array, " n"], lineax.RESULTS, dict[str, Any]]:
+        """Solve. A failed factorisation yields NaN, which `lineax.linear_solve` reports as singular."""
+        del options
+        return self.solve_columns(state, vector[:, None])[:, 0], lineax.RESULTS.successful, {}
+
+    def transpose(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
+        """The matrix is its own transpose."""
+        return state, options
+
+    def conj(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
+        """The conjugate matrix."""
+        return SparseSymmetric(state.values.conj(), state.pattern), options
+
+    def assume_full_rank(self) -> bool:
+        """Always true, because a positive definite matrix has full rank."""
+        return True
+
+
+DirectSolver = SparseCholesky | FrontalCholesky
+"""The solvers that factorise; both have `solve_columns`."""
+
+
 def choose_solver(
     pattern: SparsityPattern,
     coordinates: Any = None,
     *,
-    memory_limit: float = 2e9,
-    operations_limit: float = 1e11,
+    memory_limit: float | None = None,
     tolerance: float = 1e-10,
-) -> SparseCholesky | ConjugateGradient:
-    """Choose the direct solver if its factor is affordable, else conjugate gradients; `solver.reason` states why.
+) -> DirectSolver | ConjugateGradient:
+    """Choose a direct solver if its factor fits in memory, else conjugate gradients; `solver.reason` states why.
+
+    Small matrices are factorised by compiled programs, large ones by NumPy, which compiled programs call: compilation
+    of a factorisation takes seconds. On accelerators all matrices are factorised there that the memory admits.
 
     **Arguments:**
 
     - `pattern`: sparsity pattern of the matrices.
     - `coordinates`: (n, d) of the unknowns, as for `analyse`.
-    - `memory_limit`: maximum memory of the direct solver in bytes for one matrix in double precision: factor, largest
-      temporary arrays and index maps.
-    - `operations_limit`: maximum number of floating-point operations of one factorisation; 1e11 take a few seconds.
+    - `memory_limit`: maximum memory of a factorisation in bytes; default: half of that of the machine.
     - `tolerance`: tolerance of the conjugate gradients.
     """
-    tree = elimination_tree(pattern, coordinates)
-    # Fronts are kept until their parents have used them. An index takes 4 bytes, and an entry of a front may need two
-    # indices.
-    memory = 8.0 * (tree.num_factor_entries + tree.num_front_entries) + 8.0 * tree.num_front_entries
-    cost = f"a factorisation takes {tree.num_operations:.1e} operations and {memory / 1e6:.0f} MB"
-    if memory > memory_limit:
-        return ConjugateGradient(
-            tolerance, reason=f"iterative: {cost}, more than the {memory_limit / 1e6:.0f} MB allowed"
-        )
-    if tree.num_operations > operations_limit:
-        return ConjugateGradient(
-            tolerance, reason=f"iterative: {cost}, more than the {operations_limit:.1e} operations allowed"
-        )
-    return SparseCholesky(plan_of_tree(pattern, tree), reason=f"direct: {cost}")
+    fronts = find_fronts(pattern, coordinates)
+    limit = memory_of_machine() / 2 if memory_limit is None else memory_limit
+    memory = 8.0 * (fronts.num_factor_entries + fronts.num_waiting_entries)
+    iterative = _SECONDS_OF_GRADIENTS * pattern.size ** (4 / 3)
+    cost = f"a factorisation takes {fronts.num_operations:.1e} operations and {_bytes(memory)}"
+    if memory > limit:
+        reason = f"iterative: {cost}, more than the {_bytes(limit)} allowed; 32 solutions take about {iterative:.2g} s"
+        return ConjugateGradient(tolerance, reason=reason)
+    seconds = fronts.num_operations / _OPERATIONS_PER_SECOND
+    reason = f"direct: {cost}, about {seconds:.1g} s; by conjugate gradients 32 solutions take about {iterative:.1g} s"
+    on_cpu = jax.default_backend() == "cpu"
+    if fronts.num_operations > (_COMPILED_ON_CPU if on_cpu else _COMPILED):
+        return FrontalCholesky(fronts, reason)
+    return SparseCholesky(analyse(pattern, coordinates), reason=reason)
+
+
+def _bytes(number: float) -> str:
+    return f"{number / 1e6:.0f} MB" if number < 1e9 else f"{number / 1e9:.1f} GB"

@@ -45,7 +45,7 @@ class EliminationTree:
         rows, columns = np.asarray(pattern.rows, dtype=np.int64), np.asarray(pattern.columns, dtype=np.int64)
         self.size = size
         depth = max(0, int(np.ceil(np.log2(size / _LEAF_SIZE))))
-        owner = nested_dissection(_graph(rows, columns, size), depth, coordinates)
+        owner = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
         self._make_fronts(owner, depth)
         order = np.argsort(self.front, kind="stable")
         self.place = np.empty(size, dtype=np.int64)
@@ -153,7 +153,7 @@ def rank_within(groups: np.ndarray) -> np.ndarray:
     return np.arange(groups.size) - np.repeat(np.cumsum(counts) - counts, counts)
 
 
-def _graph(rows: np.ndarray, columns: np.ndarray, size: int) -> csr_array:
+def graph_of(rows: np.ndarray, columns: np.ndarray, size: int) -> csr_array:
     """Graph of the pattern: its entries without the diagonal, in both triangles."""
     rows, columns = rows[size:], columns[size:]
     ends = (np.concatenate([rows, columns]), np.concatenate([columns, rows]))
@@ -244,16 +244,22 @@ def elimination_tree(pattern: SparsityPattern, coordinates: Any = None) -> Elimi
 
     Raises `ValueError` for coordinates that do not have shape (n, d) or are not finite.
     """
-    if coordinates is not None:
-        coordinates = np.asarray(coordinates, dtype=float)
-        if coordinates.ndim != 2 or coordinates.shape[0] != pattern.size or coordinates.shape[1] < 1:
-            raise ValueError(
-                f"analyse: `coordinates` must have shape (n, d) with n = {pattern.size} unknowns; "
-                f"got {coordinates.shape}."
-            )
-        if not np.isfinite(coordinates).all():
-            raise ValueError("analyse: `coordinates` hold NaN or infinity.")
-    return EliminationTree(pattern, coordinates)
+    return EliminationTree(pattern, checked_coordinates(pattern, coordinates))
+
+
+def checked_coordinates(pattern: SparsityPattern, coordinates: Any) -> np.ndarray | None:
+    """Coordinates (n, d) of the unknowns as an array, or None. Raises `ValueError` for another shape, and if they are
+    not finite."""
+    if coordinates is None:
+        return None
+    coordinates = np.asarray(coordinates, dtype=float)
+    if coordinates.ndim != 2 or coordinates.shape[0] != pattern.size or coordinates.shape[1] < 1:
+        raise ValueError(
+            f"analyse: `coordinates` must have shape (n, d) with n = {pattern.size} unknowns; got {coordinates.shape}."
+        )
+    if not np.isfinite(coordinates).all():
+        raise ValueError("analyse: `coordinates` hold NaN or infinity.")
+    return coordinates
 
 
 def plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> FactorisationPlan:

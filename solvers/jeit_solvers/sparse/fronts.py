@@ -1,0 +1,239 @@
+"""Fronts of a sparsity pattern, each of its own size: the order of elimination for matrices at hand.
+
+A *front* is a small dense matrix: its *pivots* are rows that are eliminated together, and its *border* consists of the
+later rows that their elimination changes (multifrontal method; Duff and Reid, ACM Trans. Math. Softw. 9, 1983). Rows
+are numbered in the order of elimination; the pivots of a front are consecutive. Subtrees of the elimination tree that
+do not depend on each other come first, one after the other, and then the fronts above them, level by level.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
+
+import numpy as np
+from jaxtyping import Int
+
+from jeit_solvers.sparse.dissection import nested_dissection
+from jeit_solvers.sparse.pattern import SparsityPattern
+from jeit_solvers.sparse.plan import checked_coordinates, graph_of
+
+# Size of the fronts at the leaves of the tree: small enough to be treated as dense, and large enough for the time of
+# BLAS to exceed that of calling it.
+_LEAF_SIZE = 128
+# Levels of the tree above the independent subtrees.
+_SPLIT = 3
+# Bits of each coordinate in the order of a front's rows.
+_BITS = 10
+
+
+class Front(NamedTuple):
+    """**Fields**: `pivots`: number p; `border`: number b; `first`: number of the first pivot; `rows`: (b,) numbers of
+    the rows of the border, ascending; `entries`: range of the matrix entries of its pivots; `place`: their indices in
+    the flattened panel (p, p + b); `children`: numbers of the fronts whose parent it is; `into`: (b,) indices of the
+    rows of the border among the rows of the parent, pivots first, of which `among_pivots` are its pivots; `in_subtree`:
+    number of rows of the border that the front's own subtree eliminates."""
+
+    pivots: int
+    border: int
+    first: int
+    rows: Int[np.ndarray, " b"]
+    entries: slice
+    place: Int[np.ndarray, " e"]
+    children: tuple[int, ...]
+    into: Int[np.ndarray, " b"]
+    among_pivots: int
+    in_subtree: int
+
+
+@dataclass(frozen=True, eq=False)
+class Fronts:
+    """Fronts of a sparsity pattern, in the order of their elimination; equal if pattern and order are.
+
+    **Fields**: `size`, `num_entries`: of the pattern; `order`: (n,) row of the matrix of each number; `entry_order`:
+    (nnz,) entries of the matrix in the order of the fronts that hold them; `fronts`; `steps`: slices of fronts that do
+    not depend on each other, first the subtrees and then the fronts of each level above them; `top`: number of the
+    first row that a front above the subtrees eliminates; `key`: by which fronts are compared.
+    """
+
+    size: int
+    num_entries: int
+    order: Int[np.ndarray, " n"]
+    entry_order: Int[np.ndarray, " nnz"]
+    fronts: tuple[Front, ...]
+    steps: tuple[tuple[slice, ...], ...]
+    top: int
+    key: bytes
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Fronts) and self.key == other.key
+
+    def __repr__(self) -> str:
+        return f"Fronts({self.size} rows, {len(self.fronts)} fronts, {self.num_operations:.1e} operations)"
+
+    @property
+    def num_operations(self) -> float:
+        """Number of floating-point operations of a factorisation."""
+        return float(sum(_operations(one.pivots, one.border) for one in self.fronts))
+
+    @property
+    def num_factor_entries(self) -> int:
+        """Number of entries of the factor as it is stored."""
+        return sum(one.pivots * (one.pivots + one.border) for one in self.fronts)
+
+    @property
+    def num_waiting_entries(self) -> int:
+        """Greatest number of entries of Schur complements that wait for their parents, if fronts are eliminated one
+        after the other."""
+        waiting = most = 0
+        for one in self.fronts:
+            most = max(most, waiting + one.border**2)
+            waiting += one.border**2 - sum(self.fronts[child].border ** 2 for child in one.children)
+        return most
+
+
+def _operations(pivots: Any, border: Any) -> Any:
+    return pivots**3 / 3 + pivots**2 * border + 1.0 * pivots * border**2
+
+
+def find_fronts(pattern: SparsityPattern, coordinates: Any = None) -> Fronts:
+    """Fronts of a pattern, in NumPy and SciPy, once per pattern. `coordinates` (n, d) of the unknowns give a better
+    order than the pattern alone. Raises `ValueError` if their shape does not fit or they are not finite."""
+    coordinates = checked_coordinates(pattern, coordinates)
+    rows, columns = (np.asarray(one, dtype=np.int64) for one in (pattern.rows, pattern.columns))
+    found = hashlib.blake2b(digest_size=16)
+    for one in (rows, columns, coordinates if coordinates is not None else np.zeros(0)):
+        found.update(np.ascontiguousarray(one).tobytes())
+    key = found.digest()
+    if (known := _FRONTS.get(key)) is None:
+        _FRONTS[key] = known = _fronts(pattern.size, rows, columns, coordinates, key)
+    return known
+
+
+# Fronts in use, for models that are made again on the same mesh.
+_FRONTS: WeakValueDictionary[bytes, Fronts] = WeakValueDictionary()
+
+
+def _fronts(size: int, rows: np.ndarray, columns: np.ndarray, coordinates: np.ndarray | None, key: bytes) -> Fronts:
+    depth = max(0, int(np.ceil(np.log2(size / _LEAF_SIZE))))
+    owner = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
+    nodes, owner = np.unique(owner, return_inverse=True)
+    level = np.floor(np.log2(nodes + 1)).astype(int)
+    split = min(_SPLIT, depth)
+    # Steps: the subtrees are number 0, the levels above them 1, 2, …
+    step = np.maximum(split - level, 0)
+    subtree = np.where(step, 0, (nodes + 1) >> np.maximum(level - split, 0))
+    by_number = np.lexsort((_post_order(nodes, level, depth), subtree, step))
+    number = np.argsort(by_number)
+    tree = _Tree(size, rows, columns, number[owner], level[by_number], coordinates)
+    part = np.where(step, nodes, subtree)[by_number]
+    starts = np.flatnonzero(np.diff(part, prepend=-1))
+    slices = [slice(*both) for both in itertools.pairwise([*starts.tolist(), len(nodes)])]
+    step_of = step[by_number][starts]
+    steps = tuple(tuple(itertools.compress(slices, step_of == one)) for one in range(split + 1))
+    top = int(tree.pivots[: np.count_nonzero(step == 0)].sum())
+    return Fronts(size, len(rows), tree.order, tree.entry_order, tree.fronts(top), steps, top, key)
+
+
+def _post_order(nodes: np.ndarray, level: np.ndarray, depth: int) -> np.ndarray:
+    """Position of nodes of a complete binary tree in an order in which each follows all below it."""
+    position = np.full(len(nodes), 2 ** (depth + 1) - 2)
+    for above in range(depth):
+        # The ancestor of a node just below level `above`: a left one comes before its whole right sibling.
+        height = level - above - 1
+        left = (height >= 0) & ((((nodes + 1) >> np.maximum(height, 0)) & 1) == 0)
+        position -= np.where(height >= 0, 1 + np.where(left, 2 ** (depth - above) - 1, 0), 0)
+    return position
+
+
+class _Tree:
+    """Elimination tree of fronts that are numbered in the order of elimination. `pivots`, `border`, `parent`, `level`:
+    of each front; `order`, `entry_order`: as of `Fronts`."""
+
+    def __init__(self, size: int, rows, columns, front_of_row, level, coordinates):
+        self.size, self.level = size, level
+        keys = (front_of_row,) if coordinates is None else (_along_a_curve(coordinates), front_of_row)
+        self.order = np.lexsort(keys)
+        number = np.empty(size, dtype=np.int64)
+        number[self.order] = np.arange(size)
+        self.front = front_of_row[self.order]
+        count = len(level)
+        self.pivots = np.bincount(self.front, minlength=count)
+        self.first = np.cumsum(self.pivots) - self.pivots
+        first, second = number[rows], number[columns]
+        self.early, self.late = np.minimum(first, second), np.maximum(first, second)
+        self._find_borders(count)
+        self.border = np.bincount(self.border_front, minlength=count)
+        self.border_first = np.cumsum(self.border) - self.border
+        self.into = self._place(self.parent[self.border_front], self.border_row)
+        holder = self.front[self.early]
+        self.entry_order = np.argsort(holder, kind="stable")
+
+    def _find_borders(self, count: int) -> None:
+        """Find the rows of each front's border: the later rows of its entries, and the borders of its children without
+        its own pivots; and its parent, which eliminates the first of them."""
+        size, front = self.size, self.front
+        first, second = front[self.early], front[self.late]
+        pending = np.unique((first * size + self.late)[first != second])
+        self.parent, borders = np.full(count, -1), [np.zeros(0, dtype=np.int64)]
+        for level in range(int(self.level.max()), -1, -1):
+            mine = self.level[pending // size] == level
+            border, pending = pending[mine], pending[~mine]
+            child, row = np.divmod(border, size)
+            borders.append(border)
+            start = np.flatnonzero(np.diff(child, prepend=-1))
+            self.parent[child[start]] = front[row[start]]
+            above = self.parent[child]
+            pending = np.unique(np.concatenate([pending, (above * size + row)[front[row] != above]]))
+        self.keys = np.sort(np.concatenate(borders))
+        self.border_front, self.border_row = np.divmod(self.keys, size)
+
+    def _place(self, fronts: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Indices of rows in fronts: pivots first, then the border."""
+        in_border = np.searchsorted(self.keys, fronts * self.size + rows) - self.border_first[fronts]
+        own = self.front[rows] == fronts
+        return np.where(own, rows - self.first[fronts], self.pivots[fronts] + in_border)
+
+    def fronts(self, top: int) -> tuple[Front, ...]:
+        """All fronts; `top`: number of the first row above the subtrees."""
+        holder = self.front[self.early]
+        height = self.pivots + self.border
+        place = (self.early - self.first[holder]) * height[holder] + self._place(holder, self.late)
+        place = place[self.entry_order]
+        ends = np.searchsorted(holder[self.entry_order], np.arange(len(height) + 1)).tolist()
+        among = self.into < self.pivots[self.parent[self.border_front]]
+        among_pivots = np.bincount(self.border_front[among], minlength=len(height)).tolist()
+        below = np.bincount(self.border_front[self.border_row < top], minlength=len(height)).tolist()
+        children: list[list[int]] = [[] for _ in height]
+        for child, parent in enumerate(self.parent.tolist()):
+            if parent >= 0:
+                children[parent].append(child)
+        starts, counts = self.border_first.tolist(), self.border.tolist()
+        made = []
+        for number, (pivots, first) in enumerate(zip(self.pivots.tolist(), self.first.tolist(), strict=True)):
+            rows = slice(starts[number], starts[number] + counts[number])
+            entries = slice(ends[number], ends[number + 1])
+            one = Front(
+                pivots, counts[number], first, self.border_row[rows], entries, place[entries],
+                tuple(children[number]), self.into[rows], among_pivots[number], below[number],
+            )  # fmt: skip
+            made.append(one)
+        return tuple(made)
+
+
+def _along_a_curve(coordinates: np.ndarray) -> np.ndarray:
+    """Position of points along a curve that fills space (Morton's): rows that are near each other in space are near
+    each other in a front, so that the rows of a child are runs of those of its parent."""
+    extent = max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
+    cells = ((coordinates - coordinates.min(axis=0)) / extent * (2**_BITS - 1)).astype(np.int64)
+    position = np.zeros(len(cells), dtype=np.int64)
+    for bit in range(_BITS - 1, -1, -1):
+        for axis in cells.T:
+            position = 2 * position + ((axis >> bit) & 1)
+    return position
