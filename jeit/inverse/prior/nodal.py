@@ -11,26 +11,38 @@ import scipy.sparse
 from jaxtyping import Float
 
 from jeit.mesh import Mesh
-from jeit_solvers import Factor, FactorisationPlan, SparsityPattern, analyse, factorise, on_cores, solve
+from jeit_solvers import (
+    Factor,
+    FactorisationPlan,
+    Fronts,
+    SparsityPattern,
+    factorise,
+    factorise_fronts,
+    find_fronts,
+    half_solve,
+    on_cores,
+    solve,
+)
 from jeit_solvers.engines import on_host
 
-# Number of columns solved for at a time: with more, the fronts exceed the caches and memory grows.
-_AT_ONCE = 32
+# Number of columns solved for at a time, by a plan's padded fronts and by fronts of their own size: with more, they
+# exceed the caches and memory grows.
+_AT_ONCE, _BY_FRONTS = 32, 256
 
-Solve = Callable[[Float[np.ndarray, "n k"]], Float[np.ndarray, "n k"]]
+Solve = Callable[[Any], Any]
 """Function that solves a linear system for columns (n, k)."""
 
 
 class NodalSystem(NamedTuple):
     """Structure of sparse matrices whose entries couple the nodes of a cell.
 
-    **Fields**: `mesh`: mesh with NumPy arrays; `pattern`: sparsity pattern; `plan`: plan of the factorisation; `means`
-    (m, n): matrix that averages nodal values over each cell.
+    **Fields**: `mesh`: mesh with NumPy arrays; `pattern`: sparsity pattern; `fronts`: order of the factorisation;
+    `means` (m, n): matrix that averages nodal values over each cell.
     """
 
     mesh: Mesh
     pattern: SparsityPattern
-    plan: FactorisationPlan
+    fronts: Fronts
     means: scipy.sparse.csr_array
 
     @classmethod
@@ -39,12 +51,11 @@ class NodalSystem(NamedTuple):
         mesh = on_host(mesh)
         cells, count = np.asarray(mesh.cells), mesh.cells.shape[1]
         pattern = SparsityPattern.from_elements([cells], size=mesh.num_points)
-        plan = analyse(pattern, np.asarray(mesh.points))
+        fronts = find_fronts(pattern, np.asarray(mesh.points))
         ends = np.arange(0, cells.size + 1, count)
         shape = mesh.num_cells, mesh.num_points
         means = scipy.sparse.csr_array((np.full(cells.size, 1 / count), cells.ravel(), ends), shape=shape)
-        pattern, plan = on_host((pattern, plan))
-        return cls(mesh, pattern, plan, means)
+        return cls(mesh, on_host(pattern), fronts, means)
 
     def assemble(
         self, elements: Float[np.ndarray, "..."], diagonal: Float[np.ndarray, " n"]
@@ -59,28 +70,48 @@ class NodalSystem(NamedTuple):
     def inverse(self, values: Any) -> Solve:
         """Factorise the matrix A whose entries in the pattern's order are `values`; return a function that solves
         A X = B for columns B (n, k)."""
-        factor = factorise(self.plan, values)
-        return lambda columns: in_columns(solve, self.plan, factor, columns)
+        factor = factorise_fronts(self.fronts, values)
+        return lambda columns: by_columns(factor.solve, columns, len(columns))
 
 
-def in_columns(
-    how: Callable[[FactorisationPlan, Factor, Any], Any], plan: FactorisationPlan, factor: Factor, columns: Any
-) -> Any:
-    """Apply `how`, which is `solve` or `half_solve`, to columns (n, k). NumPy arrays are split over all cores."""
+class Factorised(NamedTuple):
+    """A factorised matrix A = L Lᵀ. **Fields**: `solve`: A⁻¹ times columns (n, k); `half_solve`: L⁻¹ times columns,
+    rows in an order of its own."""
+
+    solve: Solve
+    half_solve: Solve
+
+
+def factorised(plan: FactorisationPlan, fronts: Fronts, values: Any) -> Factorised:
+    """Factorise a matrix: in NumPy by its `fronts`, with the columns split over all cores, or traced by its `plan`."""
+    if not isinstance(values, np.ndarray):
+        factor = factorise(plan, values)
+        return Factorised(
+            lambda columns: solve(plan, factor, columns), lambda columns: half_solve(plan, factor, columns)
+        )
+    mine = factorise_fronts(fronts, values)
+    return Factorised(
+        lambda columns: by_columns(mine.solve, columns, len(columns)),
+        lambda columns: by_columns(mine.half_solve, columns, len(columns)),
+    )
+
+
+def solve_columns(plan: FactorisationPlan, factor: Factor, columns: Any) -> Any:
+    """Solutions for columns (n, k). NumPy arrays are split over all cores."""
     if not isinstance(columns, np.ndarray):
-        return how(plan, factor, columns)
-    return by_columns(functools.partial(how, plan, factor), columns, plan.size if how is solve else plan.num_pivots)
+        return solve(plan, factor, columns)
+    return by_columns(functools.partial(solve, plan, factor), columns, plan.size, _AT_ONCE)
 
 
-def by_columns(function: Callable[[Any], Any], columns: Any, rows: int) -> Any:
-    """Apply `function` to blocks of the columns of a NumPy array (n, k), in parallel on all cores; returns (rows, k).
-    `function` may itself call `by_columns` with all columns it is given."""
+def by_columns(function: Callable[[Any], Any], columns: Any, rows: int, at_once: int = _BY_FRONTS) -> Any:
+    """Apply `function` to blocks of `at_once` columns of a NumPy array (n, k), in parallel on all cores; returns
+    (rows, k). `function` may itself call `by_columns` with all columns it is given."""
     number = columns.shape[1]
     found = np.empty((rows, number), columns.dtype)
 
     def some(start: int) -> None:
-        part = np.ascontiguousarray(columns[:, start : start + _AT_ONCE])
-        found[:, start : start + _AT_ONCE] = function(part)
+        part = np.ascontiguousarray(columns[:, start : start + at_once])
+        found[:, start : start + at_once] = function(part)
 
-    on_cores(some, range(0, number, _AT_ONCE))
+    on_cores(some, range(0, number, at_once))
     return found

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.channels import Data
 from jeit.inverse.prior.bases import AbstractBasis, DiagonalBasis, NodalBasis
-from jeit.inverse.prior.nodal import in_columns
+from jeit.inverse.prior.nodal import solve_columns
 from jeit_solvers import (
     Factor,
     FactorisationPlan,
@@ -25,7 +25,6 @@ from jeit_solvers import (
     inverse_entries,
     inverse_root,
     ridge_model,
-    solve,
 )
 from jeit_solvers.engines import host, namespace
 
@@ -195,7 +194,7 @@ class SparseNormal(AbstractNormal):
     def covariance_product(self, columns):
         """Q⁻¹ times columns, by sparse solves."""
         size = self.plan.size
-        solved = in_columns(solve, self.plan, self.factor, columns[:size])
+        solved = solve_columns(self.plan, self.factor, columns[:size])
         return namespace(columns, solved).concatenate([solved, columns[size:]])
 
     def variance(self, basis):

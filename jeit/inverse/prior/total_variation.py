@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.hyperparameter.choice import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis, NodalBasis
-from jeit.inverse.prior.nodal import in_columns
+from jeit.inverse.prior.nodal import factorised
 from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import Mesh, gradients, measures
@@ -32,10 +32,11 @@ from jeit.mesh.geometry import interior_facets
 from jeit_solvers import (
     Factor,
     FactorisationPlan,
+    Fronts,
     SparsityPattern,
     analyse,
     factorise,
-    half_solve,
+    find_fronts,
     solve,
     solve_definite,
 )
@@ -48,7 +49,8 @@ class NodalTotalVariation(AbstractPenalty):
 
     **Fields**: `cells` (m, 4); `slope` (m, 4, 3): gradients of the basis functions, 1/m; `weight` (m,); `steepness`
     (m,): gradient below which the penalty is nearly quadratic, 1/m; `pull` (n,): weight of the deviation from the
-    background; `reference` (n,); `pattern`, `plan`: sparsity pattern and factorisation plan of matrices over the nodes.
+    background; `reference` (n,); `pattern`, `plan`: sparsity pattern and factorisation plan of matrices over the nodes;
+    `fronts`: order of the factorisation of matrices at hand.
     """
 
     cells: Int[Array, "m k"]
@@ -59,6 +61,7 @@ class NodalTotalVariation(AbstractPenalty):
     reference: Float[Array, " n"]
     pattern: SparsityPattern
     plan: FactorisationPlan
+    fronts: Fronts = eqx.field(static=True)
 
     @classmethod
     def create(
@@ -69,8 +72,8 @@ class NodalTotalVariation(AbstractPenalty):
         mesh = on_host(mesh)
         cells, size = np.asarray(mesh.cells), mesh.num_points
         pattern = SparsityPattern.from_elements([cells], size=size)
-        plan = analyse(pattern, np.asarray(mesh.points))
-        volume, extent = np.asarray(measures(mesh)), np.ptp(np.asarray(mesh.points), axis=0).max()
+        points = np.asarray(mesh.points)
+        volume, extent = np.asarray(measures(mesh)), np.ptp(points, axis=0).max()
         share = np.repeat(volume[:, None] / cells.shape[1], cells.shape[1], axis=1)
         total = np.bincount(cells.ravel(), share.ravel(), size)
         xp = namespace(reference)
@@ -83,7 +86,8 @@ class NodalTotalVariation(AbstractPenalty):
             pull=hyperparameter * host.asarray(pull * total / total.sum()),
             reference=onto_nodes,
             pattern=pattern,
-            plan=plan,
+            plan=analyse(pattern, points),
+            fronts=find_fronts(pattern, points),
         )
         return NodalBasis(energy.cells, size), energy
 
@@ -114,15 +118,16 @@ class NodalTotalVariation(AbstractPenalty):
         bend = self.weight * self.steepness**2 / self._height(image) ** 3
         within = gather(mine, self.cells)
         elements = self._elements(bend) * (within[:, :, None] & within[:, None, :])
-        solved = solve(self.plan, self._factor(elements, jnp.where(mine, self.pull, 1)), columns[:size])
+        factor = factorise(self.plan, self._matrix(elements, jnp.where(mine, self.pull, 1)))
+        solved = solve(self.plan, factor, columns[:size])
         return jnp.concatenate([solved, columns[size:]])
 
     def normal(self, coefficients):
         """Normal distribution whose precision is the quadratic form that touches the energy at c, as in
         `TotalVariationPenalty.normal`."""
         image, _ = self._parts(coefficients)
-        factor = self._factor(self._elements(self.weight / self._height(image)), self.pull)
-        return SparseNormal(self.pattern, self.plan, factor)
+        values = self._matrix(self._elements(self.weight / self._height(image)), self.pull)
+        return SparseNormal(self.pattern, self.plan, factorise(self.plan, values))
 
     def model(self, residual, jacobian, coefficients, data):
         """Objective and step: Gauss-Newton for the data, lagged diffusivity for the energy, in data space, as in
@@ -137,16 +142,16 @@ class NodalTotalVariation(AbstractPenalty):
             xp = namespace(self, jacobian)
             flux = stiffness[:, None] * self._gradient(self.reference + image)
             gradient = self.pull * image + self._divergence(flux)
-            factor = self._factor(self._elements(stiffness), self.pull)
+            factor = factorised(self.plan, self.fronts, self._matrix(self._elements(stiffness), self.pull))
             columns = xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
             # Products with Γ are formed from half solves; the direction takes one more full solve.
-            half = in_columns(half_solve, self.plan, factor, columns)
+            half = factor.half_solve(columns)
             products = half.T @ half
             further = jacobian[:, size:]
             outer = (products[:-1, :-1] + further @ further.T) / (1 + damping)
             descent = (products[:-1, -1] + further @ rest) / (1 + damping)
             inner = solve_definite(outer + data.covariance, residual - descent)
-            image_direction = solve(self.plan, factor, gradient + inner @ jacobian[:, :size])
+            image_direction = factor.solve((gradient + inner @ jacobian[:, :size])[:, None])[:, 0]
             direction = -xp.concatenate([image_direction, rest + inner @ further]) / (1 + damping)
             across = jacobian @ direction
             own, other = self._parts(direction)
@@ -161,11 +166,11 @@ class NodalTotalVariation(AbstractPenalty):
         """Element matrices (m, k, k) of the quadratic form Σ stiffness |∇x|²."""
         return namespace(self, stiffness).einsum("mid,mjd,m->mij", self.slope, self.slope, stiffness)
 
-    def _factor(self, elements, diagonal) -> Factor:
-        """Factorise the matrix assembled from `elements`, plus `diagonal`."""
+    def _matrix(self, elements, diagonal):
+        """Values of the matrix assembled from `elements`, plus `diagonal`."""
         values = self.pattern.assemble(elements)
         xp = namespace(self, values)
-        return factorise(self.plan, values + xp.concatenate([diagonal, xp.zeros(len(values) - len(diagonal))]))
+        return values + xp.concatenate([diagonal, xp.zeros(len(values) - len(diagonal))])
 
     def _gradient(self, image):
         """Gradient (m, d) of a nodal image in every cell, 1/m."""
