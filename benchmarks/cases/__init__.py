@@ -10,6 +10,7 @@ from benchmarks.harness.case import Case
 NAMES = (
     "forward",
     "solver",
+    "scaling",
     "gauss_newton",
     "optimisers",
     "realtime",

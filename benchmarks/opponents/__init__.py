@@ -12,5 +12,7 @@ CONTESTANTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "pyeit": ("benchmarks.opponents.pyeit", "PyeitContestant", ()),
     "jeit's solver": ("benchmarks.opponents.jeit_solver", "JeitSolver", ()),
     "SuperLU": ("benchmarks.opponents.superlu", "SuperLU", ()),
+    "jeit's fronts": ("benchmarks.opponents.jeit_fronts", "JeitFronts", ()),
+    "PARDISO": ("benchmarks.opponents.pardiso", "Pardiso", ()),
     "sparsax": ("benchmarks.opponents.sparsax", "Sparsax", ()),
 }

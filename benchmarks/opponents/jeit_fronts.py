@@ -1,0 +1,36 @@
+"""The sparse direct solver of matrices at hand: factorisation in NumPy, with solutions or with products alone."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+import jeit  # noqa: F401  (double precision)
+from jeit_solvers import SparsityPattern, factorise_fronts, find_fronts
+
+
+class JeitFronts:
+    """`tasks` maps a task's name to a function of the number of the repeat, which picks the matrix."""
+
+    def __init__(self, problem: dict[str, np.ndarray]):
+        pattern = SparsityPattern.from_entries(problem["rows"], problem["columns"], len(problem["load"]))
+        start = time.perf_counter()
+        fronts = find_fronts(pattern, problem["points"])
+        seconds = time.perf_counter() - start
+        every, load = [np.asarray(pattern.assemble(one)) for one in problem["values"]], problem["load"]
+
+        def factor(number: int):
+            return factorise_fronts(fronts, every[number % len(every)])
+
+        self.description = "nested dissection, multifrontal Cholesky in NumPy and SciPy's BLAS"
+        self.details = {
+            "plan": seconds,
+            "factor MB": 8 * fronts.num_factor_entries / 1e6,
+            "operations": fronts.num_operations,
+        }
+        self.tasks = {
+            "factorise and solve": lambda k: factor(k).solve(load),
+            "factorise and multiply": lambda k: factor(k).quadratic_form(load),
+            "factorise": factor,
+        }
