@@ -105,14 +105,34 @@ def test_lines_of_openeit(made, table, tmp_path):
 
 
 def test_characters_that_openeit_lost(tmp_path):
-    """Serial lines lose some: a frame of another length is masked, and never taken for another."""
+    """Serial lines lose some: what is left of a number or of a frame is masked, and never taken for another."""
     path = tmp_path / "a.txt"
     frame = "magnitudes: " + "".join(f"{one}.5 , " for one in range(1, 33))
-    path.write_text(frame + frame.replace("2.5 , ", "2.5", 1) + frame.replace("3.5", "3x5", 1) + frame)
+    cells = frame.replace("3.5", "3x5", 1).replace("7.5", "-7.5", 1).replace("9.5", "1_000", 1)
+    path.write_text("12.5 , " + frame + frame.replace("2.5 , ", "2.5", 1) + cells + "\nINFO 3\n" + frame.rstrip(" ,"))
     found = data.read(path)
-    assert np.asarray(found.mask).sum(axis=1).tolist() == [32, 0, 31, 32]
-    assert any("lost in frame 2" in note for note in found.notes)
-    assert any("1 reading of zero, as of an open circuit, or illegible" in note for note in found.notes)
+    assert np.asarray(found.mask).sum(axis=1).tolist() == [32, 0, 29, 31]
+    for note in ("lost in frame 1: masked", "6 characters before the first", "nothing follows the last number"):
+        assert any(note in one for one in found.notes), note
+    assert any("4 readings of zero, as of an open circuit, or illegible" in note for note in found.notes)
+    path.write_text(frame + frame[:40])
+    assert data.read(path).num_frames == 1
+
+
+def test_what_a_description_leaves_out_is_as_openeit_sends_it(tmp_path):
+    """The order of opposite drives, which no reciprocity shows; units that are stated are those of the numbers."""
+    path = tmp_path / "a.txt"
+    path.write_text("magnitudes: " + "".join(f"{one}.5 , " for one in range(1, 33)))
+    body, kind = RING + "number = 8\n", '[protocol]\nkind = "opposite"\ndrives = "all"\ncurrent = 2e-3\n'
+    (tmp_path / "a.toml").write_text(body + kind)
+    found = data.read(path)
+    assert found.protocol.same_patterns(protocol.opposite(8, drives="all", order="fixed", current=2e-3))
+    np.testing.assert_allclose(np.abs(found.voltages[0]), 2e-3 * (np.arange(1, 33) + 0.5))
+    assert any("as the firmware sends" in note for note in found.notes)
+    (tmp_path / "a.toml").write_text(body + kind + 'order = "rotating"\n')
+    assert data.read(path).protocol.same_patterns(protocol.opposite(8, drives="all", current=2e-3))
+    (tmp_path / "a.toml").write_text(body + '[data]\nunit = "mV"\n')
+    np.testing.assert_allclose(np.abs(data.read(path).voltages[0]), 1e-3 * (np.arange(1, 33) + 0.5))
 
 
 def test_what_openeit_does_not_send_is_refused(tmp_path):
@@ -120,6 +140,12 @@ def test_what_openeit_does_not_send_is_refused(tmp_path):
     path.write_text("magnitudes: 1, 2, 3")
     with pytest.raises(ValueError, match="most frames have 3 numbers; the firmware sends 32 \\(8 electrodes\\)"):
         data.read(path, "openeit")
+    path.write_text("1, 2, 3")
+    with pytest.raises(ValueError, match="no frame begins with 'magnitudes:'"):
+        data.read(path, "openeit")
+    path.write_text(2 * ("magnitudes: " + "1.5, " * 28) + 3 * ("magnitudes: " + "1.5, " * 32))
+    with pytest.raises(ValueError, match="2 frames have 28 numbers, and 3 have 32"):
+        data.read(path)
     path.write_text("magnitudes: " + "1.5, " * 32)
     with pytest.raises(ValueError, match="no arrays to choose from"):
         data.read(path, key="a")
