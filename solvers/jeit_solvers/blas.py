@@ -70,13 +70,13 @@ def eliminate(panel: np.ndarray, schur: np.ndarray) -> bool:
         square: Any = np.triu(panel[:, :pivots])
         square += np.triu(square, 1).T
         panel[:, :pivots] = inverse_cholesky(square[None])[0] @ square
-        if not np.isfinite(np.diagonal(panel)).all():
-            return False
     else:
         info = ctypes.c_int(0)
         _potrf(b"L", _length(pivots), panel.ctypes.data, stride, ctypes.byref(info))
         if info.value:
             return False
+    if not np.isfinite(np.diagonal(panel)).all():
+        return False
     if border:
         right, one = panel.ctypes.data + pivots * panel.itemsize, kind.one.ctypes.data
         count, wide = _length(pivots), _length(border)
@@ -88,6 +88,8 @@ def eliminate(panel: np.ndarray, schur: np.ndarray) -> bool:
 
 def solve_triangle(panel: np.ndarray, vectors: np.ndarray, *, transposed: bool) -> None:
     """Overwrite vectors (p, k) with L⁻¹ vectors, or L⁻ᵀ vectors; `panel` from `eliminate`, [Lᵀ, …]."""
+    if not vectors.size:
+        return
     kind, which = _KINDS[panel.dtype], b"N" if transposed else b"T"
     count, number = _length(len(panel)), _length(vectors.shape[1])
     one, triangle, stride = kind.one.ctypes.data, panel.ctypes.data, _stride(panel)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import itertools
 import os
 import threading
@@ -61,20 +62,25 @@ def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], number: int,
 def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     """Apply `function` to each part, in NumPy, in parallel on several cores; the function stores its results itself.
 
-    A single part, or a call from inside another part, is processed in the calling thread. Floating-point warnings are
-    suppressed, because NaN is reported elsewhere.
+    A single part, a call from inside another part, and a call while another thread has the cores, are processed in the
+    calling thread: parts may wait for compiled programs, which call NumPy from threads of their own. Floating-point
+    warnings are suppressed, because NaN is reported elsewhere.
     """
 
     def quietly(part: Any) -> None:
         with np.errstate(all="ignore"):  # every thread has its own error state
             function(part)
 
-    if len(parts) <= 1 or threading.current_thread().name.startswith(_NAME):
+    inside = threading.current_thread().name.startswith(_NAME)
+    if len(parts) <= 1 or inside or not _cores_taken(os.getpid()).acquire(blocking=False):
         for part in parts:
             quietly(part)
         return
-    with one_thread_of_blas():
-        list(_workers(os.getpid()).map(quietly, parts))
+    try:
+        with one_thread_of_blas():
+            list(_workers(os.getpid()).map(quietly, parts))
+    finally:
+        _cores_taken(os.getpid()).release()
 
 
 def parts_for_cores(number: int) -> list[slice]:
@@ -91,9 +97,15 @@ def _workers(process: int) -> ThreadPoolExecutor:
 
 
 @functools.cache
+def _cores_taken(process: int) -> threading.Lock:
+    """Lock of the thread pool of a process."""
+    return threading.Lock()
+
+
+@functools.cache
 def blas() -> threadpoolctl.ThreadpoolController:
     """Controller of the BLAS libraries of NumPy and of SciPy, which are two."""
-
+    importlib.import_module("scipy.linalg.cython_blas")  # loads SciPy's
     return threadpoolctl.ThreadpoolController().select(user_api="blas")
 
 
@@ -117,11 +129,12 @@ def one_thread_of_blas() -> Iterator[None]:
             if limit is not None:  # the first context holds the original limits, and is the last to be removed
                 _take_control()
                 limit.restore_original_limits()
+                _take_control()
 
 
 def _take_control() -> None:
-    """Let this thread set the number of threads of BLAS: from version 3.8 on, threadpoolctl obeys only the thread that
-    set it first."""
+    """Let any thread set the number of threads of BLAS next: from version 3.8 on, threadpoolctl obeys only the thread
+    that set it first."""
     for library in blas().lib_controllers:
         if isinstance(library, threadpoolctl.OpenBLASController) and hasattr(library, "clear_controlling_thread"):
             library.clear_controlling_thread(force=True)

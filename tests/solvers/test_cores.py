@@ -61,6 +61,14 @@ def test_any_thread_may_limit_the_blas():
             assert set(threads_of_blas()) == {1}
         assert set(seen[0]) == {1}
         assert threads_of_blas() == before
+    # Limits of others hold, and are taken back, whoever used ours meanwhile.
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        with threadpoolctl.threadpool_limits(1, user_api="blas"):
+            other = threading.Thread(target=lambda: on_cores(lambda _: None, range(2)))
+            other.start()
+            other.join()
+            assert set(threads_of_blas()) == {1}
+        assert threads_of_blas() == before
 
 
 def test_a_part_that_fails_is_told_of_and_the_blas_has_its_threads_again():

@@ -16,9 +16,11 @@ from jeit_solvers import (
     FrontalCholesky,
     SparseCholesky,
     SparseSymmetric,
+    SparsityPattern,
     choose_solver,
     factorise_fronts,
     find_fronts,
+    on_cores,
 )
 from jeit_solvers.sparse import choose, frontal, fronts
 
@@ -31,6 +33,7 @@ def of_many_fronts(monkeypatch):
     monkeypatch.setattr(fronts, "_LEAF_SIZE", 8)
     monkeypatch.setattr(frontal, "_WORTH_A_THREAD", 0)
     monkeypatch.setattr(frontal, "_ROWS", 3)
+    monkeypatch.setattr(fronts, "_FRONTS", {})
 
 
 def problem(case):
@@ -45,8 +48,6 @@ def test_every_problem_is_solved_to_roundoff(case, small_fronts, monkeypatch):
     pattern, values, coordinates, vectors = problem(case)
     if small_fronts:
         of_many_fronts(monkeypatch)
-        coordinates = None if coordinates is None else coordinates + 0.0
-        monkeypatch.setattr(fronts, "_FRONTS", {})
     found = find_fronts(pattern, coordinates)
     for given in (values, values * (1 + 0.3j * np.sin(np.arange(len(values))))):
         matrix, factor = dense(pattern, given), factorise_fronts(found, given)
@@ -99,8 +100,11 @@ def test_a_matrix_that_is_not_positive_definite_gives_nan(entry, monkeypatch):
     pattern, values, coordinates, vectors = problem(sparse_problems.disk)
     values = np.array(values)
     values[17] = entry
+    found = find_fronts(pattern, coordinates)
+    assert len(found.fronts) > 7
     for given in (values, values.astype(complex)):
-        factor = factorise_fronts(find_fronts(pattern, coordinates), given)
+        factor = factorise_fronts(found, given)
+        assert not factor.positive_definite
         assert np.isnan(factor.solve(vectors)).any()
         assert np.isnan(factor.quadratic_form(vectors)).any()
     solver = FrontalCholesky(find_fronts(pattern, coordinates))
@@ -112,7 +116,9 @@ class Compiled:
     """The disk solved in compiled programs, which call NumPy."""
 
     pattern, values, coordinates, vectors = problem(sparse_problems.disk)
-    solver = FrontalCholesky(find_fronts(pattern, coordinates))
+    with pytest.MonkeyPatch.context() as patch:
+        of_many_fronts(patch)
+        solver = FrontalCholesky(find_fronts(pattern, coordinates))
 
     @classmethod
     def energy(cls, values, vector):
@@ -139,7 +145,7 @@ def test_compiled_programs_and_their_derivatives():
 def test_eight_threads_solve_each_its_own_matrix():
     """Compiled programs that wait for NumPy, while others run and factorise other matrices."""
     solved = jax.jit(Compiled.energy)
-    vector, found = jnp.asarray(Compiled.vectors[:, 0]), np.zeros(8)
+    vector, found = jnp.asarray(Compiled.vectors[:, 0]), np.full(8, np.nan)
 
     def work(number):
         for _ in range(3):
@@ -150,7 +156,54 @@ def test_eight_threads_solve_each_its_own_matrix():
         one.start()
     for one in threads:
         one.join(60)
-    np.testing.assert_allclose(found * (1 + np.arange(8)), found[0], rtol=1e-12)
+    assert not any(one.is_alive() for one in threads)
+    energy = vector @ np.linalg.solve(dense(Compiled.pattern, Compiled.values), vector)
+    np.testing.assert_allclose(found * (1 + np.arange(8)), energy, rtol=1e-12)
+
+
+def test_parts_on_cores_may_wait_for_compiled_programs(monkeypatch):
+    """Callbacks come from threads of XLA's, where programs have work beside them, and find the cores taken."""
+    of_many_fronts(monkeypatch)
+    monkeypatch.setattr(fronts, "_LEAF_SIZE", 128)
+    size = 8000
+    rows = np.concatenate([np.arange(size), np.arange(1, size)])
+    columns = np.concatenate([np.arange(size), np.arange(size - 1)])
+    pattern = SparsityPattern.from_entries(rows, columns, size)
+    values = pattern.assemble(np.where(rows == columns, 2.1, -1.0))
+    chain, vectors = find_fronts(pattern, np.arange(size)[:, None]), np.random.default_rng(0).normal(size=(size, 20))
+    twice = jax.jit(
+        lambda given, b: (
+            frontal.solve_at_once(chain, given, b).sum(),
+            frontal.solve_at_once(chain, 2 * given, jnp.sin(b)).sum(),
+        )
+    )
+    found = np.full((4, 2), np.nan)
+
+    def part(number):
+        found[number] = [float(one) for one in twice(values * (1 + number), vectors)]
+
+    whole = threading.Thread(target=on_cores, args=(part, range(4)), daemon=True)
+    whole.start()
+    whole.join(30)
+    assert not whole.is_alive()
+    np.testing.assert_allclose(found * (1 + np.arange(4))[:, None], np.tile(found[0], (4, 1)), rtol=1e-9)
+
+
+def test_right_hand_sides_of_every_kind():
+    factor = factorise_fronts(Compiled.solver.fronts, Compiled.values)
+    matrix, vectors = dense(Compiled.pattern, Compiled.values), Compiled.vectors
+    for given in (
+        vectors * (1 + 2j),
+        vectors[:, :0],
+        np.asfortranarray(vectors),
+        vectors[:, ::-1],
+        vectors.astype(int),
+    ):
+        np.testing.assert_allclose(matrix @ factor.solve(given), given, rtol=0, atol=1e-12)
+    with pytest.raises(ValueError, match=r"shape \(n, k\) with n = 90; got \(90,\)"):
+        factor.solve(vectors[:, 0])
+    with pytest.raises(ValueError, match=r"values must have shape"):
+        factorise_fronts(Compiled.solver.fronts, Compiled.values[1:])
 
 
 def test_the_last_factor_serves_again_unless_it_is_large(monkeypatch):

@@ -43,7 +43,9 @@ class FrontalFactor(NamedTuple):
         return self.panels is not None
 
     def solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
-        """Solution x of A x = b."""
+        """Solution x of A x = b. Raises `ValueError` for another shape."""
+        if self._needs_parts(right_hand_sides):
+            return self.solve(np.real(right_hand_sides)) + 1j * self.solve(np.imag(right_hand_sides))
         vectors = self.half_solve(right_hand_sides)
         if self.panels is not None:
             for slices in reversed(self.fronts.steps):
@@ -58,9 +60,15 @@ class FrontalFactor(NamedTuple):
         return half.T @ half
 
     def half_solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
-        """Y = L⁻¹ P b, rows in the order of elimination, so that Yᵀ Y = bᵀ A⁻¹ b."""
+        """Y = L⁻¹ P b, rows in the order of elimination, so that Yᵀ Y = bᵀ A⁻¹ b. Raises `ValueError` for another
+        shape."""
+        shape, size = np.shape(right_hand_sides), self.fronts.size
+        if len(shape) != 2 or shape[0] != size:
+            raise ValueError(f"right-hand sides must have shape (n, k) with n = {size}; got {shape}.")
         if self.panels is None:
-            return np.full(right_hand_sides.shape, np.nan, right_hand_sides.dtype)
+            return np.full(right_hand_sides.shape, np.nan, np.result_type(right_hand_sides, np.float32))
+        if self._needs_parts(right_hand_sides):
+            return self.half_solve(np.real(right_hand_sides)) + 1j * self.half_solve(np.imag(right_hand_sides))
         vectors = right_hand_sides[self.fronts.order].astype(self.panels[0].dtype)
         subtrees, *levels = self.fronts.steps
         later = vectors[self.fronts.top :]
@@ -77,6 +85,10 @@ class FrontalFactor(NamedTuple):
         for level in levels:  # one after the other, for their borders overlap
             _for_each(lambda some: self._forward(vectors, later, some), level, 0.0)
         return vectors
+
+    def _needs_parts(self, right_hand_sides: np.ndarray) -> bool:
+        """Whether a real factor is to solve for complex numbers: their real and imaginary parts, one by one."""
+        return self.panels is not None and np.iscomplexobj(right_hand_sides) and not np.iscomplexobj(self.panels[0])
 
     def _cost(self, vectors: np.ndarray) -> float:
         return float(vectors.shape[1] * self.fronts.num_factor_entries)
@@ -107,7 +119,14 @@ class FrontalFactor(NamedTuple):
 
 
 def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> FrontalFactor:
-    """Factorise the matrix with the given values (nnz,), in the order of the pattern that `fronts` was made for."""
+    """Factorise the matrix with the given values (nnz,), in the order of the pattern that `fronts` was made for.
+
+    Raises `ValueError` for values of another shape.
+    """
+    if np.shape(values) != (fronts.num_entries,):
+        raise ValueError(
+            f"values must have shape {(fronts.num_entries,)}, the entries of the pattern; got {np.shape(values)}."
+        )
     ordered = values[fronts.entry_order].astype(complex if np.iscomplexobj(values) else float)
     panels: list[Any] = [None] * len(fronts.fronts)
     waiting: list[Any] = [None] * len(fronts.fronts)
@@ -131,14 +150,14 @@ def solve_at_once(
     calls NumPy. The last factor is kept, because derivatives solve with the same matrix again."""
     kind = jnp.result_type(values, columns)
     if has_values(values, columns):
-        return host.asarray(_solve_in_numpy(fronts, values, columns).astype(kind))
+        return host.asarray(_solve_in_numpy(fronts, kind, values, columns))
     shape = jax.ShapeDtypeStruct(columns.shape, kind)
-    return jax.pure_callback(partial(_solve_in_numpy, fronts), shape, values, columns, vmap_method="sequential")
+    return jax.pure_callback(partial(_solve_in_numpy, fronts, kind), shape, values, columns, vmap_method="sequential")
 
 
-def _solve_in_numpy(fronts: Fronts, values: Any, columns: Any) -> np.ndarray:
-    values, columns = np.asarray(values), np.asarray(columns)
-    return _LAST.of(fronts, values).solve(columns).astype(np.result_type(values, columns))
+def _solve_in_numpy(fronts: Fronts, kind: Any, values: Any, columns: Any) -> np.ndarray:
+    with np.errstate(all="ignore"):
+        return _LAST.of(fronts, np.asarray(values)).solve(np.asarray(columns)).astype(kind)
 
 
 class _LastFactor:
@@ -149,10 +168,12 @@ class _LastFactor:
 
     def of(self, fronts: Fronts, values: np.ndarray) -> FrontalFactor:
         """The factor of a matrix, made or taken from the last call."""
-        key = fronts.key + hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
+        digest = hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
+        key = fronts.key + values.dtype.str.encode() + digest
         kept = self._kept  # another thread may replace it meanwhile
         if kept is not None and kept[0] == key:
             return kept[1]
+        self._kept = kept = None  # its memory serves the next
         factor = factorise_fronts(fronts, values)
         self._kept = (key, factor) if fronts.num_factor_entries < _MOST_KEPT else None
         return factor

@@ -108,7 +108,7 @@ def find_fronts(pattern: SparsityPattern, coordinates: Any = None) -> Fronts:
     coordinates = checked_coordinates(pattern, coordinates)
     rows, columns = (np.asarray(one, dtype=np.int64) for one in (pattern.rows, pattern.columns))
     found = hashlib.blake2b(digest_size=16)
-    for one in (rows, columns, coordinates if coordinates is not None else np.zeros(0)):
+    for one in (rows, columns, coordinates if coordinates is not None else np.zeros(0), np.array(_LEAF_SIZE)):
         found.update(np.ascontiguousarray(one).tobytes())
     key = found.digest()
     if (known := _FRONTS.get(key)) is None:
