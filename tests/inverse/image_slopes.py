@@ -53,8 +53,8 @@ def assert_gradient_of_minimum(image, theta, size, solver, *, between=False):
 
 
 def assert_slopes(answer, theta, gradient, size):
-    """Against central differences of fourth order. Large steps bend and small ones are rounded, by as much as a solver
-    stops earlier or later: one of nine has to agree to 2e-5.
+    """Against central differences of fourth order. Large steps bend and small ones are rounded: one of six has to agree
+    to 1e-5.
 
     Steps go up wherever they go, each number by a share of its own: along others the parts of a slope may all but
     cancel, and differences are of rounding. `size` has what is small beside each number; without one it is itself."""
@@ -62,13 +62,13 @@ def assert_slopes(answer, theta, gradient, size):
     for name, at in theta.items():
         direction = np.abs(random.normal(size=at.shape) * size.get(name, at)) * np.sign(gradient[name])
         found, errors = float(np.vdot(gradient[name], direction)), []
-        for step in (1e-3, 1e-2, 3e-3, 3e-4, 4e-4, 5e-4, 2e-4, 1e-4, 1e-5):
+        for step in (1e-3, 1e-2, 3e-3, 3e-4, 1e-4, 1e-5):
 
             def moved(times, name=name, along=step * direction):
                 return float(answer(theta | {name: theta[name] + times * along}))
 
             near, far = moved(1) - moved(-1), moved(2) - moved(-2)
             errors.append(abs(found / ((8 * near - far) / (12 * step)) - 1))
-            if errors[-1] <= 2e-5:
+            if errors[-1] <= 1e-5:
                 break
-        assert min(errors) <= 2e-5, (name, found, errors)
+        assert min(errors) <= 1e-5, (name, found, errors)
