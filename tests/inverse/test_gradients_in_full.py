@@ -106,7 +106,7 @@ def image_of(found):
     return 1e3 * WEIGHT @ found.conductivity + found.misfit + 1e3 * jnp.sum(found.voltages**2) + found.costs[-1]
 
 
-TIGHT = GaussNewton(max_steps=100, rtol=1e-16)
+TIGHT = GaussNewton(max_steps=100, rtol=1e-24)
 
 
 def test_nonlinear_images_of_a_model_that_is_traced_as_a_whole():
@@ -138,7 +138,7 @@ def test_nonlinear_images_of_smooth_priors(prior):
 
     def image(theta):
         chosen = Gaussian(theta["length"]) if isinstance(prior, Gaussian) else prior
-        return image_of(solved(theta, chosen, LevenbergMarquardt(max_steps=100, rtol=1e-17)))
+        return image_of(solved(theta, chosen, LevenbergMarquardt(max_steps=100, rtol=1e-24)))
 
     assert_gradient(image, THETA | settings)
 

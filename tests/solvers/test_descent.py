@@ -121,6 +121,24 @@ def test_a_linear_problem_takes_one_gauss_newton_step():
     np.testing.assert_allclose(solution.value, expected, rtol=1e-9)
 
 
+def test_steps_below_the_rounding_of_the_cost_are_taken():
+    """Close to the minimum the cost only rounds up and down, and the model still points there."""
+
+    def rounded(c, _):
+        away = c - 1.0
+        cost = 1.0 + 0.5 * away @ away + 3e-15 * np.cos(1e9 * away).sum()
+
+        def step(damping):
+            direction = -0.9 * away  # of a model that is a tenth off
+            return direction, away @ direction, direction @ direction / 0.9
+
+        return cost, step
+
+    point, state = Descent(rtol=1e-24).at_once(rounded, 1.0 + np.linspace(0.1, 0.3, 5), None, 100)
+    assert state.converged
+    np.testing.assert_allclose(point, 1.0, rtol=0, atol=1e-11)
+
+
 def test_a_start_that_cannot_be_evaluated_is_said_so():
     solution = minimise(Descent(rtol=1e-14), np.full(9, np.nan), normal(6, 9), expand=expand)
     assert solution.result != optx.RESULTS.successful

@@ -162,6 +162,8 @@ def scipy_lbfgsb(
 
 _LEAST_SCALE = 2.0**-20
 _SUFFICIENT = 1e-4
+# Rounding error of a cost, which is a sum of many squares, in units of its machine precision.
+_ROUNDINGS = 100.0
 
 
 class DescentState(eqx.Module):
@@ -229,7 +231,9 @@ class Descent(optx.AbstractLeastSquaresSolver):
         xp = namespace(y)
         cost, step = options["expand"](state.trial, args)
         predicted = -(state.scale * state.slope + 0.5 * state.scale**2 * state.curvature)
-        good = xp.isfinite(cost) & (cost <= state.cost - _SUFFICIENT * predicted)
+        # Close to the minimum steps change the cost by less than its rounding, and lead nearer all the same.
+        rounding = _ROUNDINGS * np.finfo(y.dtype).eps * state.cost
+        good = xp.isfinite(cost) & (cost <= state.cost + rounding - _SUFFICIENT * predicted)
 
         def accepted():
             gain = xp.where(xp.isfinite(state.cost), (state.cost - cost) / predicted, 0.5)
