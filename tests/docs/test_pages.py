@@ -63,7 +63,7 @@ def _contacts(names: dict, folder: Path, printed: list[str]) -> None:
     assert np.linalg.norm(names["contact"].centroid - [0.01, 0.02]) < 2e-3
     assert 0.04 < names["path"].length < 0.06
     assert abs(names["force"].force - 2.0) < 0.4
-    assert names["feels"].localisation.mean < 3e-3
+    assert names["attributes"].localisation.mean < 3e-3
     assert len(printed) == 3
 
 
@@ -94,7 +94,7 @@ def _hearing(names: dict, folder: Path, printed: list[str]) -> None:
 
 
 def _instruments(names: dict, folder: Path, printed: list[str]) -> None:
-    assert names["told"] == sorted(names["told"], reverse=True)
+    assert names["differences"] == sorted(names["differences"], reverse=True)
     assert abs(names["slow"].frequency - 0.3) < 0.01
     phase = float(printed[0].split()[-1])
     assert abs(phase - np.degrees(np.pi - 0.5)) < 5
