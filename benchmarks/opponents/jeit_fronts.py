@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 
-import jeit  # noqa: F401  (double precision)
 from jeit_solvers import SparsityPattern, factorise_fronts, find_fronts
 
 

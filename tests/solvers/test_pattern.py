@@ -10,8 +10,16 @@ import pytest
 import sparse_problems
 from scipy.sparse import csr_array
 
-from jeit_solvers import ConjugateGradient, SparseCholesky, SparseSymmetric, SparsityPattern, analyse, factorise, solve
-from jeit_solvers.sparse.plan import elimination_tree
+from jeit_solvers import (
+    ConjugateGradient,
+    SparseCholesky,
+    SparseSymmetric,
+    SparsityPattern,
+    analyse,
+    factorise,
+    find_fronts,
+    solve,
+)
 
 
 def added_up(groups, matrices, size):
@@ -27,10 +35,12 @@ def test_fronts_hold_the_factor_and_the_factor_holds_the_matrix():
     """Counts by which the direct solver is chosen, or an iterative one."""
     points, cells = sparse_problems.disk_cells(300)
     pattern = SparsityPattern.from_elements([cells], 300)
-    tree = elimination_tree(pattern, points)
+    fronts = find_fronts(pattern, points)
     edges = {tuple(sorted(pair)) for cell in cells.tolist() for pair in combinations(cell, 2)}
-    assert tree.num_front_entries >= tree.num_factor_entries >= 300 + len(edges)
-    assert tree.num_operations >= 2 * tree.num_factor_entries
+    assert fronts.num_factor_entries >= 300 + len(edges)
+    assert fronts.num_operations >= 2 * fronts.num_factor_entries
+    children = fronts.fronts[-1].children
+    assert fronts.num_waiting_entries >= sum(fronts.fronts[child].border ** 2 for child in children) > 0
 
 
 @pytest.fixture

@@ -26,7 +26,23 @@ _COMPILED_ON_CPU, _COMPILED = 5e7, 2e10
 _OPERATIONS_PER_SECOND, _SECONDS_OF_GRADIENTS = 4e10, 1e-5
 
 
-class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
+class _OfMatrix(lineax.AbstractLinearSolver[SparseSymmetric]):
+    """Solver whose state is the matrix itself."""
+
+    def transpose(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
+        """The matrix is its own transpose."""
+        return state, options
+
+    def conj(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
+        """The conjugate matrix."""
+        return SparseSymmetric(state.values.conj(), state.pattern), options
+
+    def assume_full_rank(self) -> bool:
+        """Always true, because a positive definite matrix has full rank."""
+        return True
+
+
+class ConjugateGradient(_OfMatrix):
     """Conjugate gradients, preconditioned with the diagonal, for `SparseSymmetric` operators.
 
     Iteration stops when |M^-1 (b - A x)| <= `tolerance` |M^-1 b|, where M is the diagonal. The criterion is scaled by M
@@ -70,18 +86,6 @@ class ConjugateGradient(lineax.AbstractLinearSolver[SparseSymmetric]):
         result = results.where(last.broken_down, results.breakdown, result)
         stats = {"num_steps": last.step, "max_steps": max_steps}
         return last.solution, result, stats
-
-    def transpose(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
-        """The matrix is its own transpose."""
-        return state, options
-
-    def conj(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
-        """The conjugate matrix."""
-        return SparseSymmetric(state.values.conj(), state.pattern), options
-
-    def assume_full_rank(self) -> bool:
-        """Always true, because a positive definite matrix has full rank."""
-        return True
 
 
 class Iterate(NamedTuple):
@@ -183,7 +187,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
         return True
 
 
-class FrontalCholesky(lineax.AbstractLinearSolver[SparseSymmetric]):
+class FrontalCholesky(_OfMatrix):
     """Direct solver for large real or complex `SparseSymmetric` operators, with fronts of their own size, found by
     `find_fronts`. It runs in NumPy: compiled programs call it, and are compiled in no time.
 
@@ -216,18 +220,6 @@ class FrontalCholesky(lineax.AbstractLinearSolver[SparseSymmetric]):
         """Solve. A failed factorisation yields NaN, which `lineax.linear_solve` reports as singular."""
         del options
         return self.solve_columns(state, vector[:, None])[:, 0], lineax.RESULTS.successful, {}
-
-    def transpose(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
-        """The matrix is its own transpose."""
-        return state, options
-
-    def conj(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
-        """The conjugate matrix."""
-        return SparseSymmetric(state.values.conj(), state.pattern), options
-
-    def assume_full_rank(self) -> bool:
-        """Always true, because a positive definite matrix has full rank."""
-        return True
 
 
 DirectSolver = SparseCholesky | FrontalCholesky

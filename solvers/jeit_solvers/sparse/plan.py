@@ -102,22 +102,6 @@ class EliminationTree:
         in_border = np.searchsorted(border, keys) - np.searchsorted(border, fronts * self.size)
         return np.where(self.front[rows] == fronts, self.place[rows], self.pivots[stage] + in_border)
 
-    @property
-    def num_operations(self) -> float:
-        """Number of floating-point operations of a factorisation, including padding."""
-        pivots, border = np.asarray(self.pivots, dtype=float), np.asarray(self.border, dtype=float)
-        return float((self.batch * (4 / 3 * pivots**3 + 2 * pivots**2 * border + 2 * pivots * border**2)).sum())
-
-    @property
-    def num_factor_entries(self) -> int:
-        """Number of entries of the factor, including padding."""
-        return int(sum(c * (s + b) * s for c, s, b in zip(self.batch, self.pivots, self.border, strict=True)))
-
-    @property
-    def num_front_entries(self) -> int:
-        """Number of entries of all fronts, which is about the number of indices in the plan."""
-        return int(sum(c * (s + b) ** 2 for c, s, b in zip(self.batch, self.pivots, self.border, strict=True)))
-
 
 def _merged_levels(largest: np.ndarray) -> list[int]:
     """Number of levels of the tree in each stage, from the leaves up. `largest`: size of the largest separator of each
@@ -235,16 +219,7 @@ def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationP
     Runs in NumPy and SciPy, outside `jit`, once per pattern. `coordinates` (n, d) of the unknowns give a better order
     than the pattern alone. Raises a ValueError if their shape does not fit or they are not finite.
     """
-    return plan_of_tree(pattern, elimination_tree(pattern, coordinates))
-
-
-def elimination_tree(pattern: SparsityPattern, coordinates: Any = None) -> EliminationTree:
-    """Elimination tree from which `analyse` makes a plan. It is cheap to compute, and sufficient to estimate the cost
-    of the plan.
-
-    Raises `ValueError` for coordinates that do not have shape (n, d) or are not finite.
-    """
-    return EliminationTree(pattern, checked_coordinates(pattern, coordinates))
+    return _plan_of_tree(pattern, EliminationTree(pattern, checked_coordinates(pattern, coordinates)))
 
 
 def checked_coordinates(pattern: SparsityPattern, coordinates: Any) -> np.ndarray | None:
@@ -262,7 +237,7 @@ def checked_coordinates(pattern: SparsityPattern, coordinates: Any) -> np.ndarra
     return coordinates
 
 
-def plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> FactorisationPlan:
+def _plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> FactorisationPlan:
     """Make the plan with all index maps for an elimination tree. If a plan of the same tree is in use, for example in a
     forward model on the mesh of which a prior also needs matrices, its index maps are shared."""
     known = _plan_key(pattern, tree)
