@@ -14,16 +14,18 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import ShapedArray, Tracer
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 from jaxtyping import Array, Inexact, Int, Shaped
 
 
@@ -331,3 +333,62 @@ def add_into(total: Inexact[Array, "*n"], index: Any, values: Inexact[Array, "*i
         np.add.at(total, index, values)
         return host.asarray(total)
     return total.at[index].add(values)
+
+
+def call_numpy(function: Callable[..., Any], shape: jax.ShapeDtypeStruct, *arguments: Any) -> Any:
+    """The array that a `function` of NumPy arrays returns, for arguments whose values need not be known: a compiled
+    program calls it.
+
+    Unlike `jax.pure_callback` the function gets views of the program's memory. That copies arguments into arrays of
+    JAX, for which a thread of XLA's has to be free: if as many programs call at once as there are threads, all wait for
+    ever. Under `jax.vmap` the function is called for one element after the other. It is not differentiated.
+    """
+    return _numpy_call.bind(*arguments, function=function, shape=tuple(shape.shape), kind=np.dtype(shape.dtype))
+
+
+_numpy_call = Primitive("jeit_numpy_call")
+
+
+@_numpy_call.def_impl
+def _(*arguments: Any, function: Callable[..., Any], shape: tuple[int, ...], kind: np.dtype) -> Any:
+    del shape, kind
+    return jnp.asarray(function(*map(np.asarray, arguments)))
+
+
+@_numpy_call.def_abstract_eval
+def _(*arguments: Any, function: Callable[..., Any], shape: tuple[int, ...], kind: np.dtype) -> Any:
+    del arguments, function
+    return ShapedArray(shape, kind)
+
+
+def _lower_numpy_call(context: Any, *arguments: Any, function: Callable[..., Any], **_: Any) -> Any:
+    def call(*values: Any) -> tuple[np.ndarray]:
+        return (function(*map(np.asarray, values)),)
+
+    results, _, _ = mlir.emit_python_callback(
+        context,
+        call,
+        None,
+        list(arguments),
+        context.avals_in,
+        context.avals_out,
+        has_side_effect=False,
+        returns_token=False,
+    )
+    return results
+
+
+def _batch_numpy_call(arguments: Sequence[Any], axes: Sequence[Any], **parameters: Any) -> tuple[Any, int]:
+    moved = [jnp.moveaxis(one, axis, 0) for one, axis in zip(arguments, axes, strict=True) if axis is not None]
+
+    def one(given: list[Any]) -> Any:
+        own = iter(given)
+        return _numpy_call.bind(
+            *(one if axis is None else next(own) for one, axis in zip(arguments, axes, strict=True)), **parameters
+        )
+
+    return jax.lax.map(one, moved), 0
+
+
+mlir.register_lowering(_numpy_call, _lower_numpy_call)
+batching.primitive_batchers[_numpy_call] = _batch_numpy_call

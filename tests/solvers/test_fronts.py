@@ -23,6 +23,7 @@ from jeit_solvers import (
     on_cores,
 )
 from jeit_solvers.sparse import choose, frontal, fronts
+from jeit_solvers.sparse.operator import LastMatrix
 
 TOLERANCE = 5e-15
 SPREAD = (sparse_problems.disk, sparse_problems.box)
@@ -161,8 +162,9 @@ def test_eight_threads_solve_each_its_own_matrix():
     np.testing.assert_allclose(found * (1 + np.arange(8)), energy, rtol=1e-12)
 
 
-def test_parts_on_cores_may_wait_for_compiled_programs(monkeypatch):
-    """Callbacks come from threads of XLA's, where programs have work beside them, and find the cores taken."""
+def test_more_programs_than_cores_may_call_numpy_at_once(monkeypatch):
+    """From threads of XLA's, where programs have work beside them; with arrays of over 100 kB, which JAX copies in such
+    threads; inside parts on cores and outside."""
     of_many_fronts(monkeypatch)
     monkeypatch.setattr(fronts, "_LEAF_SIZE", 128)
     size = 8000
@@ -177,16 +179,19 @@ def test_parts_on_cores_may_wait_for_compiled_programs(monkeypatch):
             frontal.solve_at_once(chain, 2 * given, jnp.sin(b)).sum(),
         )
     )
-    found = np.full((4, 2), np.nan)
+    found = np.full((12, 2), np.nan)
 
     def part(number):
         found[number] = [float(one) for one in twice(values * (1 + number), vectors)]
 
-    whole = threading.Thread(target=on_cores, args=(part, range(4)), daemon=True)
-    whole.start()
-    whole.join(30)
-    assert not whole.is_alive()
-    np.testing.assert_allclose(found * (1 + np.arange(4))[:, None], np.tile(found[0], (4, 1)), rtol=1e-9)
+    threads = [threading.Thread(target=part, args=(number,), daemon=True) for number in range(8)]
+    threads.append(threading.Thread(target=on_cores, args=(part, range(8, 12)), daemon=True))
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join(60)
+    assert not any(one.is_alive() for one in threads)
+    np.testing.assert_allclose(found * (1 + np.arange(12))[:, None], np.tile(found[0], (12, 1)), rtol=1e-9)
 
 
 def test_right_hand_sides_of_every_kind():
@@ -208,7 +213,7 @@ def test_right_hand_sides_of_every_kind():
 
 def test_the_last_factor_serves_again_unless_it_is_large(monkeypatch):
     made = []
-    monkeypatch.setattr(frontal, "_LAST", frontal._LastFactor())
+    monkeypatch.setattr(frontal, "_LAST", LastMatrix())
     plain = factorise_fronts
     monkeypatch.setattr(frontal, "factorise_fronts", lambda *given: made.append(1) or plain(*given))
     given = find_fronts(Compiled.pattern, Compiled.coordinates), Compiled.values, Compiled.vectors

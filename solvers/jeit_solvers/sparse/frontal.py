@@ -5,7 +5,6 @@ Fronts that do not depend on each other are distributed over the cores.
 
 from __future__ import annotations
 
-import hashlib
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,8 +15,9 @@ from jaxtyping import Array, Inexact
 
 from jeit_solvers.blas import eliminate, solve_triangle
 from jeit_solvers.cores import on_cores, one_thread_of_blas
-from jeit_solvers.engines import has_values, host
+from jeit_solvers.engines import call_numpy, has_values, host
 from jeit_solvers.sparse.fronts import Fronts
+from jeit_solvers.sparse.operator import LastMatrix
 
 # Number of operations from which fronts are distributed over the cores; a product with k vectors takes k operations for
 # each entry of the factor.
@@ -152,34 +152,17 @@ def solve_at_once(
     if has_values(values, columns):
         return host.asarray(_solve_in_numpy(fronts, kind, values, columns))
     shape = jax.ShapeDtypeStruct(columns.shape, kind)
-    return jax.pure_callback(partial(_solve_in_numpy, fronts, kind), shape, values, columns, vmap_method="sequential")
+    return call_numpy(partial(_solve_in_numpy, fronts, kind), shape, values, columns)
 
 
 def _solve_in_numpy(fronts: Fronts, kind: Any, values: Any, columns: Any) -> np.ndarray:
     with np.errstate(all="ignore"):
-        return _LAST.of(fronts, np.asarray(values)).solve(np.asarray(columns)).astype(kind)
+        values, keep = np.asarray(values), fronts.num_factor_entries < _MOST_KEPT
+        factor = _LAST.of(fronts.key, values, lambda: factorise_fronts(fronts, values), keep=keep)
+        return factor.solve(np.asarray(columns)).astype(kind)
 
 
-class _LastFactor:
-    """The factor of the matrix that was factorised last, unless it is large."""
-
-    def __init__(self) -> None:
-        self._kept: tuple[bytes, FrontalFactor] | None = None
-
-    def of(self, fronts: Fronts, values: np.ndarray) -> FrontalFactor:
-        """The factor of a matrix, made or taken from the last call."""
-        digest = hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
-        key = fronts.key + values.dtype.str.encode() + digest
-        kept = self._kept  # another thread may replace it meanwhile
-        if kept is not None and kept[0] == key:
-            return kept[1]
-        self._kept = kept = None  # its memory serves the next
-        factor = factorise_fronts(fronts, values)
-        self._kept = (key, factor) if fronts.num_factor_entries < _MOST_KEPT else None
-        return factor
-
-
-_LAST = _LastFactor()
+_LAST = LastMatrix()
 
 
 def _one_front(fronts: Fronts, ordered: np.ndarray, panels: list[Any], waiting: list[Any], number: int) -> bool:

@@ -1,6 +1,10 @@
-"""Sparse symmetric matrices as lineax operators."""
+"""Sparse symmetric matrices as lineax operators, and what their solvers have in common."""
 
 from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -108,3 +112,44 @@ def require_sparse_symmetric(operator: lineax.AbstractLinearOperator, solver: st
             "with `pattern, values = SparsityPattern.from_matrix(matrix)` and `SparseSymmetric(values, pattern)`."
         )
     return operator
+
+
+class MatrixSolver(lineax.AbstractLinearSolver[SparseSymmetric]):
+    """Solver whose state is the matrix itself."""
+
+    def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> SparseSymmetric:
+        """Return the matrix itself. Raises `ValueError` for another kind of operator."""
+        del options
+        return require_sparse_symmetric(operator, type(self).__name__)
+
+    def transpose(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
+        """The matrix is its own transpose."""
+        return state, options
+
+    def conj(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
+        """The conjugate matrix."""
+        return SparseSymmetric(state.values.conj(), state.pattern), options
+
+    def assume_full_rank(self) -> bool:
+        """Always true, because a positive definite matrix has full rank."""
+        return True
+
+
+class LastMatrix:
+    """What was made of the matrix that was solved last: derivatives solve with the same matrix again."""
+
+    def __init__(self) -> None:
+        self._kept: tuple[bytes, Any] | None = None
+
+    def of(self, key: bytes, values: np.ndarray, make: Callable[[], Any], *, keep: bool = True) -> Any:
+        """What `make` returns for a matrix with the given values (nnz,), made or taken from the last call; `key`
+        distinguishes patterns."""
+        digest = hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
+        key += values.dtype.str.encode() + digest
+        kept = self._kept  # another thread may replace it meanwhile
+        if kept is not None and kept[0] == key:
+            return kept[1]
+        self._kept = kept = None  # its memory serves the next
+        made = make()
+        self._kept = (key, made) if keep else None
+        return made
