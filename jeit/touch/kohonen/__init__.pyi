@@ -1,5 +1,4 @@
-from .map_file import read_map, write_map
-from .placed_map import PlacedMap, drawn_map
+from .placed_map import PlacedMap, drawn_map, read_map, write_map
 from .quality import MapQuality, learning_curves, map_quality, time_constant
 from .self_organising_map import SelfOrganisingMap, fit_maps
 from .several_touches import MapTouch, neuron_shares, touches_reported

@@ -1,9 +1,11 @@
-"""A self-organising map whose neurons have places on a skin, or other values; a map's drawing as a graph."""
+"""A self-organising map whose neurons have places on a skin, or other values; a map's drawing as a graph; files of maps,
+which contain only arrays."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +17,7 @@ from scipy.spatial import KDTree
 
 from jeit.arguments import check_key, check_kind, real_array
 from jeit.arguments.extras import optional
+from jeit.files import need, npz_arrays, written_whole
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
 # Number of neurons from which a place is estimated, and regularisation of their shares, relative to the mean square of
@@ -25,6 +28,8 @@ _ON_GRID, _HELD_ON_GRID = 25, 0.005
 # Weight of the mean place of a neuron's presses in the fit of its place, relative to that of one press.
 _DOUBT = 0.3
 _FEWEST = 10
+# What a file has of a `PlacedMap` beside its map.
+_OF_PLACES = "places", "widening", "missed", "fitted"
 # Number of frames that are located at once.
 _AT_ONCE = 512
 
@@ -237,3 +242,45 @@ def neighbours(shape: tuple[int, int]) -> tuple[Int[np.ndarray, " e"], Int[np.nd
     number = np.arange(shape[0] * shape[1]).reshape(shape)
     first = np.concatenate([number[:-1].ravel(), number[:, :-1].ravel()])
     return first, np.concatenate([number[1:].ravel(), number[:, 1:].ravel()])
+
+
+def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
+    """Write a map to an NPZ file: its `weights` and `scale`, and the places of a `PlacedMap`.
+
+    Raises `ValueError` if `learnt` is no map, or `path` is a folder.
+    """
+    check_kind("learnt", learnt, (SelfOrganisingMap, PlacedMap), "a map, as of SelfOrganisingMap.fit, or a PlacedMap")
+    if Path(path).is_dir():
+        raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / 'map.npz'}.")
+    placed = isinstance(learnt, PlacedMap)
+    plain = learnt.learnt if placed else learnt
+    more = {name: getattr(learnt, name) for name in _OF_PLACES} if placed else {}
+    more = {name: value for name, value in more.items() if value is not None}
+    with written_whole(path) as file:
+        np.savez_compressed(file, weights=plain.weights, scale=plain.scale, **more)
+
+
+def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
+    """Read a map from a file that `write_map` wrote. Raises `FileNotFoundError`, and `ValueError` for any other
+    file."""
+    if Path(path).is_dir():
+        raise ValueError(f"'{path}' is a folder; give an NPZ file.")
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"'{path}': there is no such file.")
+    try:
+        arrays = npz_arrays(Path(path), "weights", "scale", *_OF_PLACES)
+        need(arrays, "weights", "scale")
+        learnt = SelfOrganisingMap(arrays["weights"], _number("scale", arrays))
+        if "places" not in arrays:
+            return learnt
+        numbers = _number("widening", arrays), _number("missed", arrays)
+        return PlacedMap(learnt, arrays["places"], *numbers, arrays.get("fitted"))
+    except ValueError as error:
+        raise ValueError(f"'{path}' is no map: {error}") from None
+
+
+def _number(name: str, arrays: dict[str, np.ndarray]) -> float:
+    value = arrays.get(name, np.zeros(0))
+    if value.dtype.kind not in "fiu" or value.shape != ():
+        raise ValueError(f"{name} must be one number; it has shape {value.shape}.")
+    return float(value)
