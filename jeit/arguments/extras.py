@@ -12,6 +12,7 @@ EXTRAS = {
     "cad": {"ezdxf": "ezdxf"},
     "learn": {"sklearn": "scikit-learn", "skops": "skops", "optax": "optax", "networkx": "networkx"},
     "sound": {"soundfile": "soundfile"},
+    "large": {"pyamg": "pyamg"},
     "vision": {"cv2": "opencv-python-headless"},
     "view": {"pyvista": "pyvista"},
     "cluster": {"dask": "dask", "distributed": "distributed", "zarr": "zarr", "xarray": "xarray"},

@@ -97,17 +97,15 @@ class ForwardModel(eqx.Module):
         solver: str | lx.AbstractLinearSolver = "auto",
     ):
         """`solver`: "auto" (chosen by size; `model.system.solver` states which solver and why), "cholesky", "cg", or
-        any lineax solver. With any value but "auto" the methods are always compiled. Raises `ValueError` if electrodes,
-        mesh and protocol do not fit together."""
+        any lineax solver. With any value but "auto" and `jeit_solvers.Multigrid` the methods are always compiled.
+        Raises `ValueError` if electrodes, mesh and protocol do not fit together."""
         _check(mesh, electrodes, protocol)
         self.mesh = mesh
         self.electrodes = electrodes
         self.protocol = protocol
         with jax.ensure_compile_time_eval():  # a model may be made inside jit, with a known mesh
             self.system = System.create(mesh, electrodes, solver)
-        # Models are compiled with conjugate gradients, for systems too large to factorise, and with any solver that the
-        # user chose.
-        self.at_once = self.system.fronts is not None
+        self.at_once = self.system.at_once
 
     def __repr__(self) -> str:
         return brief(

@@ -17,9 +17,11 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrodes import Contact
 from jeit.mesh import Mesh, gradients, measures, normals
 from jeit_solvers import (
+    ColumnSolver,
     ConjugateGradient,
     DirectSolver,
     Fronts,
+    Multigrid,
     SparseCholesky,
     SparseSymmetric,
     SparsityPattern,
@@ -158,10 +160,15 @@ class System(eqx.Module):
     solver: lx.AbstractLinearSolver
     fronts: Fronts | None = eqx.field(static=True, default=None)
 
+    @property
+    def at_once(self) -> bool:
+        """Whether matrices with known values are solved in NumPy."""
+        return self.fronts is not None or isinstance(self.solver, Multigrid)
+
     @classmethod
     def create(cls, mesh: Mesh, electrodes: AbstractElectrodes, solver: str | lx.AbstractLinearSolver = "auto"):
-        """Make the system for a mesh and electrodes. `solver`: "auto" (by predicted memory), "cholesky", "cg", or any
-        lineax solver.
+        """Make the system for a mesh and electrodes. `solver`: "auto" (by predicted memory and time), "cholesky",
+        "cg", or any lineax solver.
 
         Raises `ValueError` for another name.
         """
@@ -203,13 +210,15 @@ class System(eqx.Module):
         if self.fronts is not None and isinstance(load, np.ndarray):
             found: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).solve(load)
             return found.astype(load.dtype)
+        if isinstance(self.solver, Multigrid) and isinstance(load, np.ndarray):
+            return self.solver.solve_columns(operator, load)
         constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not through the factor
-        state = self.solver.init(constant, {})
-        direct = self.solver
-        if isinstance(direct, DirectSolver):  # all columns at once; lineax solves one by one
+        state: Any = self.solver.init(constant, {})
+        solver = self.solver
+        if isinstance(solver, ColumnSolver):  # all columns at once; lineax solves one by one
 
             def solve_columns(_, columns):
-                return direct.solve_columns(state, columns)
+                return solver.solve_columns(state, columns)
 
             def multiply(columns):
                 return operator.pattern.multiply(operator.values, columns)

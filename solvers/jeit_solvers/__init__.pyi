@@ -31,10 +31,11 @@ from .optimise.small_problems import (
     solve_small,
     symmetric_small,
 )
-from .sparse.choose import ConjugateGradient, DirectSolver, FrontalCholesky, SparseCholesky, choose_solver
+from .sparse.choose import ColumnSolver, ConjugateGradient, DirectSolver, FrontalCholesky, SparseCholesky, choose_solver
 from .sparse.frontal import FrontalFactor, factorise_fronts
 from .sparse.fronts import Fronts, find_fronts
 from .sparse.multifrontal import Factor, factorise, half_solve, inverse_entries, inverse_root, quadratic_form, solve
+from .sparse.multigrid import Multigrid
 from .sparse.near_inverse import NearInverse, Strips, near_inverse
 from .sparse.operator import SparseSymmetric
 from .sparse.pattern import SparsityPattern
@@ -42,6 +43,7 @@ from .sparse.plan import FactorisationPlan, analyse
 
 __all__ = [
     "BoundedMinimum",
+    "ColumnSolver",
     "ConjugateGradient",
     "Descent",
     "DirectSolver",
@@ -52,6 +54,7 @@ __all__ = [
     "Fronts",
     "KMeans",
     "Minimum",
+    "Multigrid",
     "NearInverse",
     "QuadraticModel",
     "SparseCholesky",

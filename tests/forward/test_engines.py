@@ -15,7 +15,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit_solvers import ConjugateGradient
+from jeit_solvers import ConjugateGradient, Multigrid
 
 QUANTITIES = ("voltages", "transfer_impedance", "potentials", "fields", "voltages_and_jacobian")
 
@@ -114,6 +114,36 @@ def test_a_solver_that_is_asked_for_is_used(parts):
     rough = ForwardModel(*parts, solver=ConjugateGradient(tolerance=1e-6)).voltages(1.0)
     exact = ForwardModel(*parts).voltages(1.0)
     assert 1e-9 < np.abs(rough - exact).max() / np.abs(exact).max() < 1e-3
+
+
+@pytest.fixture(scope="module")
+def by_multigrid(parts):
+    """A model with good contacts and bad ones, solved directly in compiled programs, and by multigrid."""
+    pytest.importorskip("pyamg", reason="PyAMG, of the extra `large`, is not installed")
+    mesh, electrodes, protocol = parts
+    electrodes = electrodes.with_contact_impedance(np.geomspace(1e-6, 1.0, 8))
+    return [ForwardModel(mesh, electrodes, protocol, solver=solver) for solver in ("cholesky", Multigrid(1e-12))]
+
+
+def test_multigrid_gives_the_same_voltages_and_jacobian(parts, by_multigrid):
+    _, found = by_multigrid
+    assert found.at_once
+    exact, conductivity = ForwardModel(parts[0], found.electrodes, parts[2]), uneven(parts[0].num_cells)
+    for given in (conductivity, conductivity * (1 + 0.2j)):
+        assert_same(found.voltages_and_jacobian(given), exact.voltages_and_jacobian(given), 1e-9)
+
+
+@pytest.mark.slow
+def test_multigrid_gives_the_same_derivatives_of_everything(parts, by_multigrid):
+    def slopes(model):
+        def misfit(conductivity, electrodes):
+            return jnp.sum(model.with_electrodes(electrodes).voltages(conductivity) ** 2)
+
+        return jax.jit(jax.value_and_grad(misfit, (0, 1)))(uneven(parts[0].num_cells), model.electrodes)
+
+    exact, found = (jax.tree.leaves(slopes(model)) for model in by_multigrid)
+    for one, other in zip(found, exact, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-8 * np.abs(other).max())
 
 
 def test_other_electrodes_are_not_taken_for_the_same(parts):

@@ -1,4 +1,4 @@
-"""Solvers of sparse systems for lineax, direct and by conjugate gradients, and the choice between them."""
+"""Solvers of sparse systems for lineax, direct and iterative, and the choice between them."""
 
 from __future__ import annotations
 
@@ -15,34 +15,21 @@ from jeit_solvers.engines import has_values
 from jeit_solvers.sparse.frontal import solve_at_once
 from jeit_solvers.sparse.fronts import Fronts, find_fronts
 from jeit_solvers.sparse.multifrontal import Factor, factorise, solve
-from jeit_solvers.sparse.operator import SparseSymmetric, require_sparse_symmetric
+from jeit_solvers.sparse.multigrid import Multigrid, multigrid_is_installed
+from jeit_solvers.sparse.operator import MatrixSolver, SparseSymmetric, require_sparse_symmetric
 from jeit_solvers.sparse.pattern import SparsityPattern
 from jeit_solvers.sparse.plan import FactorisationPlan, analyse
 
 # Operations of a factorisation up to which a compiled program is made of it: on a CPU, compiling one of more takes
 # longer than it ever saves; on an accelerator, its padded index maps have to fit.
 _COMPILED_ON_CPU, _COMPILED = 5e7, 2e10
-# What takes the time that is stated, as measured on two cores.
-_OPERATIONS_PER_SECOND, _SECONDS_OF_GRADIENTS = 4e10, 1e-5
+# Operations of a factorisation in a second; seconds and bytes that multigrid takes for 32 solutions for each entry of
+# the matrix. Measured on two cores, solids of 50,000 to 1,000,000 nodes.
+_OPERATIONS_PER_SECOND = 4e10
+_MULTIGRID_SECONDS, _MULTIGRID_BYTES = 1e-5, 400.0
 
 
-class _OfMatrix(lineax.AbstractLinearSolver[SparseSymmetric]):
-    """Solver whose state is the matrix itself."""
-
-    def transpose(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
-        """The matrix is its own transpose."""
-        return state, options
-
-    def conj(self, state: SparseSymmetric, options: dict[str, Any]) -> tuple[SparseSymmetric, dict[str, Any]]:
-        """The conjugate matrix."""
-        return SparseSymmetric(state.values.conj(), state.pattern), options
-
-    def assume_full_rank(self) -> bool:
-        """Always true, because a positive definite matrix has full rank."""
-        return True
-
-
-class ConjugateGradient(_OfMatrix):
+class ConjugateGradient(MatrixSolver):
     """Conjugate gradients, preconditioned with the diagonal, for `SparseSymmetric` operators.
 
     Iteration stops when |M^-1 (b - A x)| <= `tolerance` |M^-1 b|, where M is the diagonal. The criterion is scaled by M
@@ -68,11 +55,6 @@ class ConjugateGradient(_OfMatrix):
             )
         if self.max_steps is not None and self.max_steps < 1:
             raise ValueError(f"ConjugateGradient: `max_steps` must be positive; got {self.max_steps}.")
-
-    def init(self, operator: lineax.AbstractLinearOperator, options: dict[str, Any]) -> SparseSymmetric:
-        """Return the matrix itself; no preparation is needed."""
-        del options
-        return require_sparse_symmetric(operator, "ConjugateGradient")
 
     def compute(
         self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]
@@ -187,7 +169,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
         return True
 
 
-class FrontalCholesky(_OfMatrix):
+class FrontalCholesky(MatrixSolver):
     """Direct solver for large real or complex `SparseSymmetric` operators, with fronts of their own size, found by
     `find_fronts`. It runs in NumPy: compiled programs call it, and are compiled in no time.
 
@@ -223,7 +205,10 @@ class FrontalCholesky(_OfMatrix):
 
 
 DirectSolver = SparseCholesky | FrontalCholesky
-"""The solvers that factorise; both have `solve_columns`."""
+"""The solvers that factorise."""
+
+ColumnSolver = DirectSolver | Multigrid
+"""The solvers that solve for several right-hand sides at once, by `solve_columns`."""
 
 
 def choose_solver(
@@ -232,33 +217,39 @@ def choose_solver(
     *,
     memory_limit: float | None = None,
     tolerance: float = 1e-10,
-) -> DirectSolver | ConjugateGradient:
-    """Choose a direct solver if its factor fits in memory, else conjugate gradients; `solver.reason` states why.
+) -> ColumnSolver | ConjugateGradient:
+    """Choose a direct solver if its factor fits in memory and multigrid is not faster; `solver.reason` states why.
 
     Small matrices are factorised by compiled programs, large ones by NumPy, which compiled programs call: compilation
-    of a factorisation takes seconds. On accelerators all matrices are factorised there that the memory admits.
+    of a factorisation takes seconds. On accelerators all matrices are factorised there that the memory admits. Without
+    PyAMG (the extra `large`), conjugate gradients take the place of multigrid where a factor does not fit.
 
     **Arguments:**
 
     - `pattern`: sparsity pattern of the matrices.
     - `coordinates`: (n, d) of the unknowns, as for `analyse`.
     - `memory_limit`: maximum memory of a factorisation in bytes; default: half of that of the machine.
-    - `tolerance`: tolerance of the conjugate gradients.
+    - `tolerance`: tolerance of iterative solvers.
     """
     fronts = find_fronts(pattern, coordinates)
     limit = memory_of_machine() / 2 if memory_limit is None else memory_limit
     memory = 8.0 * (fronts.num_factor_entries + fronts.num_waiting_entries)
-    iterative = _SECONDS_OF_GRADIENTS * pattern.size ** (4 / 3)
-    cost = f"a factorisation takes {fronts.num_operations:.1e} operations and {_bytes(memory)}"
-    if memory > limit:
-        reason = f"iterative: {cost}, more than the {_bytes(limit)} allowed; 32 solutions take about {iterative:.2g} s"
-        return ConjugateGradient(tolerance, reason=reason)
-    seconds = fronts.num_operations / _OPERATIONS_PER_SECOND
-    reason = f"direct: {cost}, about {seconds:.1g} s; by conjugate gradients 32 solutions take about {iterative:.1g} s"
+    seconds, iterative = fronts.num_operations / _OPERATIONS_PER_SECOND, pattern.num_entries * _MULTIGRID_SECONDS
+    cost = (
+        f"a factorisation takes {fronts.num_operations:.1e} operations, about {seconds:.1g} s, and {_bytes(memory)}; "
+        f"multigrid takes about {iterative:.1g} s and {_bytes(pattern.num_entries * _MULTIGRID_BYTES)} for 32 solutions"
+    )
+    if memory > limit or seconds > iterative:
+        why = f"{cost}; {_bytes(limit)} are allowed"
+        if multigrid_is_installed():
+            return Multigrid(tolerance, reason=f"iterative: {why}")
+        if memory > limit:
+            slower = "; without pyamg (pip install 'jeit[large]') conjugate gradients take several times as long"
+            return ConjugateGradient(tolerance, reason=f"iterative: {why}{slower}")
     on_cpu = jax.default_backend() == "cpu"
     if fronts.num_operations > (_COMPILED_ON_CPU if on_cpu else _COMPILED):
-        return FrontalCholesky(fronts, reason)
-    return SparseCholesky(analyse(pattern, coordinates), reason=reason)
+        return FrontalCholesky(fronts, f"direct: {cost}")
+    return SparseCholesky(analyse(pattern, coordinates), reason=f"direct: {cost}")
 
 
 def _bytes(number: float) -> str:

@@ -1,0 +1,225 @@
+"""Conjugate gradients for several right-hand sides at once, preconditioned by smoothed-aggregation multigrid, in NumPy.
+
+Time and memory grow in proportion to the number of unknowns: this is for systems that are too large to factorise. PyAMG
+makes the levels from the matrix alone (Vanek, Mandel and Brezina, Computing 56, 1996). A cycle works on several columns
+at once and in single precision, which halves its memory traffic; the gradients are in double precision. The smoother is
+a Chebyshev polynomial of the matrix scaled by the sums of the absolute values of its rows, which bound the spectrum
+without an estimate (Baker, Falgout, Kolev and Yang, SIAM J. Sci. Comput. 33, 2011).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+from functools import partial
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax
+import numpy as np
+from jaxtyping import Array, Inexact
+from scipy.sparse import csr_array
+
+from jeit_solvers.cores import on_cores
+from jeit_solvers.engines import call_numpy, has_values, host, on_host
+from jeit_solvers.sparse.operator import LastMatrix, MatrixSolver, SparseSymmetric
+from jeit_solvers.sparse.pattern import SparsityPattern
+
+# Columns that are iterated together: more share the entries of the matrix that are read, fewer stay in the cache.
+_COLUMNS = 8
+# Maximum number of unknowns of the coarsest level, of which the inverse is computed.
+_COARSEST = 500
+# The smoother damps the spectrum of the scaled matrix from an eighth of its bound on, by a Chebyshev polynomial of
+# degree 2, of which these are the inverse roots.
+_MIDDLE, _HALF = (1 + 1 / 8) / 2, (1 - 1 / 8) / 2
+_WEIGHTS = tuple(1 / (_MIDDLE + sign * _HALF * np.sqrt(0.5)) for sign in (1, -1))
+
+
+class Level(NamedTuple):
+    """A level of a hierarchy, in single precision. **Fields**: `matrix`: (n, n); `scale`: (n, 1), the inverse sums of
+    the absolute values of its rows; `prolongation`, `restriction`: (n, c) from the next coarser level and (c, n) to it;
+    on the coarsest level None, and `inverse` (n, n) of its matrix instead."""
+
+    matrix: Any
+    scale: np.ndarray
+    prolongation: Any = None
+    restriction: Any = None
+    inverse: np.ndarray | None = None
+
+
+class Hierarchy(NamedTuple):
+    """A matrix with levels that precondition it. **Fields**: `matrix`: (n, n); `levels`: of its real part, from the
+    finest to the coarsest; None if its diagonal is not positive or its values are not finite."""
+
+    matrix: csr_array
+    levels: list[Level] | None
+
+
+class Multigrid(MatrixSolver):
+    """Conjugate gradients preconditioned by multigrid, for large real or complex `SparseSymmetric` operators.
+
+    Iteration ends when the residual is less than `tolerance` times the right-hand side, and the preconditioned
+    residual, which is about the error, less than `tolerance` times the preconditioned right-hand side: rows with large
+    entries, such as those of good contacts, dominate the former alone. A column for which that takes more than
+    `max_steps` is NaN, and so are all solutions if the matrix is not positive definite. It runs in NumPy: compiled
+    programs call it. Complex symmetric systems are solved by the conjugate orthogonal variant, preconditioned by their
+    real part.
+
+    Raises `ValueError` for a tolerance that is not between 0 and 1, and for a maximum of less than one step;
+    `ImportError` if PyAMG (the extra `large`) is not installed.
+    """
+
+    tolerance: float = eqx.field(static=True, default=1e-10)
+    max_steps: int = eqx.field(static=True, default=500)
+    reason: str = eqx.field(static=True, default="chosen by the user")
+
+    def __check_init__(self):
+        if not 0 < self.tolerance < 1:
+            raise ValueError(f"Multigrid: `tolerance` must be between 0 and 1; got {self.tolerance}.")
+        if self.max_steps < 1:
+            raise ValueError(f"Multigrid: `max_steps` must be positive; got {self.max_steps}.")
+        if not multigrid_is_installed():
+            raise ImportError("Multigrid needs pyamg: pip install 'jeit[large]', or in a clone '.[large]'.")
+
+    def solve_columns(self, state: SparseSymmetric, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
+        """Solutions for several right-hand sides."""
+        pattern, kind = state.pattern, jnp.result_type(state.values, columns)
+        shape = jax.ShapeDtypeStruct(columns.shape, kind)
+        if has_values(pattern):  # no part of a program: they are many
+            solve = partial(_solve_in_numpy, self, kind, on_host(pattern))
+            if has_values(state, columns):
+                return host.asarray(solve(state.values, columns))
+            return call_numpy(solve, shape, state.values, columns)
+
+        def solve_any(indices: np.ndarray, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
+            given = SparsityPattern(indices, pattern.layout, pattern.size)  # pyright: ignore[reportArgumentType]
+            return _solve_in_numpy(self, kind, given, values, columns)
+
+        return call_numpy(solve_any, shape, pattern.indices, state.values, columns)
+
+    def compute(
+        self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]
+    ) -> tuple[Inexact[Array, " n"], lineax.RESULTS, dict[str, Any]]:
+        """Solve for one right-hand side. A failure yields NaN, which `lineax.linear_solve` reports as singular."""
+        del options
+        return self.solve_columns(state, vector[:, None])[:, 0], lineax.RESULTS.successful, {}
+
+
+def multigrid_is_installed() -> bool:
+    """Whether PyAMG is installed."""
+    return find_spec("pyamg") is not None
+
+
+def hierarchy(matrix: csr_array) -> Hierarchy:
+    """Levels for a symmetric matrix (n, n) with positive definite real part."""
+    diagonal = matrix.diagonal()
+    if not (np.isfinite(matrix.data).all() and (diagonal.real > 0).all()):
+        return Hierarchy(matrix, None)
+    found = importlib.import_module("pyamg").smoothed_aggregation_solver(
+        matrix.real.tocsr(),
+        symmetry="symmetric",
+        strength=("symmetric", {"theta": 0.0}),
+        improve_candidates=None,
+        presmoother=None,
+        postsmoother=None,
+        max_coarse=_COARSEST,
+    )
+    return Hierarchy(matrix, [_level(one) for one in found.levels])
+
+
+def _level(made: Any) -> Level:
+    matrix = csr_array(made.A)
+    sums = abs(matrix).sum(axis=1).reshape(-1, 1)
+    scale = (1 / np.where(sums > 0, sums, 1)).astype(np.float32)  # rows of zeros, as PyAMG makes of isolated nodes
+    if not hasattr(made, "P"):
+        return Level(matrix, scale, inverse=np.linalg.pinv(matrix.toarray(), hermitian=True).astype(np.float32))
+    prolongation = csr_array(made.P).astype(np.float32)
+    return Level(matrix.astype(np.float32), scale, prolongation, csr_array(prolongation.T))
+
+
+def _cycle(levels: list[Level], load: np.ndarray) -> np.ndarray:
+    """One V-cycle for a load (n, k), from a start of zero."""
+    level, *coarser = levels
+    if level.inverse is not None:
+        return level.inverse @ load
+    first, second = _WEIGHTS
+    found = np.float32(first) * level.scale * load
+    found = _relaxed(level, found, load, second)
+    found += level.prolongation @ _cycle(coarser, level.restriction @ (load - level.matrix @ found))
+    for weight in (second, first):
+        found = _relaxed(level, found, load, weight)
+    return found
+
+
+def _relaxed(level: Level, found: np.ndarray, load: np.ndarray, weight: float) -> np.ndarray:
+    change = load - level.matrix @ found
+    change *= np.float32(weight) * level.scale
+    change += found
+    return change
+
+
+def _preconditioned(levels: list[Level], residual: np.ndarray) -> np.ndarray:
+    """The V-cycle of residuals (n, k), each scaled to a maximum of one: single precision has a limited range."""
+    largest = abs(residual).max(axis=0)
+    scaled = residual / np.where(largest > 0, largest, 1)
+    if np.iscomplexobj(scaled):
+        halves = np.ascontiguousarray(scaled).view(float).astype(np.float32)
+        return _cycle(levels, halves).astype(float).view(complex) * largest
+    return _cycle(levels, scaled.astype(np.float32)) * largest
+
+
+def _iterated(of: Hierarchy, load: np.ndarray, tolerance: float, max_steps: int) -> np.ndarray:
+    """Solutions (n, k) by conjugate gradients; NaN where they are not found."""
+    assert of.levels is not None
+    solution, residual = np.zeros_like(load), load.copy()
+    preconditioned = _preconditioned(of.levels, residual)
+    direction = preconditioned.copy()
+    weight = _products(residual, preconditioned)
+    targets = [tolerance * np.linalg.norm(one, axis=0) for one in (residual, preconditioned)]
+    found = targets[0] == 0
+    for _ in range(max_steps):
+        image = of.matrix @ direction
+        curvature = _products(direction, image)
+        if not (np.iscomplexobj(curvature) or (curvature[~found] > 0).all()):  # not positive definite
+            break
+        length = np.divide(weight, curvature, out=np.zeros_like(weight), where=~found)
+        solution += length * direction
+        residual -= length * image
+        preconditioned = _preconditioned(of.levels, residual)
+        before, weight = weight, _products(residual, preconditioned)
+        left = [np.linalg.norm(one, axis=0) for one in (residual, preconditioned)]
+        found |= (left[0] <= targets[0]) & (left[1] <= targets[1])
+        if found.all() or not np.isfinite(weight).all():
+            break
+        direction *= np.divide(weight, before, out=np.zeros_like(weight), where=~found)
+        direction += preconditioned
+    solution[:, ~found] = np.nan
+    return solution
+
+
+def _products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.einsum("nk,nk->k", one, other)
+
+
+def _solve_in_numpy(solver: Multigrid, kind: Any, pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
+    columns, values = np.asarray(columns), np.asarray(values)
+    key = hashlib.blake2b(np.ascontiguousarray(pattern.indices).tobytes(), digest_size=16).digest()
+    made = _LAST.of(key, values, lambda: hierarchy(pattern.to_scipy(values)))
+    load = columns.astype(np.result_type(kind, float))
+    if made.levels is None:
+        return np.full(load.shape, np.nan, kind)
+    solution = np.empty_like(load)
+
+    def solve(part: slice) -> None:
+        group = np.ascontiguousarray(load[:, part])
+        solution[:, part] = _iterated(made, group, solver.tolerance, solver.max_steps)
+
+    starts = range(0, load.shape[1], _COLUMNS)
+    on_cores(solve, [slice(start, start + _COLUMNS) for start in starts])
+    return solution.astype(kind)
+
+
+_LAST = LastMatrix()
