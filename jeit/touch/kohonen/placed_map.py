@@ -1,5 +1,5 @@
-"""A self-organising map whose neurons have places on a skin, or other values; a map's drawing as a graph; files of maps,
-which contain only arrays."""
+"""A self-organising map whose neurons have places on a skin, or other values; a map's drawing as a graph; and files of
+maps, which contain only arrays."""
 
 from __future__ import annotations
 
