@@ -13,6 +13,7 @@ CONTESTANTS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "jeit's solver": ("benchmarks.opponents.jeit_solver", "JeitSolver", ()),
     "SuperLU": ("benchmarks.opponents.superlu", "SuperLU", ()),
     "jeit's fronts": ("benchmarks.opponents.jeit_fronts", "JeitFronts", ()),
+    "jeit's multigrid": ("benchmarks.opponents.jeit_multigrid", "JeitMultigrid", ()),
     "PARDISO": ("benchmarks.opponents.pardiso", "Pardiso", ()),
     "sparsax": ("benchmarks.opponents.sparsax", "Sparsax", ()),
 }

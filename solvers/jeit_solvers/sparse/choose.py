@@ -26,7 +26,9 @@ _COMPILED_ON_CPU, _COMPILED = 5e7, 2e10
 # Operations of a factorisation in a second; seconds and bytes that multigrid takes for 32 solutions for each entry of
 # the matrix. Measured on two cores, solids of 50,000 to 1,000,000 nodes.
 _OPERATIONS_PER_SECOND = 4e10
-_MULTIGRID_SECONDS, _MULTIGRID_BYTES = 1e-5, 400.0
+_MULTIGRID_SECONDS, _MULTIGRID_BYTES = 5e-6, 400.0
+# How much longer a factorisation may take than multigrid, which is less accurate.
+_PATIENCE = 1.5
 
 
 class ConjugateGradient(MatrixSolver):
@@ -218,7 +220,7 @@ def choose_solver(
     memory_limit: float | None = None,
     tolerance: float = 1e-10,
 ) -> ColumnSolver | ConjugateGradient:
-    """Choose a direct solver if its factor fits in memory and multigrid is not faster; `solver.reason` states why.
+    """Choose a direct solver if its factor fits in memory and multigrid is not much faster; `solver.reason` states why.
 
     Small matrices are factorised by compiled programs, large ones by NumPy, which compiled programs call: compilation
     of a factorisation takes seconds. On accelerators all matrices are factorised there that the memory admits. Without
@@ -239,7 +241,7 @@ def choose_solver(
         f"a factorisation takes {fronts.num_operations:.1e} operations, about {seconds:.1g} s, and {_bytes(memory)}; "
         f"multigrid takes about {iterative:.1g} s and {_bytes(pattern.num_entries * _MULTIGRID_BYTES)} for 32 solutions"
     )
-    if memory > limit or seconds > iterative:
+    if memory > limit or seconds > _PATIENCE * iterative:
         why = f"{cost}; {_bytes(limit)} are allowed"
         if multigrid_is_installed():
             return Multigrid(tolerance, reason=f"iterative: {why}")

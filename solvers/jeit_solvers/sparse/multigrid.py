@@ -29,7 +29,7 @@ from jeit_solvers.sparse.operator import LastMatrix, MatrixSolver, SparseSymmetr
 from jeit_solvers.sparse.pattern import SparsityPattern
 
 # Columns that are iterated together: more share the entries of the matrix that are read, fewer stay in the cache.
-_COLUMNS = 8
+_COLUMNS = 16
 # Maximum number of unknowns of the coarsest level, of which the inverse is computed.
 _COARSEST = 500
 # The smoother damps the spectrum of the scaled matrix from an eighth of its bound on, by a Chebyshev polynomial of
@@ -147,51 +147,53 @@ def _cycle(levels: list[Level], load: np.ndarray) -> np.ndarray:
         return level.inverse @ load
     first, second = _WEIGHTS
     found = np.float32(first) * level.scale * load
-    found = _relaxed(level, found, load, second)
-    found += level.prolongation @ _cycle(coarser, level.restriction @ (load - level.matrix @ found))
+    _relax(level, found, load, second)
+    left = level.matrix @ found
+    np.subtract(load, left, out=left)
+    found += level.prolongation @ _cycle(coarser, level.restriction @ left)
     for weight in (second, first):
-        found = _relaxed(level, found, load, weight)
+        _relax(level, found, load, weight)
     return found
 
 
-def _relaxed(level: Level, found: np.ndarray, load: np.ndarray, weight: float) -> np.ndarray:
-    change = load - level.matrix @ found
+def _relax(level: Level, found: np.ndarray, load: np.ndarray, weight: float) -> None:
+    """Add a scaled residual to a solution (n, k)."""
+    change = level.matrix @ found
+    np.subtract(load, change, out=change)
     change *= np.float32(weight) * level.scale
-    change += found
-    return change
+    found += change
 
 
-def _preconditioned(levels: list[Level], residual: np.ndarray) -> np.ndarray:
-    """The V-cycle of residuals (n, k), each scaled to a maximum of one: single precision has a limited range."""
-    largest = abs(residual).max(axis=0)
-    scaled = residual / np.where(largest > 0, largest, 1)
-    if np.iscomplexobj(scaled):
-        halves = np.ascontiguousarray(scaled).view(float).astype(np.float32)
-        return _cycle(levels, halves).astype(float).view(complex) * largest
-    return _cycle(levels, scaled.astype(np.float32)) * largest
+def _preconditioned(levels: list[Level], residual: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The V-cycle of residuals (n, k), scaled to about one, because single precision has a limited range, by their
+    `sizes` (k,)."""
+    scale = np.where(sizes > 0, sizes, 1) / np.sqrt(len(residual))
+    single = np.complex64 if np.iscomplexobj(residual) else np.float32
+    scaled = np.multiply(residual, 1 / scale, out=np.empty(residual.shape, single), casting="unsafe")
+    return _cycle(levels, scaled.view(np.float32)).view(single) * scale
 
 
 def _iterated(of: Hierarchy, load: np.ndarray, tolerance: float, max_steps: int) -> np.ndarray:
     """Solutions (n, k) by conjugate gradients; NaN where they are not found."""
     assert of.levels is not None
-    solution, residual = np.zeros_like(load), load.copy()
-    preconditioned = _preconditioned(of.levels, residual)
-    direction = preconditioned.copy()
-    weight = _products(residual, preconditioned)
-    targets = [tolerance * np.linalg.norm(one, axis=0) for one in (residual, preconditioned)]
-    found = targets[0] == 0
+    solution, residual, size = np.zeros_like(load), load.copy(), _norms(load)
+    preconditioned = _preconditioned(of.levels, residual, size)
+    direction, weight = preconditioned.copy(), _products(residual, preconditioned)
+    target, target_error = tolerance * size, tolerance * _norms(preconditioned)
+    found = size == 0
     for _ in range(max_steps):
         image = of.matrix @ direction
         curvature = _products(direction, image)
         if not (np.iscomplexobj(curvature) or (curvature[~found] > 0).all()):  # not positive definite
             break
         length = np.divide(weight, curvature, out=np.zeros_like(weight), where=~found)
-        solution += length * direction
-        residual -= length * image
-        preconditioned = _preconditioned(of.levels, residual)
+        image *= length
+        residual -= image
+        solution += np.multiply(direction, length, out=image)
+        size = _norms(residual)
+        preconditioned = _preconditioned(of.levels, residual, size)
         before, weight = weight, _products(residual, preconditioned)
-        left = [np.linalg.norm(one, axis=0) for one in (residual, preconditioned)]
-        found |= (left[0] <= targets[0]) & (left[1] <= targets[1])
+        found |= (size <= target) & (_norms(preconditioned) <= target_error)
         if found.all() or not np.isfinite(weight).all():
             break
         direction *= np.divide(weight, before, out=np.zeros_like(weight), where=~found)
@@ -202,6 +204,11 @@ def _iterated(of: Hierarchy, load: np.ndarray, tolerance: float, max_steps: int)
 
 def _products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.einsum("nk,nk->k", one, other)
+
+
+def _norms(columns: np.ndarray) -> np.ndarray:
+    squares = _products(columns.real, columns.real)
+    return np.sqrt(squares + _products(columns.imag, columns.imag) if np.iscomplexobj(columns) else squares)
 
 
 def _solve_in_numpy(solver: Multigrid, kind: Any, pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
