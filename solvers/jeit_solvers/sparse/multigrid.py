@@ -206,7 +206,7 @@ def _products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.einsum("nk,nk->k", one, other)
 
 
-def _norms(columns: np.ndarray) -> np.ndarray:
+def _norms(columns: Any) -> np.ndarray:
     squares = _products(columns.real, columns.real)
     return np.sqrt(squares + _products(columns.imag, columns.imag) if np.iscomplexobj(columns) else squares)
 
