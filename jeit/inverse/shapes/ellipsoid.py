@@ -222,11 +222,11 @@ class Ellipsoid(eqx.Module):
 class Ellipsoids(Bodies):
     """Ellipsoids and columns on a mesh.
 
-    **Fields**, besides those of `Bodies`: `points` (m, s, 3): sampling points of the cells, metres; `width` (m,): width
+    **Fields**, besides those of `Bodies`: `points` (3, m, s): sampling points of the cells, metres; `width` (m,): width
     of the blur, metres; `total`: volume of the domain, m³; `ends`: lowest and highest z of the domain, metres.
     """
 
-    points: Float[np.ndarray, "m s 3"]
+    points: Float[np.ndarray, "3 m s"]
     width: Float[np.ndarray, " m"]
     total: float
     ends: tuple[float, float]
@@ -235,7 +235,7 @@ class Ellipsoids(Bodies):
     def create(cls, mesh: Mesh, prior: BodyPrior, start, sign) -> Ellipsoids:
         """Create ellipsoids for a mesh, with starting centres `start` (k, 3), metres."""
         points, volume = np.asarray(mesh.points), np.asarray(measures(mesh))
-        sampled = _SAMPLES @ points[np.asarray(mesh.cells)]
+        sampled = points.T[:, np.asarray(mesh.cells)] @ _SAMPLES.T
         start, total = np.reshape(np.asarray(start, float), (-1, 3)), float(volume.sum())
         sign, no = np.asarray(sign, float), np.zeros(len(start), bool)
         free = np.full(len(start), np.nan)
@@ -367,7 +367,7 @@ class Ellipsoids(Bodies):
         cells, share, _ = self.covered(k, row)
         within = share * self.weight[cells]
         centre, volume = self.centre(k, row), float(within.sum()) * self.total
-        centroid = within @ self.points[cells].mean(axis=1) / within.sum() if volume > 0 else centre
+        centroid = self.points[:, cells].mean(axis=2) @ within / within.sum() if volume > 0 else centre
         form, column = self._form(k, row), bool(self.other[k])
         if column:
             form[2, 2], centre[2] = (self.ends[1] - self.ends[0]) / 2, sum(self.ends) / 2
@@ -382,13 +382,15 @@ class Ellipsoids(Bodies):
         squeeze = (direction * np.exp(-log_stretch)) @ direction.T
         centre, radius = self.centre(k, row), np.exp(min(self.log_radius(row), np.log(10 * self.span)))
         farthest, axes = radius * np.exp(log_stretch[-1]), self._axes_of(k)
-        reached = np.linalg.norm((self.points[:, 0] - centre) * axes, axis=1) < farthest + _REACH * self.width
+        reached = _length((self.points[:, :, 0] - centre[:, None]) * axes[:, None]) < farthest + _REACH * self.width
         cells = np.flatnonzero(reached)
-        offset, width = (self.points[cells] - centre) * axes, self.width[cells, None]
-        offset = np.where(np.abs(offset).max(axis=-1, keepdims=True) > 0, offset, 1e-9 * self.span)
-        distance = np.linalg.norm(offset, axis=-1)
-        round_offset = offset @ squeeze
-        reach = np.linalg.norm(round_offset, axis=-1)
+        offset = (self.points[:, cells] - centre[:, None, None]) * axes[:, None, None]
+        distance, width = _length(offset), self.width[cells, None]
+        if (at_centre := distance == 0).any():
+            offset[:, at_centre] = 1e-9 * self.span
+            distance = _length(offset)
+        round_offset = np.tensordot(squeeze, offset, 1)
+        reach = _length(round_offset)
         # On the ray from the centre, the surface is at the distance radius · distance / reach.
         surface = radius * distance / reach
         # The blur of a convex surface adds more volume than it removes. Reducing the surface by `excess` compensates.
@@ -396,10 +398,10 @@ class Ellipsoids(Bodies):
         inside = 0.5 * (1 + np.tanh(0.5 * (surface - excess - distance) / width))
         edge = inside * (1 - inside) / width / len(_SAMPLES)  # d share / d(surface - excess - distance)
         grown = surface + excess  # d(surface - excess) / d log surface
-        by_reach = -edge * grown / reach**2  # times round_offset · d round_offset
-        by_offset = (edge * (grown - distance) / distance**2)[..., None] * offset
-        by_centre = -(by_offset + by_reach[..., None] * (round_offset @ squeeze)).sum(axis=1)
-        outer = np.einsum("cs,csi,csj->cij", by_reach, round_offset, offset)
+        by_round_offset = -edge * grown / reach**2 * round_offset
+        by_offset = edge * (grown - distance) / distance**2 * offset
+        by_centre = -(by_offset.sum(axis=2) + squeeze @ by_round_offset.sum(axis=2)).T
+        outer = np.einsum("ics,jcs->cij", by_round_offset, offset)
         stretches = (self._squeeze_slopes(log_stretch, direction) * self._mask(k)[:, None, None])[: self.prior.size - 5]
         form = outer.reshape(len(cells), 9) @ stretches.reshape(-1, 9).T
         columns = [by_centre, (edge * grown).sum(axis=1)[:, None], np.zeros((len(cells), 1)), form]
@@ -424,3 +426,7 @@ class Ellipsoids(Bodies):
         half = np.where(np.abs(apart) > 1e-12, apart / 2, 1)
         divided = -np.exp(-middle) * np.where(np.abs(apart) > 1e-12, np.sinh(half) / half, 1)
         return direction @ ((direction.T @ _STRETCHES @ direction) * divided) @ direction.T
+
+
+def _length(vectors: Float[np.ndarray, "3 *n"]) -> Float[np.ndarray, "*n"]:
+    return np.sqrt(np.einsum("i...,i...->...", vectors, vectors))
