@@ -67,6 +67,12 @@ def test_image_equals_the_full_matrix_for_one_frame_and_many(model, difference):
     expected = frames @ np.asarray(reconstruction.matrix).T
     np.testing.assert_allclose(images, expected, atol=1e-12 * np.abs(expected).max())
     np.testing.assert_allclose(reconstruction.image(frames[0]), expected[0], atol=1e-12 * np.abs(expected).max())
+    film = np.tile(frames, (1_100_000 // expected.nbytes + 1, 1))
+    imaged, again = (reconstruction.image(sign * film) for sign in (1, -1))  # in memory that JAX takes over
+    assert isinstance(imaged, jax.Array)
+    assert imaged.nbytes > 1e6
+    np.testing.assert_array_equal(imaged, -again)
+    np.testing.assert_allclose(imaged[-2:], images, atol=1e-12 * np.abs(expected).max())
 
 
 def test_an_image_is_the_same_at_once_compiled_batched_and_of_a_reconstruction_that_is_traced(model, difference):
