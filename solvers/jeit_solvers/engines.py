@@ -13,6 +13,7 @@ long per matrix as a single one that stays in the cache. Accelerators process th
 from __future__ import annotations
 
 import functools
+import math
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -157,7 +158,7 @@ def product_for_jax(one: Inexact[np.ndarray, "*f k"], other: Inexact[np.ndarray,
     """The product of NumPy's matrices as an array of JAX's. A large one is computed in memory that JAX takes over,
     because a copy would take longer than the product."""
     shape, kind = (*one.shape[:-1], other.shape[1]), np.result_type(one, other)
-    size = int(np.prod(shape)) * kind.itemsize
+    size = math.prod(shape) * kind.itemsize
     if size < _TAKEN_OVER:
         return _to_jax(one @ other)
     memory = np.empty(size + _ALIGNED, np.uint8)
