@@ -22,11 +22,23 @@ from jeit.forward.system import System, check_conductivity, field_gradients
 from jeit.forward.transfer import ElectrodeImpedance, electrode_fields, impedance_parts, solved_system
 from jeit.mesh import Mesh
 from jeit.protocol import Protocol
-from jeit_solvers import in_turn
-from jeit_solvers.engines import Recent, gather, has_values, host, namespace, on_device, on_host, sum_into
+from jeit_solvers import in_turn, on_cores
+from jeit_solvers.engines import (
+    Recent,
+    empty_for_jax,
+    gather,
+    has_values,
+    host,
+    namespace,
+    on_device,
+    on_host,
+    sum_into,
+)
 
 # Maximum number of entries of a block of the Jacobian, so that the block fits in the cache of a core.
 _BLOCK = 250_000
+# Number of blocks from which they are distributed over the cores.
+_WORTH_A_THREAD = 20
 # Number of cells processed at a time, so that their fields fit in the cache of a core.
 _CELLS = 4000
 
@@ -202,7 +214,7 @@ def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) ->
         return on_host(found) if namespace(parts[:3], conductivity) is np else found
     with np.errstate(all="ignore"):
         found = quantity(host_model(*parts), on_host(conductivity))
-    return found if namespace(parts[:3]) is np else on_device(found)
+    return found if namespace(parts[:3]) is np else on_device(found, take_over=True)
 
 
 def check_model(model: ForwardModel) -> None:
@@ -289,9 +301,7 @@ def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity
     mesh, protocol = model.mesh, model.protocol
     fields, impedance = fields_and_impedance_of(model, conductivity)
     if namespace(conductivity, mesh) is np:
-        jacobian: Any = np.empty((protocol.num_measurements, mesh.num_cells), fields.dtype)
-        for cells, block in jacobian_blocks(mesh, protocol, fields):
-            jacobian[:, cells] = block
+        jacobian: Any = _whole_jacobian(mesh, protocol, fields)
     else:
         jacobian = _of_cells(protocol, field_gradients(mesh, fields))
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
@@ -302,6 +312,27 @@ def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity
     return channel_voltages(protocol, impedance), jacobian
 
 
+def _whole_jacobian(mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"]) -> Inexact[np.ndarray, "M m"]:
+    gradient = field_gradients(mesh, fields)
+    jacobian = empty_for_jax((protocol.num_measurements, mesh.num_cells), np.dtype(fields.dtype))
+
+    def fill(cells: slice) -> None:
+        jacobian[:, cells] = _of_cells(protocol, gradient[:, cells])
+
+    blocks = _blocks_of_cells(mesh, protocol)
+    if len(blocks) < _WORTH_A_THREAD:
+        for cells in blocks:
+            fill(cells)
+    else:
+        on_cores(fill, blocks)
+    return jacobian
+
+
+def _blocks_of_cells(mesh: Mesh, protocol: Protocol) -> list[slice]:
+    size = max(1, _BLOCK // protocol.num_measurements)
+    return [slice(start, min(start + size, mesh.num_cells)) for start in range(0, mesh.num_cells, size)]
+
+
 def jacobian_blocks(
     mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"]
 ) -> Iterator[tuple[slice, Inexact[Array, "M b"]]]:
@@ -309,9 +340,7 @@ def jacobian_blocks(
     cells, because the whole Jacobian of a solid does not fit in memory. Computed in NumPy; `fields` from `fields_of`,
     in ohms."""
     gradient = field_gradients(mesh, fields)
-    size = max(1, _BLOCK // protocol.num_measurements)
-    for start in range(0, mesh.num_cells, size):
-        cells = slice(start, min(start + size, mesh.num_cells))
+    for cells in _blocks_of_cells(mesh, protocol):
         yield cells, _of_cells(protocol, gradient[:, cells])
 
 

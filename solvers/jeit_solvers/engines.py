@@ -139,14 +139,15 @@ def _on_host(leaf: Any) -> Any:
     return np.asarray(leaf) if isinstance(leaf, jax.Array) and not isinstance(leaf, Tracer) else leaf
 
 
-def on_device(tree: Any) -> Any:
-    """The pytree with NumPy's arrays converted to JAX's, which keep their values even inside a traced program."""
+def on_device(tree: Any, *, take_over: bool = False) -> Any:
+    """The pytree with NumPy's arrays converted to JAX's, which keep their values even inside a traced program.
+    `take_over`: whether arrays of `empty_for_jax` may keep their memory, as nothing else changes it."""
     with jax.ensure_compile_time_eval():
-        return jax.tree.map(_on_device, tree)
+        return jax.tree.map(functools.partial(_on_device, take_over=take_over), tree)
 
 
-def _on_device(leaf: Any) -> Any:
-    return jax.device_put(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
+def _on_device(leaf: Any, *, take_over: bool) -> Any:
+    return jax.device_put(leaf, may_alias=take_over) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
 # Bytes from which an array is made in memory that JAX takes over; of smaller ones a copy is faster. JAX takes memory
@@ -154,17 +155,21 @@ def _on_device(leaf: Any) -> Any:
 _TAKEN_OVER, _ALIGNED = 1_000_000, 64
 
 
+def empty_for_jax(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
+    """An array without values, in memory that JAX takes over."""
+    size = math.prod(shape) * kind.itemsize
+    memory = np.empty(size + _ALIGNED, np.uint8)
+    start = -memory.ctypes.data % _ALIGNED
+    return memory[start : start + size].view(kind).reshape(shape)
+
+
 def product_for_jax(one: Inexact[np.ndarray, "*f k"], other: Inexact[np.ndarray, "k m"]) -> Inexact[Array, "*f m"]:
     """The product of NumPy's matrices as an array of JAX's. A large one is computed in memory that JAX takes over,
     because a copy would take longer than the product."""
     shape, kind = (*one.shape[:-1], other.shape[1]), np.result_type(one, other)
-    size = math.prod(shape) * kind.itemsize
-    if size < _TAKEN_OVER:
+    if math.prod(shape) * kind.itemsize < _TAKEN_OVER:
         return _to_jax(one @ other)
-    memory = np.empty(size + _ALIGNED, np.uint8)
-    start = -memory.ctypes.data % _ALIGNED
-    product = memory[start : start + size].view(kind).reshape(shape)
-    return jax.device_put(np.matmul(one, other, out=product), may_alias=True)
+    return jax.device_put(np.matmul(one, other, out=empty_for_jax(shape, kind)), may_alias=True)
 
 
 @jax.jit
