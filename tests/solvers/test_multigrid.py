@@ -76,6 +76,14 @@ def test_steps_grow_neither_with_the_mesh_nor_with_the_contrast():
     assert steps(*grid(48, 100.0)) < 3 * few
 
 
+def test_right_hand_sides_of_every_kind():
+    pattern, values, vectors = problem(sparse_problems.disk)
+    matrix = dense(pattern, values)
+    for given in (vectors * (1 + 2j), vectors[:, :0], np.asfortranarray(vectors), vectors[:, ::-1], vectors[:, :1]):
+        found = Multigrid().solve_columns(SparseSymmetric(values, pattern), given)
+        np.testing.assert_allclose(matrix @ found, given, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("entry", [-1.0, np.nan])
 def test_a_matrix_that_is_not_positive_definite_gives_nan(entry):
     pattern, values, vectors = problem(sparse_problems.disk)

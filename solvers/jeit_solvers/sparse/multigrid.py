@@ -23,12 +23,12 @@ import numpy as np
 from jaxtyping import Array, Inexact
 from scipy.sparse import csr_array
 
-from jeit_solvers.cores import on_cores
+from jeit_solvers.cores import number_of_cores, on_cores
 from jeit_solvers.engines import call_numpy, has_values, host, on_host
 from jeit_solvers.sparse.operator import LastMatrix, MatrixSolver, SparseSymmetric
 from jeit_solvers.sparse.pattern import SparsityPattern
 
-# Columns that are iterated together: more share the entries of the matrix that are read, fewer stay in the cache.
+# Most columns that are iterated together: more share the entries of the matrix that are read, fewer stay in the cache.
 _COLUMNS = 16
 # Maximum number of unknowns of the coarsest level, of which the inverse is computed.
 _COARSEST = 500
@@ -215,18 +215,20 @@ def _solve_in_numpy(solver: Multigrid, kind: Any, pattern: SparsityPattern, valu
     columns, values = np.asarray(columns), np.asarray(values)
     key = hashlib.blake2b(np.ascontiguousarray(pattern.indices).tobytes(), digest_size=16).digest()
     made = _LAST.of(key, values, lambda: hierarchy(pattern.to_scipy(values)))
-    load = columns.astype(np.result_type(kind, float))
+    load = np.ascontiguousarray(columns, np.result_type(kind, float))
     if made.levels is None:
         return np.full(load.shape, np.nan, kind)
+    if np.iscomplexobj(load) and not np.iscomplexobj(values):
+        load = load.view(float)  # real and imaginary parts are columns of their own
     solution = np.empty_like(load)
 
     def solve(part: slice) -> None:
         group = np.ascontiguousarray(load[:, part])
         solution[:, part] = _iterated(made, group, solver.tolerance, solver.max_steps)
 
-    starts = range(0, load.shape[1], _COLUMNS)
-    on_cores(solve, [slice(start, start + _COLUMNS) for start in starts])
-    return solution.astype(kind)
+    together = max(1, min(_COLUMNS, -(-load.shape[1] // number_of_cores())))
+    on_cores(solve, [slice(start, start + together) for start in range(0, load.shape[1], together)])
+    return solution.view(np.result_type(kind, float)).astype(kind)
 
 
 _LAST = LastMatrix()
