@@ -7,11 +7,11 @@ import pytest
 
 from jeit.data.round_skin import RoundSkin, simulate_press
 from jeit.design import Skin
-from jeit.image import ImageSeries
+from jeit.image import ImageSeries, Raster, figures_of_merit
 from jeit.imaging import ImagingSettings, image_difference
 from jeit.inverse import Imager, one_step
 from jeit.layout import named_layout
-from jeit.mesh import Disk, Rectangle, Solid, surface_of
+from jeit.mesh import Disk, Rectangle, Solid, centroids, surface_of
 
 
 @pytest.fixture(scope="module")
@@ -21,6 +21,10 @@ def shown():
     imaged = image_difference(pressed, rest, ImagingSettings(num_points=300))
     model = imaged.calibration.model
     swing = np.ones((3, model.mesh.num_cells))
+    raster = Raster.create(model.mesh, shape=(24, 24))
+    place = np.array([[0.0, 0.0], [0.02, 0.01]])
+    blurred = [np.exp(-((np.asarray(centroids(model.mesh)) - one) ** 2).sum(axis=1) / 2e-4) for one in place]
+    merit = figures_of_merit(raster.sample(np.array(blurred)), raster.extent, place, area=1e-4)
     layout = named_layout("grid-3x3", Rectangle(0.1, 0.1))
     return {
         "measurement": pressed,
@@ -34,11 +38,12 @@ def shown():
         "series": ImageSeries(model.mesh, swing, np.arange(3.0)),
         "layout": layout,
         "skin": Skin.create(layout, num_layers=0, cell_size=8e-3),
+        "merit": merit,
         "surface": surface_of(Solid(Disk(0.1), 0.05).mesh(num_points=300)),
     }
 
 
-PICTURES = ("measurement", "imaged", "mesh", "series", "layout", "skin", "surface")
+PICTURES = ("measurement", "merit", "imaged", "mesh", "series", "layout", "skin", "surface")
 
 
 def test_texts_are_short(shown):

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jeit.arguments import brief, picture
 from jeit_solvers.engines import has_values
 
 # Pixels above this fraction of the maximum belong to the target.
@@ -53,6 +54,21 @@ class FiguresOfMerit(eqx.Module):
     ringing: Float[Array, "*targets"]
     distance: Float[Array, "*targets"]
     body_radius: Float[Array, "*targets"]
+
+    def __repr__(self) -> str:
+        return brief(self._in_words, self)
+
+    def _in_words(self) -> str:
+        middle = {name: float(np.median(np.asarray(value))) for name, value in vars(self).items()}
+        targets = f"medians of {np.size(self.distance)} targets: " if np.ndim(self.distance) else ""
+        return (
+            f"FiguresOfMerit({targets}amplitude response {middle['amplitude_response']:.3g}, position error "
+            f"{1e3 * middle['position_error']:.3g} mm,\n  resolution {middle['resolution']:.3g}, shape deformation "
+            f"{middle['shape_deformation']:.3g}, ringing {middle['ringing']:.3g})"
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return picture(self)
 
 
 def figures_of_merit(

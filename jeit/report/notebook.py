@@ -6,6 +6,7 @@ import io
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -85,11 +86,21 @@ def _series(series: Any) -> Figure:
     return plot_frames(series.mesh, series.changes, titles=series.titles)
 
 
+def _figures_of_merit(figures: Any) -> Figure:
+    from jeit.plot.imaging.hyperparameter import plot_figures_of_merit
+
+    figure = Figure(figsize=(10.6, 5.6), layout="constrained")
+    several = jax.tree.map(np.atleast_1d, figures)
+    plot_figures_of_merit({"targets": several}, ax=figure.subplots())
+    return figure
+
+
 _DRAWN: dict[str, Callable[[Any], Figure]] = {
     "ImagedDifference": draw_image,
     "Mesh": _mesh,
     "Layout": _layout,
     "Measurement": _measurement,
     "ImageSeries": _series,
+    "FiguresOfMerit": _figures_of_merit,
     "Skin": lambda skin: _layout(skin.layout),
 }
