@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 # Maximum width of a table, in characters.
 _WIDTH = 80
+# Seconds from which a step shows how long it has taken.
+_SOME_SECONDS = 2.0
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
 
@@ -47,7 +50,7 @@ class Steps:
         self._finish()
         self._step, self._start = step, time.perf_counter()
         if not self.quiet:
-            self._status = self.console.status(Text(f"{step} …"))
+            self._status = self.console.status(_UnderWay(f"{step} …", self._start))
             self._status.start()
 
     @property
@@ -58,7 +61,7 @@ class Steps:
     def report(self, detail: str) -> None:
         """Show the progress within the current step beside its spinner."""
         if self._status is not None:
-            self._status.update(Text(f"{self._step} … {detail}"))
+            self._status.update(_UnderWay(f"{self._step} … {detail}", self._start))
 
     def __enter__(self) -> "Steps":
         return self
@@ -75,6 +78,18 @@ class Steps:
         self._status.stop()
         self._status = None
         self.console.print(f"  {self._step:<24}{time.perf_counter() - self._start:6.1f} s", highlight=False)
+
+
+@dataclass(frozen=True)
+class _UnderWay:
+    """Line beside the spinner: a step, and the seconds since its `start`, once it takes some."""
+
+    step: str
+    start: float
+
+    def __rich__(self) -> Text:
+        seconds = time.perf_counter() - self.start
+        return Text(f"{self.step}  {seconds:.0f} s" if seconds >= _SOME_SECONDS else self.step)
 
 
 def pairs(title: str, rows: list[tuple[str, str]]) -> Table:

@@ -45,7 +45,12 @@ def test_progress_says_the_step_and_the_best_score(monkeypatch):
         step("optimise")
         monkeypatch.setattr(step._status, "update", said.append)
         step.report("step 3 of at most 60, best score 1.234")
-    assert [str(one) for one in said] == ["optimise … step 3 of at most 60, best score 1.234"]
+        monkeypatch.setattr(step, "_start", step._start - 7.2)
+        step.report("step 40 of at most 60")
+    assert [str(one.__rich__()) for one in said] == [
+        "optimise … step 3 of at most 60, best score 1.234",
+        "optimise … step 40 of at most 60  7 s",
+    ]
 
 
 @pytest.mark.parametrize(
