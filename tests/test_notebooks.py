@@ -53,6 +53,7 @@ def test_texts_are_short(shown):
         assert text.count("\n") <= 2, name
         assert len(text) < 330, name
     assert "208 channels" in repr(shown["protocol"])
+    assert f"amplitude response {np.median(shown['merit'].amplitude_response):.3g}," in repr(shown["merit"])
     assert "1 inclusions" in repr(shown["imaged"]) or "inclusions in" in repr(shown["imaged"])
 
 

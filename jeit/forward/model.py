@@ -214,7 +214,7 @@ def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) ->
         return on_host(found) if namespace(parts[:3], conductivity) is np else found
     with np.errstate(all="ignore"):
         found = quantity(host_model(*parts), on_host(conductivity))
-    return found if namespace(parts[:3]) is np else on_device(found, take_over=True)
+    return found if namespace(parts[:3]) is np else on_device(found)
 
 
 def check_model(model: ForwardModel) -> None:

@@ -139,15 +139,15 @@ def _on_host(leaf: Any) -> Any:
     return np.asarray(leaf) if isinstance(leaf, jax.Array) and not isinstance(leaf, Tracer) else leaf
 
 
-def on_device(tree: Any, *, take_over: bool = False) -> Any:
-    """The pytree with NumPy's arrays converted to JAX's, which keep their values even inside a traced program.
-    `take_over`: whether arrays of `empty_for_jax` may keep their memory, as nothing else changes it."""
+def on_device(tree: Any) -> Any:
+    """The pytree with NumPy's arrays converted to JAX's, which keep their values even inside a traced program; arrays
+    of `empty_for_jax` keep their memory, too."""
     with jax.ensure_compile_time_eval():
-        return jax.tree.map(functools.partial(_on_device, take_over=take_over), tree)
+        return jax.tree.map(_on_device, tree)
 
 
-def _on_device(leaf: Any, *, take_over: bool) -> Any:
-    return jax.device_put(leaf, may_alias=take_over) if isinstance(leaf, np.ndarray | np.generic) else leaf
+def _on_device(leaf: Any) -> Any:
+    return jax.device_put(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
 # Bytes from which an array is made in memory that JAX takes over; of smaller ones a copy is faster. JAX takes memory
@@ -169,7 +169,7 @@ def product_for_jax(one: Inexact[np.ndarray, "*f k"], other: Inexact[np.ndarray,
     shape, kind = (*one.shape[:-1], other.shape[1]), np.result_type(one, other)
     if math.prod(shape) * kind.itemsize < _TAKEN_OVER:
         return _to_jax(one @ other)
-    return jax.device_put(np.matmul(one, other, out=empty_for_jax(shape, kind)), may_alias=True)
+    return jax.device_put(np.matmul(one, other, out=empty_for_jax(shape, kind)))
 
 
 @jax.jit

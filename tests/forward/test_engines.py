@@ -12,10 +12,12 @@ from kinds import MODELS
 
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
+from jeit.forward import model as forward_model
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit_solvers import ConjugateGradient, Multigrid
+from jeit_solvers.engines import empty_for_jax, on_device
 
 QUANTITIES = ("voltages", "transfer_impedance", "potentials", "fields", "voltages_and_jacobian")
 
@@ -114,6 +116,20 @@ def test_a_solver_that_is_asked_for_is_used(parts):
     rough = ForwardModel(*parts, solver=ConjugateGradient(tolerance=1e-6)).voltages(1.0)
     exact = ForwardModel(*parts).voltages(1.0)
     assert 1e-9 < np.abs(rough - exact).max() / np.abs(exact).max() < 1e-3
+
+
+def test_a_large_jacobian_is_filled_on_all_cores(parts, monkeypatch):
+    model = ForwardModel(*parts)
+    expected = np.asarray(model.jacobian(1.0))
+    monkeypatch.setattr(forward_model, "_BLOCK", 200)
+    monkeypatch.setattr(forward_model, "_WORTH_A_THREAD", 2)
+    assert_same(model.jacobian(1.0), expected)
+
+
+def test_jax_takes_over_memory_that_was_made_for_it():
+    made = empty_for_jax((300, 500), np.dtype(float))
+    made[:] = 1
+    assert on_device(made).unsafe_buffer_pointer() == made.ctypes.data
 
 
 @pytest.fixture(scope="module")

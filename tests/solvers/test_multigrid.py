@@ -84,6 +84,22 @@ def test_right_hand_sides_of_every_kind():
         np.testing.assert_allclose(matrix @ found, given, rtol=0, atol=1e-9)
 
 
+def test_complex_loads_whose_squares_cancel():
+    """Of a real system; the conjugate orthogonal variant breaks down at once."""
+    pattern, values, _ = problem(sparse_problems.diagonal)
+    load = np.zeros((pattern.size, 1), complex)
+    load[[0, 1], 0] = 1, 1j * np.sqrt(2)
+    found = Multigrid().solve_columns(SparseSymmetric(values, pattern), load)
+    np.testing.assert_allclose(found[:, 0], load[:, 0] / np.arange(1, 41), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-60, 1e50])
+def test_loads_beyond_single_precision(size):
+    pattern, values, vectors = problem(sparse_problems.disk)
+    found = Multigrid().solve_columns(SparseSymmetric(values, pattern), size * vectors)
+    np.testing.assert_allclose(dense(pattern, values) @ found, size * vectors, rtol=0, atol=1e-9 * size)
+
+
 @pytest.mark.parametrize("entry", [-1.0, np.nan])
 def test_a_matrix_that_is_not_positive_definite_gives_nan(entry):
     pattern, values, vectors = problem(sparse_problems.disk)
