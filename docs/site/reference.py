@@ -51,8 +51,10 @@ def _first_sentence(text: str | None) -> str:
     return (first.split(". ")[0].rstrip(".") if first else "").replace("|", "\\|")
 
 
-def _defined(path: Path) -> Iterator[tuple[str, str]]:
+@cache
+def _defined(path: Path) -> tuple[tuple[str, str], ...]:
     """Public names that a module defines at its top, each with its docstring, or what stands by a constant."""
+    defined = []
     lines = path.read_text("utf-8").split("\n")
     body = ast.parse("\n".join(lines)).body
     for node, after in zip(body, [*body[1:], None], strict=True):
@@ -67,7 +69,8 @@ def _defined(path: Path) -> Iterator[tuple[str, str]]:
             found = [(target.id, said) for target in targets if isinstance(target, ast.Name)]
         else:
             continue
-        yield from ((name, text) for name, text in found if not name.startswith("_"))
+        defined += [(name, text) for name, text in found if not name.startswith("_")]
+    return tuple(defined)
 
 
 def _imported(path: Path, top: str) -> Iterator[tuple[str, str]]:
