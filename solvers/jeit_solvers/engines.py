@@ -234,22 +234,30 @@ def values_at_once(function: _Function) -> _Function:
 
 
 class Recent:
-    """Cache of the last few results of a function of pytrees, looked up by the identity of the arrays in its
-    arguments."""
+    """Cache of the last few results of a function of immutable pytrees, looked up by the identity of its arguments, or
+    of the arrays in them."""
 
     def __init__(self, make: Callable[..., Any], size: int = 4):
         self._make, self._size = make, size
-        self._kept: list[tuple[list[Any], Any, Any]] = []
+        self._kept: list[tuple[tuple[Any, ...], list[Any], Any, Any]] = []
 
     def __call__(self, *trees: Any) -> Any:
         """The result of `make` for these arguments, computed or taken from the cache."""
+        kept = self._kept[::-1]
+        for known, _, _, result in kept:
+            if _identical(known, trees):
+                return result
         leaves, structure = jax.tree.flatten(trees)
-        for known, kind, result in reversed(self._kept):
-            if kind == structure and all(one is other for one, other in zip(known, leaves, strict=True)):
+        for _, known, kind, result in kept:
+            if _identical(known, leaves) and kind == structure:  # structures take far longer to compare
                 return result
         result = self._make(*trees)
-        self._kept = [*self._kept[1 - self._size :], (leaves, structure, result)]
+        self._kept = [*self._kept, (trees, leaves, structure, result)][-self._size :]
         return result
+
+
+def _identical(some: Sequence[Any], others: Sequence[Any]) -> bool:
+    return len(some) == len(others) and all(one is other for one, other in zip(some, others, strict=True))
 
 
 def undifferentiated(values: Any) -> Any:

@@ -1,6 +1,7 @@
 """Results that are kept: known again by the very arrays and the kind of tree they came of, and only so many."""
 
 import numpy as np
+import pytest
 
 from jeit_solvers.engines import Recent
 
@@ -17,3 +18,20 @@ def test_the_same_arrays_in_the_same_tree_are_known_again():
     assert keep({"b": array}) == 2, "another tree of the same arrays"
     assert keep({"a": array.copy()}) == 3, "another array, if equal"
     assert [keep({"b": array}), keep({"a": array})] == [2, 4], "the first is forgotten"
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_no_more_results_are_kept_than_asked_for(size):
+    keep = Recent(lambda array: object(), size)
+    arrays = [np.ones(1) for _ in range(5)]
+    results = [keep(array) for array in arrays]
+    again = [keep(array) is result for array, result in zip(arrays[::-1], results[::-1], strict=True)]
+    assert again[:size] == [True] * size
+    assert not any(again[size:])
+
+
+def test_the_same_arguments_are_not_looked_into(monkeypatch):
+    keep, tree = Recent(lambda tree: object()), {"a": np.ones(2)}
+    kept = keep(tree)
+    monkeypatch.setattr("jax.tree.flatten", None)
+    assert keep(tree) is kept
