@@ -165,7 +165,7 @@ def find_description(
     progress("protocols that fit")
     found = list(_fitting(numbers, rest, geometry, electrodes, known or {}, current))
     if not found:
-        counts = _channel_counts(geometry, electrodes, known or {}, current)
+        counts = _channel_counts(known or {})
         wanted = f" (of what is known: {listed(counts)})" if counts else ""
         raise ValueError(
             f"{path.name}: no protocol of common kinds has as many channels{wanted} as there are numbers: "
@@ -282,8 +282,7 @@ def _fitting(
         for table in _protocols(number):
             if any(table.get(key, value) != value for key, value in known.items()):
                 continue
-            described = _described(geometry, electrodes, table, current)
-            protocol = _protocol(described, numbers.path)
+            protocol = _protocol({**table, "current": current}, numbers.path)
             if protocol is None or protocol.num_measurements not in counts:
                 continue
             if protocol.num_measurements < _LEAST_CHANNELS * number:
@@ -292,6 +291,7 @@ def _fitting(
             if same in seen:
                 continue
             seen.add(same)
+            described = _described(geometry, electrodes, table, current)
             read = [_measured(one, described, protocol) for one in (numbers, rest)]
             if read[0] is not None and read[1] is not None:
                 empty = read[1].mean_frame()
@@ -299,11 +299,11 @@ def _fitting(
                 yield Candidate(table, read[0].num_frames, spread, reciprocity_error(empty), empty)
 
 
-def _channel_counts(geometry: dict, electrodes: dict, known: dict, current: float) -> list[int]:
+def _channel_counts(known: dict) -> list[int]:
     """Numbers of channels of the protocols that agree with what is known, if the number of electrodes is."""
     tables = _protocols(known["number"]) if "number" in known else ()
     fitting = [one for one in tables if all(one.get(key, value) == value for key, value in known.items())]
-    made = [_protocol(_described(geometry, electrodes, one, current), Path("a")) for one in fitting]
+    made = [_protocol({**one, "current": 1.0}, Path("a")) for one in fitting]
     return sorted({one.num_measurements for one in made if one is not None})
 
 
@@ -313,9 +313,10 @@ def _described(geometry: dict, electrodes: dict, protocol: dict, current: float)
     return parse_description(tables, "the description")
 
 
-def _protocol(described: Description, path: Path) -> Protocol | None:
+def _protocol(table: dict, path: Path) -> Protocol | None:
+    """The protocol of a table; None if it has no channels."""
     try:
-        return described.protocol(path)
+        return parse_description({"protocol": table}, "the description").protocol(path)
     except ValueError:  # none of its channels is left, or there are too few electrodes
         return None
 

@@ -1,7 +1,9 @@
 """Files that nobody has described: explained, or a question; never a description of something else."""
 
+import functools
 import io
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,14 +19,18 @@ DISK = {"shape": "disk", "radius": 0.1}
 RING = {"layout": "ring", "width": 0.012}
 
 
-def simulated(protocol, number=8):
-    """Voltages (2, M) of a disk, empty and with a rod at (50, 0) mm, and the protocol that is described."""
-    tables = {
-        "geometry": DISK,
-        "electrodes": {**RING, "number": number, "contact_impedance": 3.0},
-        "protocol": {"current": 1e-3, **protocol},
-    }
-    model = parse_description(tables, "a.toml").model("a.csv", num_points=900)
+@functools.cache
+def empty_disk():
+    """A model of the empty disk with eight electrodes."""
+    electrodes = {**RING, "number": 8, "contact_impedance": 3.0}
+    tables = {"geometry": DISK, "electrodes": electrodes, "protocol": {"current": 1e-3, "kind": "adjacent"}}
+    return parse_description(tables, "a.toml").model("a.csv", num_points=900)
+
+
+def simulated(table):
+    """Voltages (2, M) of a disk, empty and with a rod at (50, 0) mm, and the protocol of a table."""
+    table = {"number": 8, "current": 1e-3, **table}
+    model = empty_disk().with_protocol(parse_description({"protocol": table}, "a.toml").protocol(Path("a.csv")))
     away = np.asarray(centroids(model.mesh)) - [0.05, 0]
     rod = np.where(np.linalg.norm(away, axis=1) < 0.025, 1e-5, 2e-3)
     voltages = np.stack([model.voltages(2e-3), model.voltages(rod)])
