@@ -51,6 +51,10 @@ FORMATS: dict[str, Format] = {
     "carefusion": Format("carefusion", (".eit",), described=True),
     "swisstom": Format("swisstom", (".eit",), described=True),
     "goettingen": Format("goettingen", (".get",), described=True),
+    "cn0565": Format("cn0565", (".txt", ".csv", ".dat", ".log"), described=True, borrows=True),
+    "quadrupoles": Format(
+        "quadrupoles", (".txt", ".csv", ".dat", ".data", ".ohm", ".shm"), described=True, borrows=True
+    ),
     "openeit": Format("openeit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
     "table": Format("table", _TABLES, described=True, borrows=True),
     # A table of 208 rows of real and imaginary pairs, with the bundled description; used only if named explicitly.
@@ -70,7 +74,8 @@ def read(
 
     - `path`: the data file; or a folder of Sciospec files, one per frame, which are read in the order of their names.
     - `format`: a name in `FORMATS` ("kit4", "ktc2023", "eidors", "sciospec", "draeger", "carefusion", "swisstom",
-      "goettingen", "openeit", "table", "tank6cm"); by default it is recognised from the content.
+      "goettingen", "cn0565", "quadrupoles", "openeit", "table", "tank6cm"); by default it is recognised from the
+      content.
     - `description`: a TOML file, or the name of a bundled one, that states the meaning of the numbers (tables, EIDORS
       files) or the body measured (files of instruments). By default it is looked for beside the data.
     - `like`: a measurement of the same sensor, such as the reference, whose description applies to a table that has

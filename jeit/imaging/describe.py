@@ -19,11 +19,10 @@ from jeit.data import Measurement
 from jeit.data.description import Description, TableLayout, parse_description
 from jeit.data.exchange import assignments
 from jeit.data.formats import openeit
-from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text
 from jeit.data.formats.table import measurement_in
-from jeit.data.formats.text import read_text
-from jeit.data.formats.unstated import channel_gains
+from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read_text
 from jeit.data.quality import reciprocity_error
+from jeit.data.unstated import channel_gains
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.files import matlab, npy_array, npz_arrays
 from jeit.forward import ForwardModel

@@ -9,8 +9,8 @@ import scipy.io
 from jeit import data
 from jeit.data import load_description
 from jeit.data.description import TableLayout, parse_description
-from jeit.data.formats.frames import frames_in_table
-from jeit.data.formats.unstated import fitting_protocol
+from jeit.data.formats.text import frames_in_table
+from jeit.data.unstated import fitting_protocol
 from jeit.protocol import adjacent
 
 TANK = """

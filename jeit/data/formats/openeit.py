@@ -25,8 +25,8 @@ from jeit.arguments import counted, listed
 from jeit.data.description import parse_description
 from jeit.data.formats.recording import Recording, content_of, description_of, measurement_of
 from jeit.data.formats.table import description_like, find_description
-from jeit.data.formats.unstated import with_signs
 from jeit.data.measurement import Measurement
+from jeit.data.unstated import with_signs
 from jeit.protocol import Protocol
 
 DESCRIPTION = "lines of an OpenEIT device ('magnitudes: …'), of 8, 16 or 32 electrodes"
