@@ -267,7 +267,7 @@ def _numbered(path: Path, lines: _Lines, placed: int | None) -> tuple[Int[np.nda
     return electrodes, notes
 
 
-def _at(row: int) -> str:
+def _at(row: int | np.integer) -> str:
     return f"measurement {int(row) + 1}"
 
 
