@@ -117,6 +117,12 @@ def test_characters_that_openeit_lost(tmp_path):
     assert any("4 readings of zero, as of an open circuit, or illegible" in note for note in found.notes)
     path.write_text(frame + frame[:40])
     assert data.read(path).num_frames == 1
+    # A lost word makes two frames one, and those after them keep their times.
+    path.write_text(frame + frame + frame.replace("magnitudes: ", "") + frame + "\n")
+    path.with_suffix(".toml").write_text("[data]\nframe_rate = 10\n")
+    found = data.read(path)
+    assert np.asarray(found.mask).all(axis=1).tolist() == [True, False, False, True]
+    np.testing.assert_allclose(found.times, [0, 0.1, 0.2, 0.3])
 
 
 def test_what_a_description_leaves_out_is_as_openeit_sends_it(tmp_path):

@@ -25,14 +25,19 @@ def test_lines_of_a_cn0565(tmp_path):
     """With times before them, answers between them, a lost character, and a last line that is cut off."""
     frame = disk_voltages(FIXED) * (1 + 0.2j)
     line = hexadecimal(frame)
-    text = f"OK\n[10:00:01] {line}\r\n!C 0\nOK\n{line.replace(',', ';', 1)}\n{line}\n{line[:100]}"
+    text = f"OK\n[10:00:01] {line}\r\n!C 0\nOK\n{line[:-30]}{line}\n{line}\n{line[:100]}"
     (tmp_path / "a.log").write_text(text)
     (tmp_path / "a.toml").write_text(RING + '8\n[data]\ncomponent = "complex"\n')
     found = data.read(tmp_path / "a.log")
     assert found.protocol.same_patterns(FIXED)
-    assert np.asarray(found.mask).sum(axis=1).tolist() == [40, 0, 40]
+    assert np.asarray(found.mask).sum(axis=1).tolist() == [40, 0, 0, 40]
     np.testing.assert_allclose(found.voltages[0], 1e5 * frame, atol=1)
-    for note in ("distance are taken to be 1", "lost in frame 1: masked", "cut off after", "nor the current is known"):
+    for note in (
+        "distance are taken to be 1",
+        "lost in frames 1, 2: masked",
+        "cut off after",
+        "nor the current is known",
+    ):
         assert any(note in one for one in found.notes), note
     assert data.reciprocity_error(found.frame(0)) < 1e-2
 

@@ -141,6 +141,8 @@ def _frames(content: bytes) -> Iterator[list[float | None]]:
             cells.pop()
         found = [_number(cell) for cell in cells]
         yield [*found, None] if line[2].strip() else found
+        for _ in range(line[2].count(b"!V")):  # a line end is lost; the frames keep their places in time
+            yield [None]
 
 
 def _number(cell: bytes) -> float | None:
