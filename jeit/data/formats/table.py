@@ -66,6 +66,8 @@ def read(
     elif like is not None:
         described = description_like(like)
     else:
+        # A damaged file is named as such: no description helps it.
+        _ = _from_numpy(path, ()) if path.suffix.lower() in (".npz", ".npy") else read_text(path)
         raise ValueError(
             f"description: {path.name} is a table of numbers, and nothing says what they mean. Put a description "
             f"beside it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one; "
