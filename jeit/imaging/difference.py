@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Array, Float, Inexact, UInt8
 
-from jeit.arguments import brief, percent, picture
+from jeit.arguments import brief, page, percent, picture
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
 from jeit.electrodes import AbstractElectrodes
@@ -101,6 +101,9 @@ class ImagedDifference:
 
     def _repr_png_(self) -> bytes | None:
         return picture(self)
+
+    def _repr_html_(self) -> str | None:
+        return page(self)
 
     @property
     def lowest(self) -> float:
