@@ -190,6 +190,11 @@ def test_command(tmp_path, capsys, monkeypatch):
     assert "--shape: no file says it; give --shape disk:0.1" in capsys.readouterr().err
     assert main([*given, "--shape", "disk:0.1,3", "--width", "0.012"]) == 1
     assert "--shape: give one of disk:RADIUS" in capsys.readouterr().err
+    for wide, said in (("0.2", "--width: electrodes 1 and 2 overlap;"), ("0", "--width is 0, and must be from")):
+        assert main([*given, "--shape", "disk:0.1", "--width", wide, "--electrodes", "8"]) == 1
+        assert capsys.readouterr().err.startswith(f"jeit: {said}")
+    assert main([*given, "--shape", "disk:-0.1", "--width", "0.01", "--electrodes", "8"]) == 1
+    assert capsys.readouterr().err.startswith("jeit: --shape is -0.1, and must be")
     assert main([*given, "--shape", "disk:0.1", "--width", "0.012", "--electrodes", "8", "--protocol", "adjacent"]) == 0
     said = capsys.readouterr().out
     assert "adjacent, 8 electrodes, order fixed" in said
