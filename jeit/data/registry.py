@@ -20,7 +20,8 @@ _IN_MEMORY = 4
 class Format:
     """A file format. **Fields**: `module`: name of the module that reads it; `endings`: suffixes of its files;
     `described`: whether a description may accompany a file; `borrows`: whether a file may use the description of
-    another measurement; `bundled`: name of the bundled description that always applies, or None.
+    another measurement; `own_protocol`: whether files state their protocol, and a description the body alone;
+    `bundled`: name of the bundled description that always applies, or None.
 
     The module is imported only when a file has one of the suffixes.
     """
@@ -29,6 +30,7 @@ class Format:
     endings: tuple[str, ...]
     described: bool = False
     borrows: bool = False
+    own_protocol: bool = False
     bundled: str | None = None
 
     @property
@@ -47,20 +49,31 @@ FORMATS: dict[str, Format] = {
     "kit4": Format("kit4", (".mat",)),
     "ktc2023": Format("ktc2023", (".mat",)),
     "eidors": Format("eidors", (".mat",), described=True, borrows=True),
-    "sciospec": Format("sciospec", (".eit",), described=True),
-    "draeger": Format("draeger", (".eit",), described=True),
-    "carefusion": Format("carefusion", (".eit",), described=True),
-    "swisstom": Format("swisstom", (".eit",), described=True),
-    "goettingen": Format("goettingen", (".get",), described=True),
-    "cn0565": Format("cn0565", (".txt", ".csv", ".dat", ".log"), described=True, borrows=True),
+    "sciospec": Format("sciospec", (".eit",), described=True, own_protocol=True),
+    "draeger": Format("draeger", (".eit",), described=True, own_protocol=True),
+    "carefusion": Format("carefusion", (".eit",), described=True, own_protocol=True),
+    "swisstom": Format("swisstom", (".eit",), described=True, own_protocol=True),
+    "goettingen": Format("goettingen", (".get",), described=True, own_protocol=True),
+    "cn0565": Format("cn0565", (".txt", ".csv", ".dat", ".log"), described=True, borrows=True, own_protocol=True),
     "quadrupoles": Format(
-        "quadrupoles", (".txt", ".csv", ".dat", ".data", ".ohm", ".shm"), described=True, borrows=True
+        "quadrupoles",
+        (".txt", ".csv", ".dat", ".data", ".ohm", ".shm"),
+        described=True,
+        borrows=True,
+        own_protocol=True,
     ),
     "openeit": Format("openeit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
     "table": Format("table", _TABLES, described=True, borrows=True),
     # A table of 208 rows of real and imaginary pairs, with the bundled description; used only if named explicitly.
     "tank6cm": Format("table", (), bundled="tank6cm"),
 }
+
+
+def format_with_protocol(path: Path) -> str | None:
+    """Name of the format of a file that states its protocol, so that only the body is to be described; or None."""
+    if not path.is_file():
+        return None
+    return next((name for name, one in FORMATS.items() if one.own_protocol and one.recognises(path)), None)
 
 
 def read(

@@ -113,7 +113,15 @@ def describe(
     with written_whole(target) as file:
         file.write(found.text.encode())
     if reference is None and reference_key is None:
-        console.print(f"Written: {target}. Give --reference, a file of the empty body, to image it.")
+        frames = found.candidates[0].frames
+        several = (
+            f"; or say which of its {frames} frames are of the empty body, and which to image: jeit reconstruct {data} "
+            f"--description {target} --reference-frames 0-1 --frame {frames - 1}"
+        )
+        console.print(
+            f"Written: {target}. Give --reference, a file of the empty body, to image it{several * (frames > 1)}.",
+            soft_wrap=True,
+        )
         return
     with Steps(console, quiet=quiet) as step:
         base = read(data if reference is None else reference, description=target, key=reference_key)

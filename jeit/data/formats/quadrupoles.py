@@ -125,6 +125,11 @@ def read(
     return with_signs(measurement_of(path, recording, replace(described, protocol_section=None)), like)
 
 
+def places(path: Path) -> Float[np.ndarray, "L d"] | None:
+    """Positions of the electrodes (L, d), metres, that a file states; or None."""
+    return _lines(path).places
+
+
 def _heading(lines: Sequence[str]) -> tuple[int, list[str], list[float]] | None:
     """Index of the line that names the columns, names and scales of these; None if there is none."""
     for number, line in enumerate(lines[:_MOST_HEADING]):

@@ -2,8 +2,9 @@
 whose arrangement is found out: rows or columns, a column of times, frames wrapped over lines.
 
 Understood are cells separated by commas, semicolons, tabs or spaces, also several of these at once; decimal commas;
-comments (# or %), headings; a word before the numbers of each line ("magnitudes : 1.2, 3.4"); separators at the end
-of lines; and lines of unequal length, of frames that are wrapped over several lines.
+complex numbers ("1+2j", "(1-2j)"); brackets around lines, as Python and NumPy print lists and arrays; comments (# or
+%), headings, and lines like those of the heading between frames; a word before the numbers of each line ("magnitudes :
+1.2, 3.4"); separators at the end of lines; and lines of unequal length, of frames that are wrapped over several lines.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ _SAMPLE, _MOST_HEADING = 40, 100
 _LABEL = re.compile(r"\s{0,40}([A-Za-z_][\w ()/\[\].-]{0,60})[:=]\s{0,40}(?=[-+.\d])")
 _CUT_NUMBER = re.compile(r"[-+]?\d*[.,]?\d*([eE][-+]?)?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+_COMPLEX = re.compile(r"\(?[-+]?[\d.]+(?:[eE][-+]?\d+)?[-+]{1,2}[\d.]+(?:[eE][-+]?\d+)?[ijIJ]\)?")
 _COMMENTS = ("#", "%", "//")
 _SET = "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
 
@@ -41,7 +43,7 @@ class Text(NamedTuple):
     """**Fields**: `values`: all numbers; `lengths`: how many stand in each line; `heading`: cells of the last line of a
     heading; `notes`: what was found out."""
 
-    values: Float[np.ndarray, " n"]
+    values: Inexact[np.ndarray, " n"]
     lengths: np.ndarray
     heading: tuple[str, ...]
     notes: tuple[str, ...]
@@ -58,15 +60,17 @@ class _Way(NamedTuple):
         line = _unlabelled(line)
         if self.decimal_comma:
             line = line.replace(",", ".")
-        cells = [cell.strip(' \t"') for cell in line.strip(" \r\n").split(self.delimiter)]
+        line = line.strip(" \r\n").lstrip("[ ")
+        line = line.rstrip(",; ]") if line.rstrip(",; ").endswith("]") else line
+        cells = [cell.strip(' \t"') for cell in line.split(self.delimiter)]
         while cells and not cells[-1]:
             cells.pop()
         return cells
 
-    def numbers(self, line: str) -> list[float] | None:
+    def numbers(self, line: str) -> list[complex] | None:
         """The numbers of a line, or None if it holds anything else."""
         try:
-            return [float(cell) for cell in self.cells(line)]
+            return [_number(cell) for cell in self.cells(line)]
         except ValueError:
             return None
 
@@ -90,35 +94,43 @@ def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = 
     lines = [line for _, line in islice(_content(path, skipped), _MOST_HEADING + _SAMPLE)]
     way = _Way(_given(delimiter), False) if delimiter is not None else _way_of(lines)
     heading = 0 if skip_rows is not None else _heading(way, lines)
-    values, lengths, label = array("d"), array("q"), ""
+    values, imaginary, lengths, label = array("d"), array("d"), array("q"), ""
     rest, line, cells, ended = islice(_content(path, skipped), heading, None), "\n", [], False
+    titles, repeated = {_form(one) for one in lines[:heading]}, 0
     for place, line in rest:
+        if lengths and _form(line) in titles:
+            repeated += 1
+            continue
         cells = way.cells(line)
         try:
-            row = [float(cell) for cell in cells]
+            row = [_number(cell) for cell in cells]
         except ValueError:
             cut = lengths and all(map(_is_number, cells[:-1])) and _CUT_NUMBER.fullmatch(cells[-1])
             if not cut or next(rest, None) is not None:
                 raise ValueError(f"{path.name}, line {place}{_no_number(cells, way, first=not lengths)}") from None
-            row, ended = [float(cell) for cell in cells[:-1]], True
+            row, ended = [_number(cell) for cell in cells[:-1]], True
         if not lengths and (named := _LABEL.match(line)):
             label = named[1].strip()
-        values.extend(row)
+        values.extend([one.real for one in row])
+        if imaginary or any(isinstance(one, complex) for one in row):
+            imaginary.extend([0.0] * (len(values) - len(row) - len(imaginary)) + [one.imag for one in row])
         lengths.append(len(row))
     if not values:
         raise ValueError(f"{path.name} holds no numbers.")
     notes = [f"numbers are separated by {way}."] if delimiter is None and way != _PLAIN else []
     notes += [f"the first {heading} line{'s are' if heading > 1 else ' is'} a heading, skipped."] if heading else []
+    notes += [f"{repeated} more such lines stand between the numbers, and are left out."] if repeated else []
     notes += [f"{label!r} stands before each line, and is left out."] if label else []
     if ended:
         notes.append(f"the last number, {cells[-1][:20]!r}, is cut off, and left out.")
     elif not line.endswith("\n") and len(cells) > 1 and len(cells[-1]) < min(map(len, cells[:-1])):
         notes.append(f"no line end follows the last number, {cells[-1][:20]}: is it cut off?")
     named = tuple(way.cells(lines[heading - 1])) if heading else ()
-    return Text(np.array(values), np.array(lengths), named, tuple(notes))
+    numbers = np.array(values) + 1j * np.array(imaginary) if imaginary else np.array(values)
+    return Text(numbers, np.array(lengths), named, tuple(notes))
 
 
-def rectangle(text: Text, name: str) -> Float[np.ndarray, "R C"]:
+def rectangle(text: Text, name: str) -> Inexact[np.ndarray, "R C"]:
     """The numbers as rows of equal length. Raises `ValueError` if a row has another length."""
     length = int(text.lengths[0])
     if (other := np.flatnonzero(text.lengths != length)).size:
@@ -126,6 +138,11 @@ def rectangle(text: Text, name: str) -> Float[np.ndarray, "R C"]:
             f"{name}: row {other[0] + 1} has length {text.lengths[other[0]]}, the first {length}. Is the file cut off?"
         )
     return text.values.reshape(-1, length)
+
+
+def _form(line: str) -> str:
+    """A line with # in place of numbers, so that "Frame 1" is of the form of "Frame 2"."""
+    return re.sub(r"\d+", "#", line.strip())
 
 
 def _unlabelled(line: str) -> str:
@@ -184,6 +201,8 @@ def _no_number(cells: list[str], way: _Way, *, first: bool) -> str:
     """Error message for a line whose cells are not all numbers. `first`: whether no line of numbers precedes it."""
     wrong = [k for k, cell in enumerate(cells) if not _is_number(cell)]
     cell = cells[wrong[0]]
+    if first and cells[0].startswith("{"):
+        return ": this is JSON; write its numbers as CSV, a frame in each line."
     said = f"{cell[:40]!r} is no number" if cell else "nothing stands there"
     if len(cells) == 1:
         return f": {said}, nor numbers separated by {way}. {_SET}"
@@ -192,9 +211,19 @@ def _no_number(cells: list[str], way: _Way, *, first: bool) -> str:
     return f", column {wrong[0] + 1}: {said}; where a value is missing write nan.{other}"
 
 
+def _number(cell: str) -> complex:
+    """A number, real or complex. Raises `ValueError` for anything else."""
+    try:
+        return float(cell)
+    except ValueError:
+        if not _COMPLEX.fullmatch(cell):
+            raise
+        return complex(cell.strip("()").replace("+-", "-").replace("i", "j").replace("I", "j"))
+
+
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        _number(cell)
     except ValueError:
         return False
     return True
