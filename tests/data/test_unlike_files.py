@@ -296,6 +296,18 @@ def test_arrays_as_they_are_printed(frames, tmp_path):
     np.testing.assert_allclose(read(tmp_path / "a.txt").voltages, values[:1], rtol=1e-6)
 
 
+@pytest.mark.parametrize(("index", "first"), [(True, 0), (False, 0), (False, 1)])
+def test_a_first_line_that_numbers_the_columns_is_no_frame(index, first, frames, tmp_path):
+    """As data frames are saved, with and without their index."""
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    lines = [("," if index else "") + ",".join(str(first + k) for k in range(values.shape[1]))]
+    lines += [(f"{k}," if index else "") + ",".join(map(repr, frame.tolist())) for k, frame in enumerate(values)]
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    found = read(tmp_path / "a.csv")
+    np.testing.assert_allclose(found.voltages, values)
+    assert any("the first 1 line is a heading" in note for note in found.notes)
+
+
 def test_json_is_named(frames, tmp_path):
     (tmp_path / "a.txt").write_text('{"t": 0.0, "v": [1.0, 2.0]}')
     with pytest.raises(ValueError, match="line 1: this is JSON; write its numbers as CSV"):

@@ -32,6 +32,8 @@ _LABEL = re.compile(r"\s{0,40}([A-Za-z_][\w ()/\[\].-]{0,60})[:=]\s{0,40}(?=[-+.
 _CUT_NUMBER = re.compile(r"[-+]?\d*[.,]?\d*([eE][-+]?)?")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _COMPLEX = re.compile(r"\(?[-+]?[\d.]+(?:[eE][-+]?\d+)?[-+]{1,2}[\d.]+(?:[eE][-+]?\d+)?[ijIJ]\)?")
+# Fewest columns of which a first line of their numbers is no frame.
+_COLUMNS = 8
 _COMMENTS = ("#", "%", "//")
 _SET = "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
 
@@ -174,10 +176,15 @@ def _has_decimal_commas(way: _Way, lines: Sequence[str]) -> bool:
 
 
 def _heading(way: _Way, lines: Sequence[str]) -> int:
-    """Number of lines at the start that are a heading: half words or more, or as long as no line of numbers."""
+    """Number of lines at the start that are a heading: half words or more, as long as no line of numbers, or the
+    numbers of the columns, as data frames are saved."""
     usual = {len(row) for line in lines if (row := way.numbers(line))}
     for number, line in enumerate(lines):
         cells = way.cells(line)
+        named = cells[1:] if cells and not cells[0] else cells
+        first = 1 if named[:1] == ["1"] else 0
+        if len(named) >= _COLUMNS and named == [str(first + k) for k in range(len(named))]:
+            continue
         known = sum(map(_is_number, cells))
         if known == len(cells) or (2 * known > len(cells) and len(cells) in usual):
             return number
