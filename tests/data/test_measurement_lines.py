@@ -128,6 +128,11 @@ def test_the_unified_data_format(tmp_path):
             for (a, b, m, n), value in zip(QUADRUPOLES, disk_voltages(made), strict=True)]  # fmt: skip
     (tmp_path / "b.dat").write_text("# a b m n r/Ohm\n" + "\n".join(ohms))
     np.testing.assert_allclose(data.read(tmp_path / "b.dat", like=found).voltages[0], disk_voltages(made), rtol=1e-8)
+    # Apparent resistivities with their factors.
+    (tmp_path / "c.dat").write_text(
+        "# a b m n k rhoa\n" + "\n".join(f"{' '.join(one.split()[:4])} 2 {2 * float(one.split()[4])}" for one in ohms)
+    )
+    np.testing.assert_allclose(data.read(tmp_path / "c.dat", like=found).voltages[0], disk_voltages(made), rtol=1e-8)
     assert any("1 mA multiplies the resistances" in note for note in data.read(tmp_path / "b.dat").notes)
 
 

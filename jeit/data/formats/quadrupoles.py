@@ -289,7 +289,8 @@ def _current(
     known = np.zeros(0) if current is None else np.abs(current[np.isfinite(current) & (current != 0)])
     if known.size:
         return float(np.median(known)), ()
-    taken = "multiplies the resistances" if lines.column("r") is not None else "is assumed"
+    voltages = lines.column("u") is not None or lines.column("real") is not None
+    taken = "is assumed" if voltages else "multiplies the resistances"
     return _CURRENT, (f"the file states no current: {1e3 * _CURRENT:g} mA {taken}.",)
 
 
