@@ -126,7 +126,7 @@ def read(
 
 
 def places(path: Path) -> Float[np.ndarray, "L d"] | None:
-    """Positions of the electrodes (L, d), metres, that a file states; or None."""
+    """Positions of the electrodes (L, d), metres, that a file states; or None. Raises `ValueError` as `read`."""
     return _lines(path).places
 
 
