@@ -1,5 +1,7 @@
 """What consoles and notebooks show of objects: two lines, and a picture."""
 
+import html
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -64,6 +66,15 @@ def test_pictures(shown, name):
     assert len(drawn) > 5_000
 
 
+def test_pages(shown):
+    """The text and the picture, in HTML without scripts."""
+    for name in PICTURES:
+        page = shown[name]._repr_html_()
+        assert page.startswith(f"<pre>{html.escape(repr(shown[name]))}</pre><img"), name
+        assert "data:image/png;base64,iVBOR" in page, name
+        assert "<script" not in page
+
+
 def test_what_is_traced_has_neither(shown):
     mesh = shown["mesh"]
 
@@ -71,6 +82,7 @@ def test_what_is_traced_has_neither(shown):
     def seen(points):
         traced = eqx.tree_at(lambda one: one.points, mesh, points)
         assert traced._repr_png_() is None
+        assert traced._repr_html_() is None
         assert repr(traced).startswith("Mesh(")
         return points.sum()
 

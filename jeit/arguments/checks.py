@@ -207,3 +207,8 @@ def picture(one: Any) -> bytes | None:
     The report that draws it is imported by its name, for the objects are of lower layers.
     """
     return importlib.import_module("jeit.report.notebook").picture(one)
+
+
+def page(one: Any) -> str | None:
+    """HTML of an object for a notebook (`_repr_html_`): its text, and its picture; or None if it has none."""
+    return importlib.import_module("jeit.report.notebook").page(one)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 _WIDTH = 80
 # Seconds from which a step shows how long it has taken.
 _SOME_SECONDS = 2.0
+# Parts done of a step, and their share from which the time left is estimated. "12 of at most 60" states none.
+_PARTS, _SOME_PARTS = re.compile(r"(\d[\d,]*) of (\d[\d,]*)"), 0.05
 _PREFIXES = ((0, ""), (-3, "m"), (-6, "µ"), (-9, "n"))
 
 
@@ -59,9 +62,13 @@ class Steps:
         return self._step
 
     def report(self, detail: str) -> None:
-        """Show the progress within the current step beside its spinner."""
+        """Show the progress within the current step beside its spinner; of a `detail` such as "frame 12 of 100" the
+        time that is left, too."""
         if self._status is not None:
-            self._status.update(_UnderWay(f"{self._step} … {detail}", self._start))
+            parts = _PARTS.search(detail)
+            done, number = (int(one.replace(",", "")) for one in parts.groups()) if parts else (0, 0)
+            now = time.perf_counter()
+            self._status.update(_UnderWay(f"{self._step} … {detail}", self._start, done, number, now))
 
     def __enter__(self) -> "Steps":
         return self
@@ -82,14 +89,30 @@ class Steps:
 
 @dataclass(frozen=True)
 class _UnderWay:
-    """Line beside the spinner: a step, and the seconds since its `start`, once it takes some."""
+    """Line beside the spinner: a step, and the seconds since its `start`, once it takes some; and those that are left
+    at the same pace, where `done` and `number` of its parts are known and some are done."""
 
     step: str
     start: float
+    done: int = 0
+    number: int = 0
+    reported: float = 0.0
 
     def __rich__(self) -> Text:
         seconds = time.perf_counter() - self.start
-        return Text(f"{self.step}  {seconds:.0f} s" if seconds >= _SOME_SECONDS else self.step)
+        said = f"{self.step}  {seconds:.0f} s" if seconds >= _SOME_SECONDS else self.step
+        if seconds >= _SOME_SECONDS and _SOME_PARTS * self.number <= self.done < self.number:
+            taken = self.reported - self.start
+            left = max(taken * self.number / self.done - seconds, 0)
+            said += f", about {_rounded(left)} left"
+        return Text(said)
+
+
+def _rounded(seconds: float) -> str:
+    """A duration to one or two digits: an estimate has no more."""
+    if seconds < 100:
+        return f"{seconds:.0f} s" if seconds < 10 else f"{5 * round(seconds / 5)} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def pairs(title: str, rows: list[tuple[str, str]]) -> Table:

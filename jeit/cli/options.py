@@ -22,8 +22,8 @@ Reference = Annotated[
 Format = Annotated[
     str | None,
     typer.Option(
-        help="kit4, ktc2023, eidors, sciospec, draeger, carefusion, swisstom, goettingen, openeit, table or tank6cm; "
-        "found from the content unless given."
+        help="kit4, ktc2023, eidors, sciospec, draeger, carefusion, swisstom, goettingen, cn0565, quadrupoles, "
+        "openeit, table or tank6cm; found from the content unless given."
     ),
 ]
 Description = Annotated[

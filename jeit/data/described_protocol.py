@@ -1,4 +1,8 @@
-"""Construction of the protocol that the section `[protocol]` of a description specifies."""
+"""Construction of the protocol that the section `[protocol]` of a description specifies.
+
+Systems that drive all electrodes at once publish a matrix of the measured currents, with one column per pattern, beside
+voltages indexed by electrode, pattern and frame: `[protocol] kind = "measured"`.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jeit import protocol as protocols
+from jeit.arguments import listed
 from jeit.data.described_body import located
-from jeit.data.measured_patterns import protocol_of_file
-from jeit.files import check_memory
-from jeit.protocol import Protocol
+from jeit.files import check_electrodes, check_memory, matlab, npz_arrays
+from jeit.protocol import Protocol, from_matrices, measurement_patterns
 
 if TYPE_CHECKING:
-    from jeit.data.description_tables import ConstructedTable, DrivenTable, OptimalTable, ProtocolTable
+    from jeit.data.description_tables import ConstructedTable, DrivenTable, MeasuredTable, OptimalTable, ProtocolTable
 
 PROTOCOL_ARRAYS = ("drive", "measurement", "drive_index", "measurement_index")
 _CURRENT_UNITS = {"A": 1.0, "mA": 1e-3, "uA": 1e-6, "µA": 1e-6}
@@ -179,3 +183,57 @@ def _matches(pattern: str, text: str) -> bool:
             return False
         place = found + len(part)
     return True
+
+
+def protocol_of_file(table: MeasuredTable, path: Path) -> Protocol:
+    """The protocol whose currents, and measurement patterns if named, are stored in the .mat or .npz file at `path`.
+
+    Raises `ValueError` if the file or a variable does not exist, and if the matrices are not a valid protocol.
+    """
+    keys = (table.drive_key,) if table.measurement_key is None else (table.drive_key, table.measurement_key)
+    drive, *own = (_matrix(one, key, path) for one, key in zip(_read(path, keys), keys, strict=True))
+    turned = table.patterns_in == "columns"
+    drive, own = (drive.T, [one.T for one in own]) if turned else (drive, own)
+    check_electrodes(path.name, drive.shape[1])
+    rows = own[0] if own else measurement_patterns(drive.shape[1], table.measurement, table.reference)
+    check_memory(f"{path.name}: the protocol", 64 * len(drive) * len(rows))
+    # Currents measured by an instrument sum to zero only within its errors.
+    drive = _balanced(drive, table.drive_key, path) * _CURRENT_UNITS[table.current_unit]
+    read = table.measurement_key or table.measurement
+    name = table.name or f"{len(drive)} measured currents, {read}, {drive.shape[1]} electrodes"
+    return from_matrices(drive, rows, name=name)
+
+
+def _read(path: Path, keys: tuple[str, ...]) -> list[np.ndarray]:
+    if not path.is_file() or path.suffix.lower() not in (".mat", ".npz"):
+        raise ValueError(f"kind = 'measured' takes the currents from a .mat or .npz file; {path.name[:60]!r} is none.")
+    if path.suffix.lower() == ".mat":
+        content = matlab.load(path, *keys)
+        return [matlab.numbers(content, key, path) for key in keys]
+    arrays = npz_arrays(path, *keys)
+    missing = [key for key in keys if key not in arrays]
+    if missing:
+        raise ValueError(f"{path.name}: there is no array '{missing[0][:60]}'; the file has {listed(arrays[''])}.")
+    return [arrays[key] for key in keys]
+
+
+def _matrix(values: np.ndarray, key: str, path: Path) -> np.ndarray:
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+        raise ValueError(
+            f"{path.name}: '{key[:60]}' must be a matrix of real numbers, without NaN, a column for every pattern; it "
+            f"is {values.dtype} of shape {values.shape}."
+        )
+    return values.astype(float)
+
+
+def _balanced(drive: np.ndarray, key: str, path: Path) -> np.ndarray:
+    """Currents minus their mean; raises `ValueError` if the mean is not small."""
+    excess, size = np.abs(drive.sum(axis=1)), np.abs(drive).max(axis=1)
+    worst = int(np.argmax(excess - 0.05 * size))
+    if excess[worst] > 0.05 * size[worst]:
+        raise ValueError(
+            f"{path.name}: pattern {worst} of '{key[:60]}' sums to {excess[worst]:.3g}, and its largest current is "
+            f"{size[worst]:.3g}: current that goes in must come out. Is there a pattern in every column? Else say "
+            "patterns_in = 'rows'."
+        )
+    return drive - drive.mean(axis=1, keepdims=True)

@@ -1,11 +1,12 @@
-"""Checks of whether frames can be imaged: against their reference, and by their noise."""
+"""Checks of whether frames can be imaged: against their reference, by their noise, and for spikes in single
+channels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Inexact
 
 from jeit.arguments import counted, percent
 from jeit.data.measurement import Measurement
@@ -18,6 +19,7 @@ from jeit.data.quality import (
     rounding_deviation,
 )
 from jeit.inverse import relative_noise
+from jeit_solvers.engines import as_array
 
 # Maximum fraction of impossible signs. A quarter means that half of the voltages are noise, as noise has the wrong sign
 # half of the time.
@@ -31,6 +33,17 @@ MOST_DIFFERENCE_RECIPROCITY_ERROR = 0.63
 _LEAST_COSINE = -0.5
 # Maximum share of a difference that is rounding of the voltages.
 _MOST_ROUNDING = 0.7
+# A spike contradicts the other channels by as many robust standard deviations, by as much as channels change typically,
+# and by more than all channels together that are left; at most so many in a frame.
+_SPIKE, _SPIKE_SHARE, _MOST_SPIKES = 10.0, 0.5, 8
+# Of two channels that contradict each other, the one is at fault that changed so many times as much.
+_CULPRIT = 3.0
+# Share of a channel that the others leave free, below which they say nothing of it; and rounding.
+_FREE = 1e-6
+# Most operations to find which changes bodies can give, a second or less.
+_MOST_OPERATIONS = 2e9
+# Most kinds of masks of frames for which that is done.
+_MOST_MASKS = 8
 
 
 @dataclass(frozen=True)
@@ -173,6 +186,118 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
             )
         )
     return results
+
+
+def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool = False) -> Measurement:
+    """The measurement without spikes: single channels of a frame whose change from the mean of `reference` contradicts
+    that of all others, masked, with a note; with `fill`, replaced by what the others determine, and masked otherwise.
+
+    The voltages of every body follow from its symmetric transfer impedance, which has fewer entries than most protocols
+    have channels. What of a frame's change no symmetric matrix explains is noise, or a spike: where one channel leaves
+    more of it unexplained than all others together. If that does not determine which of two reciprocal channels is at
+    fault, both are masked. Nothing is found in protocols whose channels are all independent, and of more than about 40
+    electrodes, for which the search would take too long.
+
+    The `reference` must be of the same set-up (`check_same_setup`).
+    """
+    mean = reference.mean_frame()
+    base, known = np.asarray(mean.voltages)[0], np.asarray(mean.mask)[0]
+    weight = np.asarray(relative_noise(as_array(np.abs(np.where(known, base, 0))), as_array(known)))
+    voltages, masks = np.array(measurement.voltages), np.asarray(measurement.mask)
+    spikes, filled = np.zeros(masks.shape, bool), np.zeros(masks.shape, bool)
+    kinds, kind, count = np.unique(masks & known, axis=0, return_inverse=True, return_counts=True)
+    for one in np.argsort(-count)[:_MOST_MASKS]:
+        mask = kinds[one]
+        basis = _possible_changes(measurement, weight, mask)
+        if basis is None:
+            continue
+        for frame in np.flatnonzero(kind.ravel() == one):
+            change = ((voltages[frame] - base) / weight)[mask]
+            rounding = rounding_of_difference(measurement.frame(int(frame)), mean) / weight
+            found = np.isin(np.arange(len(change)), _spikes(change, basis, rounding[mask]))
+            spikes[frame, mask] = found
+            if fill and found.any():
+                # Rows of the basis that those of the other channels span are determined by them.
+                share = basis[found] @ np.linalg.pinv(basis[~found])
+                determined = np.linalg.norm(share @ basis[~found] - basis[found], axis=1) < _FREE
+                places = np.flatnonzero(mask)[found][determined]
+                voltages[frame, places] = base[places] + weight[places] * (share @ change[~found])[determined]
+                filled[frame, places] = True
+    said = f"spikes, which contradict the other channels ({_listed_spikes(spikes)})."
+    if filled.any():
+        note = f"{counted(int(filled.sum()), 'voltage')} replaced by what others determine: {said}"
+        measurement = replace(measurement, voltages=voltages, notes=(*measurement.notes, note))
+    return measurement.masked(~spikes | filled, said) if (spikes & ~filled).any() else measurement
+
+
+def _listed_spikes(spikes: Bool[np.ndarray, "F M"]) -> str:
+    """Channels with spikes, and their frames if there are several."""
+    frames, channels = np.nonzero(spikes)
+    said = [
+        f"channel {k + 1}" + (f" of frame {f}" if len(spikes) > 1 else "")
+        for f, k in zip(frames, channels, strict=True)
+    ]
+    return ", ".join(said[:_MOST_SPIKES]) + (" …" if len(said) > _MOST_SPIKES else "")
+
+
+def _possible_changes(
+    measurement: Measurement, weight: Float[np.ndarray, " M"], mask: Bool[np.ndarray, " M"]
+) -> Float[np.ndarray, "n r"] | None:
+    """Orthonormal basis (n, r) of the changes of the n usable channels, divided by `weight`, that a symmetric transfer
+    impedance can give; None if that is all of them, or takes too long to find."""
+    drive = np.asarray(measurement.protocol.channel_drive)[mask]
+    read = np.asarray(measurement.protocol.channel_measurement)[mask]
+    row, column = np.triu_indices(drive.shape[1])
+    if len(drive) * len(row) * min(len(drive), len(row)) > _MOST_OPERATIONS or not len(drive):
+        return None
+    drive = drive / np.abs(drive).max()
+    products = drive[:, row] * read[:, column] + drive[:, column] * read[:, row]
+    basis, size, _ = np.linalg.svd(products / weight[mask, None], full_matrices=False)
+    basis = basis[:, size > 1e-9 * size[0]]
+    return basis if basis.shape[1] < len(drive) else None
+
+
+def _spikes(
+    change: Inexact[np.ndarray, " n"], basis: Float[np.ndarray, "n r"], rounding: Float[np.ndarray, " n"]
+) -> list[int]:
+    """Indices of the channels with spikes in a change (n,), weighted; `rounding`: its standard deviation.
+
+    A channel that may read anything adds its unit vector to the basis. What that explains, `gain`, is compared with
+    what was left unexplained before.
+    """
+    unexplained, free = change - basis @ (basis.T @ change), 1 - np.sum(basis**2, axis=1)
+    left, found, spikes = np.ones(len(change), bool), [], []
+    for _ in range(_MOST_SPIKES):
+        contradicted = left & (free > _FREE)
+        size = np.where(contradicted, np.abs(unexplained) / np.sqrt(np.maximum(free, _FREE)), 0)
+        worst = np.flatnonzero(size > (1 - _FREE) * size.max())
+        if not 0 < len(worst) <= 2:
+            break
+        deviation = max(1.4826 * float(np.median(size[contradicted])), float(rounding[worst].max()))
+        if not size.max() > _SPIKE * deviation:
+            break
+        one = np.zeros(len(change))
+        one[worst[0]] = 1
+        for _ in range(2):  # twice, for orthogonality
+            one = one - basis @ (basis.T @ one)
+        one = one / np.linalg.norm(one)
+        before, gain = float(np.sum(np.abs(unexplained) ** 2)), float(np.abs(one @ unexplained) ** 2)
+        off = float((size[worst] / np.sqrt(free[worst])).max())
+        basis = np.column_stack([basis, one])
+        unexplained, free = unexplained - one * (one @ unexplained), free - one**2
+        found += _at_fault(change, worst)
+        left[worst] = False
+        typical = float(np.sqrt(np.mean(np.abs(change[left]) ** 2)))
+        if off > typical and gain > _SPIKE_SHARE * before:
+            spikes = [*found]
+    return spikes
+
+
+def _at_fault(change: Inexact[np.ndarray, " n"], worst: np.ndarray) -> list[int]:
+    """Of one or two channels that contradict the others, or each other, that which changed far more, or all."""
+    size = np.abs(change[worst])
+    alone = size.max() > _CULPRIT * size.min()
+    return [int(worst[size.argmax()])] if alone else worst.tolist()
 
 
 def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[np.ndarray, " M"]:

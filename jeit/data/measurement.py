@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, check_kind, counted, describe, did_you_mean, is_number, picture
+from jeit.arguments import brief, check_kind, counted, describe, did_you_mean, is_number, page, picture
 from jeit.electrodes import AbstractElectrodes
 from jeit.inverse.placement import Uncertainty
 from jeit.mesh import Body, Mesh
@@ -118,6 +118,9 @@ class Measurement(eqx.Module):
 
     def _repr_png_(self) -> bytes | None:
         return picture(self)
+
+    def _repr_html_(self) -> str | None:
+        return page(self)
 
     @property
     def num_frames(self) -> int:

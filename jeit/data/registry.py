@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ _IN_MEMORY = 4
 class Format:
     """A file format. **Fields**: `module`: name of the module that reads it; `endings`: suffixes of its files;
     `described`: whether a description may accompany a file; `borrows`: whether a file may use the description of
-    another measurement; `bundled`: name of the bundled description that always applies, or None.
+    another measurement; `own_protocol`: whether files state their protocol, and a description the body alone;
+    `bundled`: name of the bundled description that always applies, or None.
 
     The module is imported only when a file has one of the suffixes.
     """
@@ -28,6 +30,7 @@ class Format:
     endings: tuple[str, ...]
     described: bool = False
     borrows: bool = False
+    own_protocol: bool = False
     bundled: str | None = None
 
     @property
@@ -46,16 +49,31 @@ FORMATS: dict[str, Format] = {
     "kit4": Format("kit4", (".mat",)),
     "ktc2023": Format("ktc2023", (".mat",)),
     "eidors": Format("eidors", (".mat",), described=True, borrows=True),
-    "sciospec": Format("sciospec", (".eit",), described=True),
-    "draeger": Format("draeger", (".eit",), described=True),
-    "carefusion": Format("carefusion", (".eit",), described=True),
-    "swisstom": Format("swisstom", (".eit",), described=True),
-    "goettingen": Format("goettingen", (".get",), described=True),
+    "sciospec": Format("sciospec", (".eit",), described=True, own_protocol=True),
+    "draeger": Format("draeger", (".eit",), described=True, own_protocol=True),
+    "carefusion": Format("carefusion", (".eit",), described=True, own_protocol=True),
+    "swisstom": Format("swisstom", (".eit",), described=True, own_protocol=True),
+    "goettingen": Format("goettingen", (".get",), described=True, own_protocol=True),
+    "cn0565": Format("cn0565", (".txt", ".csv", ".dat", ".log"), described=True, borrows=True, own_protocol=True),
+    "quadrupoles": Format(
+        "quadrupoles",
+        (".txt", ".csv", ".dat", ".data", ".ohm", ".shm"),
+        described=True,
+        borrows=True,
+        own_protocol=True,
+    ),
     "openeit": Format("openeit", (".txt", ".csv", ".dat", ".log", ".bin"), described=True, borrows=True),
     "table": Format("table", _TABLES, described=True, borrows=True),
     # A table of 208 rows of real and imaginary pairs, with the bundled description; used only if named explicitly.
     "tank6cm": Format("table", (), bundled="tank6cm"),
 }
+
+
+def format_with_protocol(path: Path) -> str | None:
+    """Name of the format of a file that states its protocol, so that only the body is to be described; or None."""
+    if not path.is_file():
+        return None
+    return next((name for name, one in FORMATS.items() if one.own_protocol and one.recognises(path)), None)
 
 
 def read(
@@ -70,7 +88,8 @@ def read(
 
     - `path`: the data file; or a folder of Sciospec files, one per frame, which are read in the order of their names.
     - `format`: a name in `FORMATS` ("kit4", "ktc2023", "eidors", "sciospec", "draeger", "carefusion", "swisstom",
-      "goettingen", "openeit", "table", "tank6cm"); by default it is recognised from the content.
+      "goettingen", "cn0565", "quadrupoles", "openeit", "table", "tank6cm"); by default it is recognised from the
+      content.
     - `description`: a TOML file, or the name of a bundled one, that states the meaning of the numbers (tables, EIDORS
       files) or the body measured (files of instruments). By default it is looked for beside the data.
     - `like`: a measurement of the same sensor, such as the reference, whose description applies to a table that has
@@ -91,7 +110,7 @@ def read(
         raise ValueError(f"path: there is no file {file}. Check the name and the working directory.")
     if file.stat().st_size == 0:
         raise ValueError(f"{file.name} is empty.")
-    name = _recognise(file, description or like) if format is None else format
+    name = _recognise(file, description, like) if format is None else format
     check_name("format", name, FORMATS)
     chosen = FORMATS[name]
     reader = chosen.reader
@@ -106,21 +125,95 @@ def read(
     return reader.read(file, description=chosen.bundled) if chosen.bundled else reader.read(file)
 
 
-def _recognise(file: Path, description: object) -> str:
+def _recognise(file: Path, description: str | Path | None, like: Measurement | None) -> str:
+    """Name of the format of a file. Raises `ValueError`, with what it probably is, if it is of none."""
+    described = description is not None or like is not None
     for name, candidate in FORMATS.items():
         if candidate.recognises(file):
+            if name == "table" and not described and candidate.reader.find_description(file) is None:
+                _check_mark(file)
             return name
+    _check_mark(file)
     if file.suffix.lower() == ".mat":
         from jeit.data.formats import eidors, kit4, ktc2023
         from jeit.files import matlab
 
-        if description is not None or eidors.find_description(file) is not None:
+        if described or eidors.find_description(file) is not None:
             return "eidors"
+        names = matlab.variable_names(file)
+        for one in (kit4, ktc2023):
+            lacking = [min(kind - names, key=len) for kind in one.VARIABLES if len(kind & names) == len(kind) - 1]
+            if lacking:
+                raise ValueError(
+                    f"{file.name} looks like {one.DESCRIPTION}, but lacks the variable {lacking[0]}: add it, or put a "
+                    "description beside the file."
+                )
+        held = listed(sorted(names))
         raise ValueError(
-            f"{file.name} is a .mat file of no known kind; it holds "
-            f"{listed(sorted(matlab.variable_names(file)))}. `jeit describe {file.name}` finds out what it can, and "
-            f"writes a description. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; {eidors.DESCRIPTION}."
+            f"{file.name} is a .mat file of no known kind; it holds {held}. `jeit describe {file.name}` finds out what "
+            f"it can, and writes a description. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; {eidors.DESCRIPTION}."
         )
+    ending = file.suffix.lower()
+    if known := [one for one in FORMATS.values() if ending in one.endings]:
+        raise ValueError(
+            f"{file.name}: its content is that of no file ending in '{ending}' ("
+            f"{'; '.join(one.reader.DESCRIPTION for one in known)}). Is its start damaged, or is it of another program?"
+        )
+    with file.open("rb") as content:
+        head = content.read(_HEAD)
+    hint = next((f" It is {said}." for mark, said in _KINDS.items() if head.startswith(mark)), "")
+    if not hint and _is_text(head):
+        hint = f" It is text: if it is a table of numbers, name it {file.stem[:40]}.txt."
     raise ValueError(
-        f"{file.name}: files ending in '{file.suffix}' are of no known format. Known: " + f"{', '.join(FORMATS)}."
+        f"{file.name}: files ending in '{file.suffix}' are of no known format.{hint} Known: {', '.join(FORMATS)}."
     )
+
+
+_HEAD = 65536
+# Marks by which damaged and misnamed files of a format are known.
+_MARKS = {
+    "draeger": rb"Draeger EIT-Software|Framerate \[Hz\]:",
+    "carefusion": rb"E\0I\0T\0_\0F\0i\0l\0e",
+    "sciospec": rb"(?m)^MeasurementChannels(?:IndependentFromInjectionPattern)?:",
+    "cn0565": rb"(?m)^!V[ \t]*[0-9A-Fa-f]",
+    "openeit": rb"(?mi)^\s{0,40}magnitudes\s{0,40}:",
+}
+# First bytes of files of other programs, and what to do with these.
+_KINDS = {
+    b"PK\x03\x04": "a spreadsheet or another archive: export its numbers as CSV",
+    b"\x89HDF": "HDF5: save the arrays as .npz, or by MATLAB with `save(name, '-v7')`",
+    b"MATLAB": "a file of MATLAB: name it .mat",
+    b"\x93NUMPY": "an array of NumPy: name it .npy",
+    b"\x1f\x8b": "compressed: unpack it",
+}
+
+
+def _check_mark(file: Path) -> None:
+    """Raise `ValueError` if a file has a mark of a format that does not recognise it: with what is damaged, or its
+    ending."""
+    with file.open("rb") as content:
+        head = content.read(_HEAD)
+    for name, mark in _MARKS.items():
+        if not re.search(mark, head):
+            continue
+        reader, endings = FORMATS[name].reader, FORMATS[name].endings
+        try:
+            reader.read(file)
+        except ValueError as error:
+            raise ValueError(
+                f"{file.name} looks like a file of {name} ({reader.DESCRIPTION}), but is damaged or of a version that "
+                f"is not known: {str(error).removeprefix(file.name).lstrip(':, ')}"
+            ) from None
+        if file.suffix.lower() not in endings:
+            raise ValueError(
+                f"{file.name} is a file of {name} ({reader.DESCRIPTION}), which end in {listed(endings)}: rename it, "
+                f"or give format='{name}' (--format {name})."
+            )
+
+
+def _is_text(head: bytes) -> bool:
+    try:
+        head.decode("utf-8")
+    except UnicodeDecodeError as error:
+        return error.start > len(head) - 4 and b"\0" not in head
+    return b"\0" not in head

@@ -20,7 +20,7 @@ import scipy.optimize
 from jaxtyping import Bool, Float, Real
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, check_name, describe, is_number, picture
+from jeit.arguments import brief, check_name, describe, is_number, page, picture
 from jeit.mesh import Mesh, measures
 
 
@@ -63,6 +63,9 @@ class ImageSeries:
 
     def _repr_png_(self) -> bytes | None:
         return picture(self)
+
+    def _repr_html_(self) -> str | None:
+        return page(self)
 
     @property
     def imaged(self) -> Bool[np.ndarray, " F"]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jeit.arguments import brief, picture
+from jeit.arguments import brief, page, picture
 from jeit_solvers.engines import has_values
 
 # Pixels above this fraction of the maximum belong to the target.
@@ -69,6 +69,9 @@ class FiguresOfMerit(eqx.Module):
 
     def _repr_png_(self) -> bytes | None:
         return picture(self)
+
+    def _repr_html_(self) -> str | None:
+        return page(self)
 
 
 def figures_of_merit(

@@ -15,15 +15,15 @@ from typing import Any
 import numpy as np
 
 from jeit.arguments import counted, did_you_mean, listed, percent
-from jeit.data import Measurement
+from jeit.data import Measurement, read
 from jeit.data.description import Description, TableLayout, parse_description
 from jeit.data.exchange import assignments
-from jeit.data.formats import openeit
-from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text
+from jeit.data.formats import openeit, quadrupoles
 from jeit.data.formats.table import measurement_in
-from jeit.data.formats.text import read_text
-from jeit.data.formats.unstated import channel_gains
+from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read_text
 from jeit.data.quality import reciprocity_error
+from jeit.data.registry import format_with_protocol
+from jeit.data.unstated import channel_gains, with_signs
 from jeit.electrodes.body_mesh import body_mesh
 from jeit.files import matlab, npy_array, npz_arrays
 from jeit.forward import ForwardModel
@@ -118,10 +118,11 @@ class Findings:
         if best.unexplained < bound and best.spread < _UNLIKE:
             return ""
         if best.spread >= _UNLIKE:
+            parts = " If its two columns are real and imaginary parts, keep one of them." if best.frames == 2 else ""
             return (
                 f"the best explanation, {best.name}, makes frames of the empty body differ by {percent(best.spread)}: "
                 "that is not good enough to go on. Are there columns of other things than voltages, or is the "
-                "reference one of another sensor? Name the protocol if you know it."
+                f"reference one of another sensor? Name the protocol if you know it.{parts}"
             )
         broken = "" if best.reciprocity is None else f" and breaks reciprocity by {percent(best.reciprocity)}"
         wired = best.wiring.explanation if best.wiring is not None else ""
@@ -154,6 +155,9 @@ def find_description(
 
     Raises `ValueError` for files that cannot be read, several arrays and none named, and if no protocol fits.
     """
+    if (own := format_with_protocol(path)) is not None:
+        progress("read")
+        return _described_body(path, own, geometry, electrodes, reference or path, known or {})
     if not known and openeit.recognises(path):
         known = openeit.protocol_table(path)
     number = (known or {}).get("number")
@@ -184,8 +188,43 @@ def find_description(
     contact = {"contact_impedance": _contact_impedance(best, models[best.protocol["number"]])}
     tables = {"geometry": geometry, "electrodes": {**contact, **electrodes, "number": best.protocol["number"]}}
     tables["protocol"] = {**best.protocol, "current": current}
-    text = _text(path, numbers, best, near, tables)
+    text = _text(path, numbers.shape, numbers.data, best, near, tables)
     return Findings((*compared, *found[_FEW:]), tuple(near), text, known="kind" in (known or {}))
+
+
+def _described_body(
+    path: Path,
+    format: str,
+    geometry: dict[str, Any],
+    electrodes: dict[str, Any],
+    reference: Path,
+    known: dict[str, Any],
+) -> Findings:
+    """Findings of a file that states its protocol: a description of the body alone."""
+    measured, rest = read(path, format), read(reference, format)
+    number = measured.protocol.num_electrodes
+    if known.get("number", number) != number or "kind" in known or "order" in known:
+        raise ValueError(
+            f"number: {path.name} is of format '{format}', and states its protocol, of {number} electrodes: leave out "
+            "what is said of it."
+        )
+    placed, written = {**electrodes, "number": number}, {**electrodes, "number": number}
+    if format == "quadrupoles" and (places := quadrupoles.places(path)) is not None:
+        sizes = {key: value for key, value in electrodes.items() if key not in ("layout", "levels")}
+        placed, written = {**sizes, "positions": places.tolist()}, sizes
+    tables = {"geometry": geometry, "electrodes": {"contact_impedance": 1.0, **placed}}
+    body = parse_description(tables, "the description")
+    empty = replace(rest.mean_frame(), domain=body.domain, electrodes=body.electrodes)
+    empty = with_signs(replace(empty, voltages=np.real(np.asarray(empty.voltages))))
+    spread = _spread(np.real(np.asarray(rest.filled())))
+    models: dict[int, ForwardModel] = {}
+    protocol = {"kind": format, "number": number}
+    found = Candidate(protocol, measured.num_frames, spread, reciprocity_error(empty), empty)
+    found = _with_misfit(found, models)
+    contact = {"contact_impedance": _contact_impedance(found, models[number])}
+    shape = f"{counted(measured.num_frames, 'frame')} of {measured.num_channels}"
+    text = _text(path, shape, {}, found, (), {"geometry": geometry, "electrodes": {**contact, **written}})
+    return Findings((found,), (), text, known=True)
 
 
 @dataclass(frozen=True)
@@ -371,31 +410,39 @@ def _contact_impedance(best: Candidate, model: ForwardModel) -> float:
 
 
 def _text(
-    path: Path, numbers: _Numbers, best: Candidate, near: Sequence[Candidate], tables: dict[str, dict[str, Any]]
+    path: Path,
+    shape: str,
+    data: dict[str, Any],
+    best: Candidate,
+    near: Sequence[Candidate],
+    tables: dict[str, dict[str, Any]],
 ) -> str:
-    """The description in TOML, with the evidence as comments."""
+    """The description in TOML, with the evidence as comments. `shape` of the numbers in words; `data`: what `[data]`
+    has to say of their arrangement."""
     notes = [note for note in best.measurement.notes if not note.startswith("[protocol]")]
     reversed_signs = best.reversed_signs or any("polarity" in note for note in notes)
     broken = "no two channels are reciprocal" if best.reciprocity is None else f"broken by {percent(best.reciprocity)}"
     explained = best.wiring.explanation if best.wiring is not None and not best.reversed_signs else ""
     lines = [
-        f"Written by `jeit describe {path.name}` ({numbers.shape} numbers). Lengths in metres, currents in amperes.",
+        f"Written by `jeit describe {path.name}` ({shape} numbers). Lengths in metres, currents in amperes.",
         f"{best.name}: a uniform body misses {percent(best.misfit)} of the empty one; reciprocity: {broken}.",
         *(f"It may as well be {one.name}: {percent(one.misfit)}." for one in near),
         *notes,
         *([explained] if explained else []),
     ]
-    data = {**numbers.data, **({"polarity": "reversed"} if reversed_signs else {})}
+    data = {**data, **({"polarity": "reversed"} if reversed_signs else {})}
     if best.gains is not None:
         lines.append(f"Gains of the measurements differ by {percent(float(np.std(best.gains)))}, found by reciprocity.")
         data["gains"] = [round(float(one), 4) for one in best.gains]
-    places = "No voltage says where electrode 1 is, nor which way round: taken at 12 o'clock, counter-clockwise."
+    places = "Electrodes are where the file places them."
+    if "layout" in tables["electrodes"]:
+        places = "No voltage says where electrode 1 is, nor which way round: taken at 12 o'clock, counter-clockwise."
     scale = "The current, and the unit of voltages, scale conductivities alone."
     parts = [
         [f"# {line}" for line in lines],
         ["[geometry]", *assignments(tables["geometry"])],
         [f"# {places}", "[electrodes]", *assignments(tables["electrodes"])],
-        [f"# {scale}", "[protocol]", *assignments(tables["protocol"])],
+        *([[f"# {scale}", "[protocol]", *assignments(tables["protocol"])]] if "protocol" in tables else []),
         *([["[data]", *assignments(data)]] if data else []),
     ]
     return "\n\n".join("\n".join(part) for part in parts) + "\n"

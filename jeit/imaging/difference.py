@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Array, Float, Inexact, UInt8
 
-from jeit.arguments import brief, percent, picture
+from jeit.arguments import brief, page, percent, picture
 from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality
 from jeit.electrodes import AbstractElectrodes
@@ -36,9 +36,11 @@ from jeit_solvers.engines import as_array
 _MIDDLE = 0.5
 # Maximum misfit of an image's voltages, in standard deviations, that raises no doubt.
 _MISFIT = 3.0
-# Minimum share of usable voltages that raises no doubt, and range of plausible conductivities in S/m: from tap water
-# and fat to brine, with a margin on both sides.
-_FEW_CHANNELS, _CONDUCTIVITIES = 0.5, (1e-3, 30.0)
+# Minimum share of usable voltages that raises no doubt, and ranges of plausible conductivities: of solids in S/m, from
+# tap water and fat to brine, with a margin on both sides; of sheets in S, from a megohm a square to metal.
+_FEW_CHANNELS, _CONDUCTIVITIES = 0.5, {2: (1e-6, 1e5), 3: (1e-3, 30.0)}
+# Volts that no amplifier of such an instrument reads; and units that are smaller than a volt, with their number in it.
+_MOST_VOLTS, _SMALLER = 60.0, (("mV", 1e3), ("uV", 1e6))
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,9 @@ class ImagedDifference:
 
     def _repr_png_(self) -> bytes | None:
         return picture(self)
+
+    def _repr_html_(self) -> str | None:
+        return page(self)
 
     @property
     def lowest(self) -> float:
@@ -192,20 +197,45 @@ def _imaged_on(found, calibration: Calibration) -> ForwardModel:
 
 
 def _doubts_of_data(found: ImagedDifference) -> list[str]:
-    """Reasons to doubt the data: too few usable voltages, or an implausible background conductivity of a solid."""
+    """Reasons to doubt the data: too few usable voltages, or a level of the voltages that is implausible."""
     used, said = np.asarray(found.measurement.mask)[0], []
     if (left := np.mean(used)) < _FEW_CHANNELS:
         said.append(
             f"only {used.sum()} of {used.size} voltages are left ({percent(float(left))}): they determine little of "
             "what is where."
         )
-    background, (low, high) = abs(complex(found.calibration.conductivity)), _CONDUCTIVITIES
-    if found.mesh.dimension == 3 and not low < background < high:
-        said.append(
-            f"a background of {background:.3g} S/m is no water's, gel's or tissue's, which conduct {low:g} to "
-            f"{high:g}: are currents in amperes, voltages in volts, lengths in metres?"
-        )
+    if doubt := _doubt_of_units(found):
+        said.append(doubt)
     return said
+
+
+def _doubt_of_units(found: ImagedDifference) -> str:
+    """What is wrong with the level of the voltages, and the unit that is likely; empty if nothing is, or if the notes
+    say that the scale is not known."""
+    low, high = _CONDUCTIVITIES[found.mesh.dimension]
+    background = abs(complex(found.calibration.conductivity))
+    frames = [np.abs(np.asarray(one.voltages)[np.asarray(one.mask)]) for one in (found.measurement, found.reference)]
+    largest = max(float(one.max(initial=0)) for one in frames)
+    stated = any("trust relative changes" in note for note in (*found.measurement.notes, *found.reference.notes))
+    if stated or (low < background < high and largest < _MOST_VOLTS):
+        return ""
+    solid = found.mesh.dimension == 3
+    unit, of = ("S/m", "no water's, gel's or tissue's") if solid else ("S", "no sheet's or shallow tank's")
+    if not low < background < high:
+        said = f"a background of {background:.3g} {unit} is {of}, which conduct {low:g} to {high:g} {unit}"
+    else:
+        said = f"voltages of up to {largest:.3g} V are beyond what instruments read"
+    if background < high:
+        likely = [f'"{name}" (a background of {background * factor:.3g} {unit})' for name, factor in _SMALLER
+                  if low < background * factor < high and largest < _MOST_VOLTS * factor]  # fmt: skip
+        key = "[data] unit"
+    else:
+        likely = [f'"{name}"' for name, factor in (("mA", 1e3), ("uA", 1e6)) if low < background / factor < high]
+        key = "[protocol] current_unit"
+    likely = [f"{key} = {' or '.join(likely)}?"] if likely else []
+    if all((one == np.round(one)).all() for one in frames) and largest > 1:
+        likely.append("They are whole numbers, as the counts of a converter are: those show relative changes, not S/m.")
+    return f"{said}: {' '.join(likely) or 'are currents in amperes, voltages in volts, lengths in metres?'}"
 
 
 def image_difference(

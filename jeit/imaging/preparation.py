@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jeit.arguments import check_kind
 from jeit.data import Measurement
-from jeit.data.imageable import FrameQuality, assess, rounding_of_difference
+from jeit.data.imageable import FrameQuality, assess, check_same_setup, mask_spikes, rounding_of_difference
 from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.body_mesh import body_mesh
@@ -234,17 +234,21 @@ def prepare_difference(
     as_is: bool = False,
     clock: Clock | None = None,
 ) -> PreparedDifference:
-    """Check a frame and its reference, build a mesh, and calibrate a model of the body on the reference.
+    """Check a frame and its reference, mask spikes, build a mesh, and calibrate a model of the body on the reference.
 
     Arguments as in `jeit.imaging.image_difference` and its settings; `clock` measures the duration of each step. Raises
     `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the places of the electrodes,
     if the calibration fails, and, unless `as_is`, if the wiring differs from its description or from that of the
-    reference (see `jeit.imaging.wiring`).
+    reference (see `jeit.imaging.wiring`). `as_is` leaves spikes in place, too.
     """
     clock = Clock(None) if clock is None else clock
     one, base = select_frames(measurement, reference, frame)
     number = chosen_frame(measurement, frame)
     with clock("check"), naming_frame(measurement, number):
+        check_same_setup(one, base)
+        if not as_is:
+            one = mask_spikes(one, base)
+            base = replace(base, mask=as_array(np.asarray(base.mask) & np.asarray(one.mask)))
         (quality,) = assess(one, base)
         domain, electrodes = body_of(one, base)
         base = base if one.uncertainty is None else replace(base, uncertainty=one.uncertainty)

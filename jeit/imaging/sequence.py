@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from jeit.data import Measurement
-from jeit.data.imageable import check_same_setup
+from jeit.data.imageable import check_same_setup, mask_spikes
 from jeit.files import check_memory
 from jeit.image.image_series import ImageSeries
 from jeit.imaging.difference import ImagedDifference, image_difference
@@ -75,6 +75,7 @@ def image_sequence(
       `lambda mesh: jeit.image.ball_region(mesh, (0, 0), 0.01)`. They are called before imaging, so that their errors
       are raised early.
 
+    Spikes in single channels are replaced by what other channels determine (`jeit.data.imageable.mask_spikes`).
     Channels missing in more than half of the frames are not used; frames that lack any other channel are refused. The
     images need four bytes per cell and frame. Raises `ValueError` as `image_difference`, for a measurement with
     one frame, for an iterative method, and for images that would not fit in memory.
@@ -88,11 +89,13 @@ def image_sequence(
     if settings.method == AUTO:
         settings = replace(settings, method="one-step")
     clock = Clock(progress)
-    voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     if reference is None and "reference" not in measurement.frame_names:
         reference = measurement.mean_frame()
     _, base = select_frames(measurement, reference)
     check_same_setup(measurement, base)
+    if not settings.as_is:
+        measurement = mask_spikes(measurement, base, fill=True)
+    voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     expected = np.asarray(base.voltages)[0]
     common = (mask.mean(axis=0) >= _MOST_FRAMES) & np.asarray(base.mask)[0]
     refused = np.asarray(~mask[:, common].all(axis=1))

@@ -104,19 +104,21 @@ class Wiring:
     - `places`: electrode k is at the place of electrode `places[k]`, numbered from 0.
     - `order`: order of the channels, a name in `channel_orders`; empty if as described.
     - `reversed_signs`: whether all voltages have the opposite sign.
+    - `magnitudes`: whether the voltages look to have lost their signs.
     - `misfit`: relative misfit of a uniform body with this wiring to the frame; `described`: with the described wiring.
     """
 
     places: tuple[int, ...]
     order: str = ""
     reversed_signs: bool = False
+    magnitudes: bool = False
     misfit: float = field(default=np.inf, compare=False)
     described: float = field(default=np.inf, compare=False)
 
     @property
     def as_described(self) -> bool:
         """Whether the wiring is the described one."""
-        return not (self.order or self.reversed_signs or self._cycles())
+        return not (self.order or self.reversed_signs or self.magnitudes or self._cycles())
 
     @property
     def fault(self) -> str:
@@ -136,6 +138,7 @@ class Wiring:
         found.append(
             'all voltages look to have the opposite sign ([data] polarity = "reversed")' if self.reversed_signs else ""
         )
+        found.append("the voltages look to be magnitudes, without signs" if self.magnitudes else "")
         said = ", and ".join(one for one in found if one)
         return (
             said and f"{said}: so taken the misfit is {percent(self.misfit)}, as described {percent(self.described)}."
@@ -158,14 +161,32 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
     the misfit of another is far smaller.
 
     Candidates are other orders of the channels, voltages of opposite sign, other first electrodes, the reverse order of
-    electrodes, and up to four successive exchanges of two electrodes. Errors that leave the voltages unchanged, such as
-    a rotation of the electrodes of a symmetric body, cannot be found.
+    electrodes, and up to four successive exchanges of two electrodes. Voltages all of one sign, or with the signs that
+    the described wiring gives them, may be magnitudes: they are compared without signs if that explains more. Errors
+    that leave the voltages unchanged, such as a rotation of the electrodes of a symmetric body, cannot be found.
     """
     count, orders = model.protocol.num_electrodes, channel_orders(model.protocol)
     plain = Wiring(tuple(range(count)))
     if not np.any(np.asarray(measurement.filled())[0]):
         return replace(plain, misfit=1.0, described=0.0)  # a frame without signal does not determine the wiring
     misfit_of = _comparison(model, measurement, orders)
+    best = misfit_of(plain)
+    described = 1.0 if best.reversed_signs else best.misfit
+    if best.misfit < MOST_MISFIT:  # as described, except possibly for the sign
+        return replace(best, described=described)
+    found = _explained(misfit_of, plain, best, orders)
+    if (one_way := _signs_say_nothing(model, measurement)) is not None:
+        misfit_of = _comparison(model, measurement, orders, signs=False)
+        without = _explained(misfit_of, plain, misfit_of(plain), orders)
+        if without.misfit < _STEP * found.misfit:
+            found = replace(without, magnitudes=one_way)
+    found = replace(plain, misfit=described) if found.misfit > _BETTER * described else found
+    return replace(found, described=described)
+
+
+def _explained(misfit_of: Callable[[Wiring], Wiring], plain: Wiring, best: Wiring, orders: Iterable[str]) -> Wiring:
+    """The wiring that explains a frame far better than `best`, the described one, or that."""
+    count = len(plain.places)
 
     def least(tried: Iterable[Wiring], so_far: Wiring) -> Wiring:
         # Misfits are rounded so that the first of equivalent wirings is taken, such as orders that are the same by
@@ -182,16 +203,20 @@ def find_wiring(model: ForwardModel, measurement: Measurement) -> Wiring:
                 break
         return best
 
-    best = misfit_of(plain)
-    described = 1.0 if best.reversed_signs else best.misfit
-    if best.misfit < MOST_MISFIT:  # as described, except possibly for the sign
-        return replace(best, described=described)
     best = with_exchanges(least([replace(plain, order=order) for order in orders], best))
     turned = [Wiring(places, order) for places in _turns(count) for order in orders]
-    best = least([with_exchanges(least(turned, misfit_of(plain)))], best)
-    if best.misfit > _BETTER * described:
-        best = replace(plain, misfit=described)
-    return replace(best, described=described)
+    return least([with_exchanges(least(turned, misfit_of(plain)))], best)
+
+
+def _signs_say_nothing(model: ForwardModel, measurement: Measurement) -> bool | None:
+    """Whether all voltages have one sign; False if they have the signs of a uniform body with the described wiring, as
+    magnitudes are given on reading; None if neither."""
+    used = np.asarray(measurement.mask)[0]
+    signs = np.sign(np.real(np.asarray(measurement.filled())[0]))[used]
+    expected = np.sign(select_channels(on_host(model.protocol), _impedances(model)[0]))[used]
+    if abs(signs.sum()) == np.count_nonzero(signs):
+        return True
+    return False if (signs * expected >= 0).all() or (signs * expected <= 0).all() else None
 
 
 def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
@@ -222,11 +247,14 @@ def channel_orders(protocol: Protocol) -> dict[str, Int[np.ndarray, " M"]]:
     return orders
 
 
-def _comparison(model: ForwardModel, measurement: Measurement, orders) -> Callable[[Wiring], Wiring]:
-    """Function that computes the misfit of a wiring and the sign of its voltages."""
+def _comparison(
+    model: ForwardModel, measurement: Measurement, orders, *, signs: bool = True
+) -> Callable[[Wiring], Wiring]:
+    """Function that computes the misfit of a wiring and the sign of its voltages; of their magnitudes without
+    `signs`."""
     protocol = on_host(model.protocol)
     voltages, mask = np.real(np.asarray(measurement.filled())[0]), np.asarray(measurement.mask)[0]
-    impedances = _impedances(model)
+    impedances, voltages = _impedances(model), voltages if signs else np.abs(voltages)
 
     def misfit_of(wiring: Wiring) -> Wiring:
         places, order = np.array(wiring.places), orders[wiring.order]
@@ -234,6 +262,7 @@ def _comparison(model: ForwardModel, measurement: Measurement, orders) -> Callab
         size, best = np.linalg.norm(measured), wiring
         for impedance in impedances:
             expected = np.where(used, select_channels(protocol, impedance[np.ix_(places, places)]), 0)
+            expected = expected if signs else np.abs(expected)
             scale = expected @ measured / (expected @ expected)
             misfit = float(np.linalg.norm(measured - scale * expected) / size)
             if misfit < best.misfit or best is wiring:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, picture
+from jeit.arguments import brief, page, picture
 from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions
 from jeit.mesh import Domain
@@ -72,6 +72,9 @@ class Layout(eqx.Module):
 
     def _repr_png_(self) -> bytes | None:
         return picture(self)
+
+    def _repr_html_(self) -> str | None:
+        return page(self)
 
     def __init__(
         self,

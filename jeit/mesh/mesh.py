@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, picture
+from jeit.arguments import brief, page, picture
 from jeit.mesh import checks, topology
 from jeit_solvers.engines import as_array, has_values
 
@@ -44,6 +44,9 @@ class Mesh(eqx.Module):
 
     def _repr_png_(self) -> bytes | None:
         return picture(self)
+
+    def _repr_html_(self) -> str | None:
+        return page(self)
 
     @property
     def dimension(self) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import html
 import io
 from collections.abc import Callable
 from typing import Any
@@ -25,6 +27,15 @@ def picture(one: Any) -> bytes | None:
     file = io.BytesIO()
     draw(one).savefig(file, dpi=_DPI, format="png")
     return file.getvalue()
+
+
+def page(one: Any) -> str | None:
+    """HTML of an object: its text above its picture, without scripts; None if it has no picture."""
+    drawn = picture(one)
+    if drawn is None:
+        return None
+    data = base64.b64encode(drawn).decode("ascii")
+    return f'<pre>{html.escape(repr(one))}</pre><img alt="{type(one).__name__}" src="data:image/png;base64,{data}">'
 
 
 def _mesh(mesh: Any) -> Figure:

@@ -8,8 +8,9 @@ import pytest
 from rich.console import Console
 
 from jeit.arguments import percent
+from jeit.cli import console as console_room
 from jeit.cli.commands.reconstruct import bodies_text
-from jeit.cli.console import inclusion_table, quantity_table
+from jeit.cli.console import Steps, inclusion_table, quantity_table
 from jeit.image import Inclusion, SolidForm
 
 SAID = {
@@ -97,3 +98,24 @@ def test_bodies_end_at_outlines_in_a_sheet_and_at_surfaces_in_a_solid(dimension,
         f"2 {edge} fitted; 1 ghost left out; of 1 the data give a limit of the change only; the background "
         "has drifted by 1 %"
     )
+
+
+def test_the_time_left_is_estimated_where_parts_are_known(monkeypatch):
+    """At the pace so far; of steps whose number of parts is not known nothing is estimated."""
+    now = [100.0]
+    monkeypatch.setattr(console_room.time, "perf_counter", lambda: now[0])
+    with Steps(Console(file=io.StringIO(), force_terminal=True), quiet=False) as step:
+
+        def shown(seconds, detail):
+            step("image")
+            now[0] += seconds
+            step.report(detail)
+            return str(step._status.status.__rich__())
+
+        assert shown(4, "frame 10 of 40") == "image … frame 10 of 40  4 s, about 10 s left"
+        assert shown(60, "1,000 of 4,000 films") == "image … 1,000 of 4,000 films  60 s, about 3 min left"
+        assert shown(7200, "2 of 4") == "image … 2 of 4  7200 s, about 2.0 h left"
+        assert shown(4, "step 10 of at most 40") == "image … step 10 of at most 40  4 s"
+        assert shown(4, "1 of 100") == "image … 1 of 100  4 s"
+        assert shown(1, "20 of 100") == "image … 20 of 100"
+        assert shown(4, "40 of 40") == "image … 40 of 40  4 s"

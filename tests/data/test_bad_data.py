@@ -174,7 +174,8 @@ def test_the_file_that_the_bad_ones_were_made_from_is_good(tmp_path):
     [
         (
             {"format": "xlsx"},
-            "kit4, ktc2023, eidors, sciospec, draeger, carefusion, swisstom, goettingen, openeit, table, tank6cm",
+            "kit4, ktc2023, eidors, sciospec, draeger, carefusion, swisstom, goettingen, cn0565, quadrupoles, openeit, "
+            "table, tank6cm",
         ),
         ({"format": "kit4"}, "not a readable .mat"),
         ({"format": "tank6cm", "description": "other.toml"}, "describes itself"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.io
 from instrument_files import (
     adjacent_channels,
     adjacent_voltages,
@@ -117,6 +118,12 @@ def test_characters_that_openeit_lost(tmp_path):
     assert any("4 readings of zero, as of an open circuit, or illegible" in note for note in found.notes)
     path.write_text(frame + frame[:40])
     assert data.read(path).num_frames == 1
+    # A lost word makes two frames one, and those after them keep their times.
+    path.write_text(frame + frame + frame.replace("magnitudes: ", "") + frame + "\n")
+    path.with_suffix(".toml").write_text("[data]\nframe_rate = 10\n")
+    found = data.read(path)
+    assert np.asarray(found.mask).all(axis=1).tolist() == [True, False, False, True]
+    np.testing.assert_allclose(found.times, [0, 0.1, 0.2, 0.3])
 
 
 def test_what_a_description_leaves_out_is_as_openeit_sends_it(tmp_path):
@@ -347,6 +354,85 @@ def test_what_is_wrong_is_told(name, tmp_path):
     with pytest.raises(ValueError, match=message) as caught:
         data.read(tmp_path / "a.eit")
     assert len(str(caught.value)) < 400
+
+
+def written(write, name="a.eit"):
+    """A maker of a file of this name, whose content is changed."""
+
+    def make(folder, change=lambda content: content):
+        write(folder / name)
+        (folder / name).write_bytes(change((folder / name).read_bytes()))
+        return folder / name
+
+    return make
+
+
+def one_of_sciospec(path):
+    write_sciospec(path, impedance(8)[None], PAIRS)
+
+
+NOISE = np.random.default_rng(0).integers(0, 256, 4096, dtype=np.uint8).tobytes()
+DAMAGED = {
+    "dräger, start lost": (written(dragged), lambda content: content[40:], "looks like a file of draeger"),
+    "carefusion, start lost": (
+        written(lambda path: write_carefusion(path, frames(1))),
+        lambda content: content[2:],
+        "looks like a file of carefusion .* does not say where the frames begin",
+    ),
+    "sciospec, start lost": (
+        written(one_of_sciospec),
+        lambda content: content[3:],
+        "looks like a file of sciospec .* line 1: a header of 2 lines",
+    ),
+    "sciospec by another name": (
+        written(one_of_sciospec, "a.txt"),
+        None,
+        r"is a file of sciospec .* which end in \.eit: rename it, or give format='sciospec'",
+    ),
+    "openeit of three": (
+        written(lambda path: path.write_text("magnitudes: 1, 2, 3\n"), "a.txt"),
+        None,
+        "looks like a file of openeit .* most frames have 3 numbers",
+    ),
+    "get of text": (
+        written(lambda path: path.write_text("GET /\n" * 400), "a.get"),
+        None,
+        "of no file ending in '.get'",
+    ),
+    "get of noise": (written(lambda path: path.write_bytes(NOISE), "a.get"), None, "is it of another program"),
+    "eit of text": (written(lambda path: path.write_text("hello\n")), None, "of no file ending in '.eit' \\(Sciospec"),
+    "a table that is no text": (written(lambda path: path.write_bytes(NOISE), "a.csv"), None, "is not a text file"),
+    "an archive cut off": (
+        written(lambda path: np.savez(path, voltages=np.ones((2, 40))), "a.npz"),
+        lambda content: content[:200],
+        "not a readable",
+    ),
+    "a spreadsheet": (
+        written(lambda path: path.write_bytes(b"PK\x03\x04"), "a.xlsx"),
+        None,
+        "export its numbers as CSV",
+    ),
+    "text of another ending": (written(lambda path: path.write_text("1 2 3"), "a.asc"), None, "name it a.txt"),
+    "kit4 without a variable": (
+        written(lambda path: scipy.io.savemat(path, {"Uel": [1.0], "CurrentPattern": [1.0]}), "a.mat"),
+        None,
+        "looks like KIT4 .* but lacks the variable MeasPattern",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGED)
+def test_a_damaged_file_is_named_for_what_it_probably_is(name, tmp_path):
+    make, change, said = DAMAGED[name]
+    path = make(tmp_path) if change is None else make(tmp_path, change)
+    with pytest.raises(ValueError, match=said) as caught:
+        data.read(path)
+    assert len(str(caught.value)) < 500
+
+
+def test_a_mark_of_byte_order_before_sciospec_is_none_of_the_header(tmp_path):
+    path = written(one_of_sciospec)(tmp_path, lambda content: b"\xef\xbb\xbf" + content)
+    assert data.read(path).num_frames == 1
 
 
 def test_a_table_has_one_list_of_endings():

@@ -1,9 +1,13 @@
 """The readers on the real files (skipped where there are none)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from jeit import data
+from jeit.data.imageable import mask_spikes
+from jeit.inverse import relative_noise
 from jeit.mesh import Disk
 
 TOO_WEAK = "20uA"
@@ -134,3 +138,33 @@ def test_references_of_other_setups_are_refused(data_folder):
     weak, strong = (data.read(f) for f in tank_files(data_folder) if "20uA" in f.name or "60uA" in f.name)
     with pytest.raises(ValueError, match="times the current"):
         data.check_imageable(*sorted((weak, strong), key=lambda m: float(m.protocol.drive.max())))
+
+
+def test_no_channel_of_a_measured_frame_is_a_spike(data_folder):
+    check_spikes([data.read(file).split_reference() for file in tank_files(data_folder)[::3]])
+
+
+@pytest.mark.slow
+def test_no_channel_of_any_measured_frame_is_a_spike(data_folder):
+    folder = data_folder / "kit4"
+    empty = data.read(folder / "datamat_1_0.mat")
+    pairs = [(data.read(file), empty) for file in sorted(folder.glob("*.mat")) if file.stem != "datamat_1_0"]
+    other = data.read(data_folder / "ktc2023" / "ref.mat")
+    pairs += [(data.read(file), other) for file in sorted((data_folder / "ktc2023").glob("data*.mat"))]
+    pairs += [data.read(file).split_reference() for file in tank_files(data_folder)]
+    assert len(pairs) == 27
+    check_spikes(pairs)
+
+
+def check_spikes(pairs):
+    """None is found in frames as measured; one that is made, as large as the largest change, is found in each."""
+    rng = np.random.default_rng(0)
+    for frame, rest in pairs:
+        assert mask_spikes(frame, rest) is frame, frame.source
+        both = np.asarray(frame.mask)[0] & np.asarray(rest.mask)[0]
+        base, values = np.asarray(rest.voltages)[0], np.array(frame.voltages)
+        noise = np.asarray(relative_noise(np.abs(np.where(both, base, 0)), both))
+        one = rng.choice(np.flatnonzero(both))
+        values[0, one] += noise[one] * np.abs((values[0] - base) / noise)[both].max()
+        found = mask_spikes(replace(frame, voltages=values), rest)
+        assert not np.asarray(found.mask)[0, one], frame.source

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jeit import data, protocol
-from jeit.data.imageable import assess
+from jeit.data.imageable import assess, mask_spikes
 from jeit.data.quality import channel_reciprocity_error, expected_signs, rounding_deviation
 from jeit.inverse import relative_noise
 from jeit.report.compared_rules import report_measurement
@@ -272,3 +272,37 @@ def test_masked_voltages_do_not_hide_rounding():
     voltages = rounded(np.random.default_rng(1).normal(size=100), 2)
     voltages[3], mask = np.pi, np.arange(100) != 3
     assert rounding_deviation(voltages, mask)[mask].all()
+
+
+@pytest.mark.parametrize("driven", [False, True])
+@pytest.mark.parametrize("size", [1, 30])
+def test_spikes_in_single_channels_are_masked_and_named(driven, size, tank, setup):
+    """As large as the largest change, and far larger; with fill, they are what reciprocity says."""
+    chosen, rng = protocol.adjacent(16, driven_electrodes=driven), np.random.default_rng(0)
+    empty = data.screen(tank(chosen), chosen, **setup(16))
+    noise = 1e-4 * np.abs(tank(chosen)) * rng.normal(size=(3, chosen.num_measurements))
+    sound = data.screen(tank(chosen, 0.05) + noise, chosen, **setup(16))
+    assert mask_spikes(sound, empty) is sound
+    spoilt, each = np.array(sound.voltages), np.asarray(relative_noise(np.abs(tank(chosen))))
+    largest = np.abs((tank(chosen, 0.05) - tank(chosen)) / each).max()
+    spoilt[1, [17, 100]] += size * largest * each[[17, 100]] * [1, -1]
+    spiky = data.screen(spoilt, chosen, **setup(16))
+    found = mask_spikes(spiky, empty)
+    assert {(1, 17), (1, 100)} <= {*map(tuple, np.argwhere(~np.asarray(found.mask)).tolist())}
+    assert (~np.asarray(found.mask)).sum() <= 3
+    assert "contradict the other channels (channel 18 of frame 1, channel 101 of frame 1" in found.notes[-1]
+    if size > 1:
+        filled = mask_spikes(spiky, empty, fill=True)
+        assert np.asarray(filled.mask).all()
+        np.testing.assert_allclose(filled.voltages[1, [17, 100]], sound.voltages[1, [17, 100]], rtol=2e-3)
+        assert filled.notes[-1].startswith("2 voltages replaced by what others determine")
+
+
+def test_no_spike_is_found_where_channels_are_independent(tank, setup):
+    """A light touch between two electrodes changes their channel alone."""
+    chosen = protocol.two_terminal(8)
+    empty = data.screen(tank(chosen), chosen, **setup(8))
+    touched = tank(chosen)
+    touched[3] *= 1.1
+    touched = data.screen(touched, chosen, **setup(8))
+    assert mask_spikes(touched, empty) is touched

@@ -9,8 +9,8 @@ import scipy.io
 from jeit import data
 from jeit.data import load_description
 from jeit.data.description import TableLayout, parse_description
-from jeit.data.formats.frames import frames_in_table
-from jeit.data.formats.unstated import fitting_protocol
+from jeit.data.formats.text import frames_in_table
+from jeit.data.unstated import fitting_protocol
 from jeit.protocol import adjacent
 
 TANK = """
@@ -274,3 +274,57 @@ def test_hyphens_and_underscores_are_alike():
         assert described.num_measurements == 28
     table = {"protocol": {"kind": "haar", "number": 8, "current": 1e-3, "measurement": "mean_removed"}}
     assert parse_description(table, "a.toml").protocol("a.csv") is not None
+
+
+@pytest.mark.parametrize("form", ["({:.9e}{:+.9e}j)", "{:.9e}{:+.9e}i", "({:.9e}+{:.9e}j)"])
+def test_complex_numbers_in_text(form, frames, tmp_path):
+    """As NumPy, MATLAB and older NumPy write them."""
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    (tmp_path / "a.txt").write_text("\n".join(" ".join(form.format(v, -0.1 * v) for v in frame) for frame in values))
+    found = read(tmp_path / "a.txt", 'component = "complex"')
+    np.testing.assert_allclose(found.voltages, values * (1 - 0.1j), rtol=1e-8)
+    np.testing.assert_allclose(read(tmp_path / "a.txt").voltages, values, rtol=1e-8)
+
+
+def test_arrays_as_they_are_printed(frames, tmp_path):
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    for text in (str(values.tolist()).replace("], ", "],\n"), "\n".join(map(str, values.tolist()))):
+        (tmp_path / "a.txt").write_text(text)
+        np.testing.assert_allclose(read(tmp_path / "a.txt").voltages, values)
+    with np.printoptions(precision=9, threshold=1000):
+        (tmp_path / "a.txt").write_text(str(values[:1]))
+    np.testing.assert_allclose(read(tmp_path / "a.txt").voltages, values[:1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("index", "first"), [(True, 0), (False, 0), (False, 1)])
+def test_a_first_line_that_numbers_the_columns_is_no_frame(index, first, frames, tmp_path):
+    """As data frames are saved, with and without their index."""
+    values, _ = voltages_of(frames, False, "rotating", "all")
+    lines = [("," if index else "") + ",".join(str(first + k) for k in range(values.shape[1]))]
+    lines += [(f"{k}," if index else "") + ",".join(map(repr, frame.tolist())) for k, frame in enumerate(values)]
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    found = read(tmp_path / "a.csv")
+    np.testing.assert_allclose(found.voltages, values)
+    assert any("the first 1 line is a heading" in note for note in found.notes)
+
+
+def test_json_is_named(frames, tmp_path):
+    (tmp_path / "a.txt").write_text('{"t": 0.0, "v": [1.0, 2.0]}')
+    with pytest.raises(ValueError, match="line 1: this is JSON; write its numbers as CSV"):
+        read(tmp_path / "a.txt")
+
+
+def test_titles_between_frames(frames, tmp_path):
+    """As the one at the start, apart from the number; any other word is refused."""
+    values, _ = voltages_of(frames, True, "fixed", "all")
+    blocks = [
+        f"Frame {k}\n" + "\n".join(",".join(f"{v:.9e}" for v in row) for row in frame.reshape(8, 8)) + "\n"
+        for k, frame in enumerate(values)
+    ]
+    (tmp_path / "a.csv").write_text("\n".join(blocks))
+    found = read(tmp_path / "a.csv")
+    np.testing.assert_allclose(found.voltages, values, rtol=1e-8)
+    assert any("2 more such lines stand between" in note for note in found.notes)
+    (tmp_path / "a.csv").write_text("\n".join(blocks).replace("Frame 2", "broken"))
+    with pytest.raises(ValueError, match="'broken' is no number"):
+        read(tmp_path / "a.csv")

@@ -239,6 +239,20 @@ _instrument(
     8,
     lambda path: path.write_text(2 * ("magnitudes: " + ", ".join(f"{one}.5" for one in range(1, 33)) + "\n")),
 )
+_instrument(
+    "cn0565",
+    ".log",
+    8,
+    lambda path: path.write_text(2 * ("!V " + ",".join(f"{2**32 - 999 * one:X}" for one in range(1, 81)) + "\n")),
+)
+_instrument(
+    "quadrupoles",
+    ".csv",
+    8,
+    lambda path: path.write_text(
+        "frame,a,b,m,n,u/mV\n" + "".join(f"{one % 2},1,{3 + one // 2},5,{6 + one % 2},{one}.5\n" for one in range(1, 9))
+    ),
+)
 _instrument("sciospec", ".eit", 8, lambda path: write_sciospec(path, np.array([np.eye(8)] * 2), [(1, 3), (2, 4)]))
 
 

@@ -13,6 +13,7 @@ from jeit import data
 from jeit.cli import main
 from jeit.data.description import parse_description
 from jeit.imaging.describe import find_description
+from jeit.layout import ring
 from jeit.mesh import centroids
 
 DISK = {"shape": "disk", "radius": 0.1}
@@ -187,6 +188,30 @@ def test_what_is_known_narrows_the_search(tmp_path):
     assert {replace(one.measurement).num_frames for one in found.candidates} == {1}
 
 
+def test_of_a_file_that_states_its_protocol_the_body_is_described(tmp_path):
+    """Electrodes are where the file places them, if it does; instruments say nothing of it."""
+    voltages, made = simulated(KINDS[1])
+    values, position = voltages[0] / 1e-3, ring(0.1, 8)
+    places = "\n".join(f"{x:.7f} {y:.7f}" for x, y in position)
+    pairs = (np.asarray(one) for one in (made.channel_drive, made.channel_measurement))
+    rows = np.stack([choose(one, axis=1) for one in pairs for choose in (np.argmax, np.argmin)], axis=1) + 1
+    lines = "\n".join(f"{a} {b} {m} {n} {r:.9g}" for (a, b, m, n), r in zip(rows, values, strict=True))
+    path = tmp_path / "a.ohm"
+    path.write_text(f"8\n# x y\n{places}\n40\n# a b m n r\n{lines}\n")
+    found = find_description(path, DISK, RING)
+    assert found.fault == ""
+    assert found.candidates[0].misfit < 0.05
+    assert "[protocol]" not in found.text
+    assert "Electrodes are where the file places them" in found.text
+    (tmp_path / "a.toml").write_text(found.text)
+    np.testing.assert_allclose(data.read(path).electrodes.position, position, atol=1e-6)
+    path = tmp_path / "b.txt"
+    path.write_text(f"a b m n r\n{lines}\n")
+    assert 'layout = "ring"' in find_description(path, DISK, RING).text
+    with pytest.raises(ValueError, match="states its protocol, of 8 electrodes: leave out"):
+        find_description(path, DISK, RING, known={"number": 16})
+
+
 def test_command(tmp_path, capsys, monkeypatch):
     voltages, _ = simulated(KINDS[1])
     empty, rod = saved(tmp_path, -voltages, "\t")
@@ -196,6 +221,8 @@ def test_command(tmp_path, capsys, monkeypatch):
     assert "--shape: no file says it; give --shape disk:0.1" in capsys.readouterr().err
     assert main([*given, "--shape", "disk:0.1,3", "--width", "0.012"]) == 1
     assert "--shape: give one of disk:RADIUS" in capsys.readouterr().err
+    assert main([*given, "--shape", "disk:0.1", "--width", "0", "--electrodes", "8"]) == 1
+    assert capsys.readouterr().err.startswith("jeit: --width is 0, and must be from")
     assert main([*given, "--shape", "disk:0.1", "--width", "0.012", "--electrodes", "8", "--protocol", "adjacent"]) == 0
     said = capsys.readouterr().out
     assert "adjacent, 8 electrodes, order fixed" in said

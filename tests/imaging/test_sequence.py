@@ -128,3 +128,16 @@ def test_a_sphere_that_oscillates_ten_times_a_second():
     assert series.unit == "S/m"
     upper = half_region(series.mesh, (0, 0, 1))
     assert told.amplitude[upper].mean() == pytest.approx(told.amplitude[~upper].mean(), rel=0.3)  # it is half way up
+
+
+def test_a_spike_in_one_channel_changes_no_image(chest):
+    """It is replaced, and said so; the frame is not refused."""
+    few = chest.frames(slice(0, 6))
+    spoilt = np.array(few.voltages)
+    spoilt[2, 40] *= 2
+    settings = ImagingSettings(num_points=500, hyperparameter=0.1)
+    sound, found = (image_sequence(one, few.frames([5]), settings) for one in (few, replace(few, voltages=spoilt)))
+    assert not found.refused.any()
+    size = np.abs(sound.series.changes).max()
+    assert np.abs(found.series.changes - sound.series.changes).max() < 0.05 * size
+    assert any("replaced by what others determine" in note for note in found.prepared.measurement.notes)

@@ -14,7 +14,7 @@ from jeit.imaging.preparation import imaging_mesh
 from jeit.imaging.wiring import channel_orders, find_wiring
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, centroids
-from jeit.protocol import adjacent, skip
+from jeit.protocol import adjacent, opposite, skip
 from jeit.report.image import report_image
 
 RADIUS, COUNT = 0.05, 16
@@ -197,3 +197,20 @@ def test_all_exchanges_of_two_electrodes_are_found_on_measured_tanks(data_folder
         wiring = find_wiring(model.with_electrodes(electrodes), frame)
         assert wiring.places == tuple(places), pair
         assert (wiring.order, wiring.reversed_signs) == ("", False), pair
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_the_order_of_magnitudes_is_found(signed):
+    """Magnitudes, or these with the signs that the described order gives them, as on reading."""
+    model = MODEL.with_protocol(opposite(COUNT))
+    order = 'from electrode 1 on in every drive (order = "fixed")'
+    frame = measured(model, order=order)
+    signs = np.sign(np.asarray(model.voltages(1.0))) if signed else 1
+    wiring = find_wiring(model, replace(frame, voltages=signs * np.abs(np.asarray(frame.voltages))))
+    assert wiring.order == order
+    assert wiring.magnitudes == (not signed)
+    assert wiring.misfit < 0.05
+    assert ("to be magnitudes, without signs" in wiring.explanation) == (not signed)
+    alone = find_wiring(model, replace(frame, voltages=np.abs(np.asarray(measured(model).voltages))))
+    assert alone.order == ""
+    assert alone.magnitudes

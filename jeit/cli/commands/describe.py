@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -85,7 +88,8 @@ def describe(
         raise ValueError(f"--output: {target} exists already; move it, or give another folder.")
     console = plain_console()
     given = {name: value for name, value in known.items() if value is not None}
-    with Steps(console, quiet=quiet) as step, naming_options({"key": "--key", "number": "--electrodes"}):
+    named = {"key": "--key", "number": "--electrodes", "width": "--width", "height": "--height"}
+    with Steps(console, quiet=quiet) as step, naming_options(named), _naming_sizes():
         found = find_description(
             data,
             geometry,
@@ -109,7 +113,15 @@ def describe(
     with written_whole(target) as file:
         file.write(found.text.encode())
     if reference is None and reference_key is None:
-        console.print(f"Written: {target}. Give --reference, a file of the empty body, to image it.")
+        frames = found.candidates[0].frames
+        several = (
+            f"; or say which of its {frames} frames are of the empty body, and which to image: jeit reconstruct {data} "
+            f"--description {target} --reference-frames 0-1 --frame {frames - 1}"
+        )
+        console.print(
+            f"Written: {target}. Give --reference, a file of the empty body, to image it{several * (frames > 1)}.",
+            soft_wrap=True,
+        )
         return
     with Steps(console, quiet=quiet) as step:
         base = read(data if reference is None else reference, description=target, key=reference_key)
@@ -121,6 +133,21 @@ def describe(
     if not quiet:
         show(console, result)
         say_written(console, target, *_WRITTEN[1 : 4 + (result.mesh.dimension == 3)])
+
+
+@contextmanager
+def _naming_sizes() -> Iterator[None]:
+    """Context manager that names the options --shape, --width and --height in errors about what they describe."""
+    try:
+        yield
+    except ValueError as error:
+        said = str(error).removeprefix("the description: ")
+        if " overlap;" in said:
+            said = f"--width: {said[0].lower()}{said[1:]}"
+        said = re.sub(r"^geometry(\.\w+)?", "--shape", re.sub(r"^electrodes\.(width|height)", r"--\1", said))
+        if not said.startswith("--"):
+            raise
+        raise ValueError(re.sub(r"^(--\w+): \1: ", r"\1: ", said)) from error
 
 
 def _asked(option: str, given: Any, question: str, example: str) -> Any:

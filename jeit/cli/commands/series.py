@@ -132,7 +132,7 @@ def series(
     rate_text = "" if report["frame_rate"] is None else f", {report['frame_rate']:.4g} a second"
     untimed = "" if measured.times is not None else "; no times are known (--rate gives them), frames are numbered"
     console.print(f"\n{frames}{rate_text}, {report['refused']} refused{untimed}")
-    for note in dict.fromkeys((*measured.notes, *(() if base is None else base.notes))):
+    for note in dict.fromkeys((*found.prepared.measurement.notes, *(() if base is None else base.notes))):
         console.print(f"  {note}", style="dim")
     for one in report["oscillations"]:
         console.print(f"{one['frequency']:.4g} Hz (resolution {one['resolution']:.2g} Hz):")

@@ -106,6 +106,7 @@ def stream(
     from jeit.arguments import counted
     from jeit.cli.console import Steps, plain_console, say_written, scaled
     from jeit.cli.stopping import FrameCounter, Stopping
+    from jeit.data.imageable import mask_spikes
     from jeit.imaging.stream_preparation import StreamSettings, frames_of, parse_frames, prepare_imager
     from jeit.inverse import stream as images_of
     from jeit.inverse.nonlinear.solvers import SOLVERS, frame_solvers
@@ -140,6 +141,7 @@ def stream(
         if data == "-":
             frames, number = parse_frames(sys.stdin), None
         else:
+            measured = measured if settings.as_is else mask_spikes(measured, empty)
             frames, number = frames_of(measured), measured.num_frames
             rate = measured.frame_rate if rate is None else rate
         with naming_options({"rate": "--rate"}), Steps(console, quiet=quiet) as step:

@@ -15,9 +15,8 @@ import numpy as np
 
 from jeit.arguments import listed
 from jeit.data.description import Description, load_description, parse_description
-from jeit.data.formats.frames import frames_in_table
-from jeit.data.formats.table import channel_counts, description_like, measurement_in
-from jeit.data.measured_patterns import frames_of
+from jeit.data.formats.table import channel_counts, description_like, frames_of, measurement_in
+from jeit.data.formats.text import frames_in_table
 from jeit.data.measurement import Measurement
 from jeit.files import matlab
 from jeit.protocol import Protocol, from_channels

@@ -29,14 +29,27 @@ from jeit.data.measurement import Measurement
 DESCRIPTION = "Göttingen MCEIT (.get): 208 adjacent voltages a frame"
 # Bytes per frame; the beginning and the end of Dräger's text, and its maximum length in bytes.
 _FRAME, _MARK, _END, _LONGEST = 1024, b"---Draeger EIT-Software", b"\r\n\r\n\r\n", 65536
+# Bytes of text; share of numbers that are finite, and the largest of a frame.
+_READABLE, _MOST, _LARGEST = frozenset(b"\t\r\n" + bytes(range(32, 127))), 0.9, 1e9
 _NOTE = "neither unit nor gain of the voltages is known: trust relative changes, not volts."
 _NO_RATE = "the file says no rate, nor a record beside it (.prl); give it by [data] frame_rate."
 _RATE = re.compile(rb"Framerate\s*=\s*(\d+(?:\.\d+)?)\s*per second", re.IGNORECASE)
 
 
 def recognises(path: Path) -> bool:
-    """True for a .get file."""
-    return path.suffix.lower() == ".get"
+    """True for a .get file that begins with Dräger's text, or whose first frame may be voltages: neither text nor
+    numbers beyond any instrument."""
+    if path.suffix.lower() != ".get":
+        return False
+    with path.open("rb") as file:
+        head = file.read(_FRAME)
+    if head.startswith(_MARK) or len(head) < _FRAME:
+        return True
+    if all(byte in _READABLE for byte in head):
+        return False
+    first = np.frombuffer(head, "<f4")
+    known = first[np.isfinite(first)]
+    return len(known) > _MOST * len(first) and bool((np.abs(known) < _LARGEST).all())
 
 
 def read(path: Path, description: str | Path | None = None) -> Measurement:

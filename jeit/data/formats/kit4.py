@@ -13,6 +13,8 @@ from jeit.mesh import Disk
 from jeit.protocol import from_matrices
 
 DESCRIPTION = "KIT4 tank archive (.mat with Uel, CurrentPattern, MeasPattern)"
+VARIABLES = (frozenset({"Uel", "CurrentPattern", "MeasPattern"}),)
+"""Variables of its files."""
 RADIUS = 0.14
 ELECTRODE_WIDTH = 0.025
 # Initial value for calibration, in ohm·m: the empty tank fits about 1e-4 m / 1.3 mS.
@@ -21,8 +23,7 @@ CONTACT_IMPEDANCE = 0.08
 
 def recognises(path: Path) -> bool:
     """True for a .mat file with the three variables of the archive."""
-    names = {"Uel", "CurrentPattern", "MeasPattern"}
-    return path.suffix.lower() == ".mat" and names <= matlab.variable_names(path)
+    return path.suffix.lower() == ".mat" and VARIABLES[0] <= matlab.variable_names(path)
 
 
 def read(path: Path) -> Measurement:

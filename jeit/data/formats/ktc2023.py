@@ -15,6 +15,8 @@ from jeit.mesh import Disk
 from jeit.protocol import from_matrices
 
 DESCRIPTION = "Kuopio Tomography Challenge 2023 (.mat with Mpat, and Inj and Uel or Injref and Uelref)"
+VARIABLES = (frozenset({"Mpat", "Inj", "Uel"}), frozenset({"Mpat", "Injref", "Uelref"}))
+"""Variables of its files, and of the reference."""
 RADIUS = 0.115
 ELECTRODE_ANGLE = np.radians(5.625)
 # Initial value for calibration, in ohm·m. The empty tank fits a contact impedance of nearly zero.
@@ -26,7 +28,7 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() != ".mat":
         return False
     names = matlab.variable_names(path)
-    return "Mpat" in names and ({"Inj", "Uel"} <= names or {"Injref", "Uelref"} <= names)
+    return any(one <= names for one in VARIABLES)
 
 
 def read(path: Path) -> Measurement:

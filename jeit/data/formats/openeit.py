@@ -25,8 +25,8 @@ from jeit.arguments import counted, listed
 from jeit.data.description import parse_description
 from jeit.data.formats.recording import Recording, content_of, description_of, measurement_of
 from jeit.data.formats.table import description_like, find_description
-from jeit.data.formats.unstated import with_signs
 from jeit.data.measurement import Measurement
+from jeit.data.unstated import with_signs
 from jeit.protocol import Protocol
 
 DESCRIPTION = "lines of an OpenEIT device ('magnitudes: …'), of 8, 16 or 32 electrodes"
@@ -100,7 +100,7 @@ def _alike(one: Protocol, other: Protocol) -> bool:
 
 def numbers(path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
     """The numbers of each frame, and notes. NaN where there is none: of a reading of zero, as of an open circuit, of a
-    cell that is no number, of a last number that may be cut off, and of a whole frame that is longer or shorter than
+    cell that is no number, of a last number that may be cut off, and of whole frames that are longer or shorter than
     most, for characters were lost.
 
     Raises `ValueError` if frames are of no protocol of the firmware, or of two.
@@ -132,10 +132,13 @@ def numbers(path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
     elif content[-1:].isdigit() and lengths[-1] == count:
         frames[-1][-1] = np.nan
         notes.append("nothing follows the last number, which may be cut off: masked.")
-    whole = [length == count for length in lengths]
-    lost = [str(number) for number, one in enumerate(whole) if not one]
-    values = np.full((len(frames), count), np.nan)
-    values[whole] = [one for one, kept in zip(frames, whole, strict=True) if kept]
+    # Frames between which a word is lost are one, of as many numbers as they had: each keeps its place in time.
+    places = np.cumsum([0, *(max(1, round(length / count)) for length in lengths)])
+    whole = np.zeros(places[-1], bool)
+    whole[[place for place, length in zip(places[:-1], lengths, strict=True) if length == count]] = True
+    lost = [str(number) for number in np.flatnonzero(~whole)]
+    values = np.full((len(whole), count), np.nan)
+    values[whole] = [one for one in frames if len(one) == count]
     if lost:
         notes.append(f"characters are lost in frame{'s' * (len(lost) > 1)} {listed(lost)}: masked.")
     values = np.where(values == 0, np.nan, values)

@@ -46,7 +46,7 @@ def recognises(path: Path) -> bool:
     if path.suffix.lower() != ".eit":
         return False
     with path.open("rb") as file:
-        first = file.read(24).split(b"\n")[0].strip()
+        first = file.read(24).removeprefix(b"\xef\xbb\xbf").split(b"\n")[0].strip()
     return first.isdigit() and _FEWEST <= int(first) <= _MOST
 
 
@@ -59,7 +59,7 @@ def read(path: Path, description: str | Path | None = None) -> Measurement:
     Raises `ValueError` with the line at fault.
     """
     try:
-        lines = content_of(path).decode("utf-8", "strict").splitlines()
+        lines = content_of(path).decode("utf-8-sig", "strict").splitlines()
     except UnicodeDecodeError:
         raise ValueError(f"{path.name} is not text, as Sciospec's files are; is it damaged?") from None
     header = _header(lines, path)

@@ -8,16 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Inexact
 
 from jeit.arguments import listed
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
-from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text
-from jeit.data.formats.text import read_text, rectangle
-from jeit.data.formats.unstated import driven_zeros, fitting_protocol, with_signs
-from jeit.data.measured_patterns import frames_of, less_their_mean
+from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read_text, rectangle
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
+from jeit.data.unstated import driven_zeros, fitting_protocol, with_signs
 from jeit.files import npy_array, npz_arrays
 from jeit.protocol import Protocol
 
@@ -25,6 +24,11 @@ DESCRIPTION = "table (.csv, .txt, .npy, .npz) with a TOML description beside it"
 SUFFIXES = (".csv", ".txt", ".dat", ".npy", ".npz")
 # Arrays that `write_table` stores in addition to the voltages and the protocol.
 _WORDS = ("mask", "protocol_name", "frame_names", "notes", "times")
+
+AXES = ("electrodes", "patterns", "frames")
+"""Names of the axes of an array of voltages, in their default order; a description can state another order."""
+# Maximum mean of the potentials of a pattern that counts as removed, relative to the largest potential.
+_MOST_MEAN = 0.01
 
 
 def recognises(path: Path) -> bool:
@@ -62,6 +66,8 @@ def read(
     elif like is not None:
         described = description_like(like)
     else:
+        # A damaged file is named as such: no description helps it.
+        _ = _from_numpy(path, ()) if path.suffix.lower() in (".npz", ".npy") else read_text(path)
         raise ValueError(
             f"description: {path.name} is a table of numbers, and nothing says what they mean. Put a description "
             f"beside it, {path.with_suffix('.toml').name} (geometry, electrodes, protocol), or name one; "
@@ -296,3 +302,31 @@ def _times(arrays: dict[str, np.ndarray], name: str) -> np.ndarray | None:
 
 def _texts(arrays: dict[str, np.ndarray], name: str) -> tuple[str, ...]:
     return tuple(str(one) for one in np.ravel(arrays.get(name, np.zeros(0))))
+
+
+def frames_of(values: np.ndarray, axes: tuple[str, ...], name: str) -> Inexact[np.ndarray, "F M"]:
+    """Frames (F, M) of voltages with the given axes, channels ordered drive by drive; an array of two axes is one
+    frame.
+
+    Raises `ValueError` for another number of axes.
+    """
+    named = tuple(axes or AXES)
+    if values.ndim == len(named) - 1:
+        values = np.expand_dims(values, named.index("frames"))  # MATLAB drops a last axis of length one
+    if values.ndim != len(named):
+        raise ValueError(f"{name}: the voltages have shape {values.shape}; {', '.join(named)} are {len(named)} axes.")
+    ordered = np.transpose(values, [named.index(one) for one in ("frames", "patterns", "electrodes")])
+    return ordered.reshape(len(ordered), -1)
+
+
+def less_their_mean(frames: Inexact[np.ndarray, "F M"], count: int) -> tuple[Inexact[np.ndarray, "F M"], float]:
+    """Subtract from the potentials of `count` electrodes the mean of each pattern, if any mean exceeds noise: the
+    potentials were then measured against ground or an electrode. Returns the frames and the largest mean, 0 if nothing
+    is subtracted. Patterns with NaN are not changed."""
+    potentials = frames.reshape(len(frames), -1, count)
+    mean = potentials.mean(axis=2, keepdims=True)
+    mean = np.where(np.isfinite(mean), mean, 0)
+    rest = potentials - mean
+    if not (np.abs(mean) > _MOST_MEAN * np.abs(rest).max(axis=2, keepdims=True)).any():
+        return frames, 0.0
+    return rest.reshape(frames.shape), float(np.abs(mean).max())

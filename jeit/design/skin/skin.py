@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jeit.arguments import IN_MILLIMETRES, brief, check_kind, check_metres, picture
+from jeit.arguments import IN_MILLIMETRES, brief, check_kind, check_metres, page, picture
 from jeit.design.defaults import CELL_SIZE, CONDUCTIVITY, CONTACT_IMPEDANCE, CONTRAST, NUM_LAYERS, THICKNESS
 from jeit.design.skin.indentation import AbstractIndentation, Bell
 from jeit.design.skin.protocol import skin_protocol
@@ -104,6 +104,9 @@ class Skin(eqx.Module):
 
     def _repr_png_(self) -> bytes | None:
         return picture(self)
+
+    def _repr_html_(self) -> str | None:
+        return page(self)
 
     @classmethod
     def create(
