@@ -1,4 +1,4 @@
 from .pictures import AbstractView, LiveFrame, Marker, Picture, Scene
-from .views import ConductivityView
+from .views.conductivity import ConductivityView
 
 __all__ = ["AbstractView", "ConductivityView", "LiveFrame", "Marker", "Picture", "Scene"]

@@ -187,7 +187,9 @@ class Imager(eqx.Module):
         """
         frame, used = np.asarray(reference, float), np.asarray(self.mask)
         if frame.shape != used.shape:
-            raise ValueError(f"reference has shape {frame.shape}; give ({used.size},), a frame of the undisturbed body.")
+            raise ValueError(
+                f"reference has shape {frame.shape}; give ({used.size},), a frame of the undisturbed body."
+            )
         if (missing := np.flatnonzero(used & ~np.isfinite(frame))).size:
             raise ValueError(
                 f"reference has no reading of {counted(missing.size, 'channel')} in use, the first number {missing[0]}."

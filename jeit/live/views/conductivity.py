@@ -12,13 +12,13 @@ from jeit.data import Measurement
 from jeit.imaging.stream_preparation import StreamSettings, prepare_imager
 from jeit.inverse import Imager
 from jeit.inverse.calibration import Calibration
-from jeit.inverse.streaming.stream import FrameStatus, StreamState
+from jeit.inverse.streaming.stream import FrameImage, FrameStatus, StreamState
 from jeit.live.pictures import AbstractView, LiveFrame, Marker, Picture
-from jeit.live.scene import PixelGrid, scene_of
+from jeit.live.views.scene import PixelGrid, scene_of
 
 
 class ConductivityView(AbstractView):
-    """View of the change of conductivity from that of the undisturbed body, the same images as of `jeit.inverse.stream`.
+    """View of the change of conductivity from that of the undisturbed body: the images of `jeit.inverse.stream`.
 
     Images are in S/m (2-D: S). A marker stands at the largest change, unless the frame differs from an undisturbed one
     by noise only.
@@ -66,16 +66,20 @@ class ConductivityView(AbstractView):
 
     def picture(self, frame: LiveFrame) -> Picture:
         """The image of a frame; see `AbstractView.picture`."""
+        return self.image(frame)[1]
+
+    def image(self, frame: LiveFrame) -> tuple[FrameImage, Picture]:
+        """The image of a frame on the cells of the mesh, and its picture."""
         one = self._state.image(frame.number, frame.values)
         if one.conductivity is None:
-            return Picture(None, status=one.status, reason=one.reason)
+            return one, Picture(None, status=one.status, reason=one.reason)
         change = one.conductivity - self.background
         markers = ()
         if one.status != FrameStatus.UNCHANGED:
             peak = int(np.abs(change).argmax())
             x, y = self._middle[peak].tolist()
             markers = (Marker(x, y, f"{100 * change[peak] / self.background:+.0f} %"),)
-        return Picture(self.grid(change), markers, one.status, one.reason)
+        return one, Picture(self.grid(change), markers, one.status, one.reason)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
         """Take the mean of frames (N, M) as the new reference; images with a memory begin anew."""

@@ -65,7 +65,7 @@ def scene_of(
     notes: Sequence[str] = (),
 ) -> Scene:
     """The scene of a body with electrodes, whose images are sampled on `grid`."""
-    outline = _loops(mesh) if mesh.dimension == 2 else _slice_outline(grid)
+    outline = closed_outline(mesh) if mesh.dimension == 2 else _slice_outline(grid)
     names = [str(number) for number in range(1, electrodes.num_electrodes + 1)]
     return Scene(
         title=title,
@@ -103,8 +103,8 @@ def _pattern(row: np.ndarray) -> str:
     return "-".join(map(str, (*plus, *minus)))
 
 
-def _loops(mesh: Mesh) -> list[np.ndarray]:
-    """Closed curves along the boundary of a plane mesh."""
+def closed_outline(mesh: Mesh) -> list[Float[np.ndarray, "n 2"]]:
+    """Closed curves (n, 2) along the boundary of a plane mesh, metres."""
     facets, points = np.asarray(mesh.facets), np.asarray(mesh.points)
     starts = np.flatnonzero(np.append(True, facets[1:, 0] != facets[:-1, 1]))
     return [points[np.append(part[:, 0], part[0, 0])] for part in np.split(facets, starts[1:])]
