@@ -6,14 +6,18 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from jeit.arguments import counted
+from jeit.data import Measurement
 from jeit.inverse.streaming.stream import FrameStatus
 from jeit.live.pictures import AbstractView, LiveFrame, Picture, Scene
+from jeit.live.quality import Quality, QualityWatch, RateWatch
+from jeit.live.recording import Recorder
 from jeit.live.sources import ENDED, MESSAGES, AbstractSource
 
 # Seconds for which frames wait for the imaging: older ones are left out of the view.
@@ -21,8 +25,13 @@ _PATIENCE = 0.05
 # Memory of the pictures that are kept, bytes, frames that wait at most, and kinds of reasons that are counted.
 _MOST_BYTES, _MOST_WAITING, _MOST_REASONS = 128_000_000, 256, 30
 _NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
-# Frames over which latency is summarised, and seconds over which the rate is measured.
-_LATENCIES, _RATE_SPAN = 600, 2.0
+# Frames over which latency is summarised; seconds over which the rate is measured, and from one look at the quality of
+# the frames to the next.
+_LATENCIES, _RATE_SPAN, _LOOK = 600, 2.0, 0.5
+# Frames of another number of channels, one after another, that are reported; most frames of a reference.
+_OTHERS, _MOST_REFERENCE = 3, 10_000
+# Longest name of an event; seconds for which events of skipped frames are kept for a program that is busy.
+_LABEL, _SKIPPED = 200, 30.0
 
 
 @dataclass(frozen=True)
@@ -40,16 +49,31 @@ class Session:
 
     One thread reads; one images, and leaves frames out of the view, never of the recording, when it falls behind.
     `recorder`: where to record once `record(True)` is called. `history`: seconds for which results are kept; these take
-    128 MB at most. Use it as a context manager, or call `start` and `stop`.
+    128 MB at most. `reference`: a measurement of the undisturbed sensor, by which the quality of frames is judged; by
+    default that of the recorder. Use it as a context manager, or call `start` and `stop`.
     """
 
-    def __init__(self, source: AbstractSource, view: AbstractView, *, recorder: Any = None, history: float = 60.0):
+    def __init__(
+        self,
+        source: AbstractSource,
+        view: AbstractView,
+        *,
+        recorder: Recorder | None = None,
+        history: float = 60.0,
+        reference: Measurement | None = None,
+    ):
         self.source, self.view, self.recorder, self.history = source, view, recorder, history
+        if reference is None and recorder is not None:
+            reference = recorder.reference
+        self._watch, self._quality, self._rates = QualityWatch(reference), Quality(), RateWatch()
+        self._length = 0 if reference is None else reference.num_channels
+        self._others = 0
         self._changed = threading.Condition()
         self._waiting: deque[LiveFrame] = deque()
         self._results: deque[Result] = deque()
         self._bytes = 0
         self._ended = self._finished = False
+        self._closed = threading.Event()
         self._read = self._imaged = self._dropped = self._refused = 0
         self._reasons: dict[str, list] = {}
         self._latencies: deque[float] = deque(maxlen=_LATENCIES)
@@ -77,7 +101,7 @@ class Session:
             raise RuntimeError("A session starts once; make another for the same source.")
         self._threads = [
             threading.Thread(target=work, name=f"jeit live {name}", daemon=True)
-            for name, work in (("reader", self._reading), ("imaging", self._imaging))
+            for name, work in (("reader", self._reading), ("imaging", self._imaging), ("quality", self._judging))
         ]
         for thread in self._threads:
             thread.start()
@@ -118,22 +142,46 @@ class Session:
                     return one
         return None
 
+    def with_events(self, result: Result, after: int) -> Result:
+        """A result with the events of those kept before it, of frames above `after`, too."""
+        with self._changed:
+            skipped = [one for one in self._results if after < one.frame.number < result.frame.number]
+        before = tuple(event for one in skipped for event in one.picture.events)
+        return replace(result, picture=replace(result.picture, events=(*before, *result.picture.events)))
+
     def take_reference(self, count: int) -> None:
-        """Take the mean of the next `count` frames, of the undisturbed sensor, as the new reference."""
+        """Take the mean of the next `count` frames, of the undisturbed sensor, as the new reference. Raises
+        `ValueError` unless `count` is between 1 and 10,000."""
+        if not 1 <= count <= _MOST_REFERENCE:
+            raise ValueError(f"count must be a number of frames between 1 and {_MOST_REFERENCE:,}; it is {count}.")
         with self._changed:
             self._wanted, self._collected = count, []
 
     def mark(self, label: str) -> None:
         """Mark an event now, also in the recording."""
+        label = " ".join(label.split())[:_LABEL] or "event"
         second = time.monotonic() - self.source.begun
         self.say(f"Event: {label}")
         if self.recorder is not None:
             self.recorder.mark(second, label)
 
     def record(self, on: bool) -> None:
-        """Begin a recording in a new folder, or end the one under way."""
-        if self.recorder is not None:
-            self.recorder.start() if on else self.recorder.stop()
+        """Begin a recording in a new folder, or end the one under way. What fails is reported in `state`."""
+        if self.recorder is None:
+            if on:
+                self.say("There is nowhere to record to.")
+            return
+        if not on:
+            ended = self.recorder.stop()
+            if ended:
+                self.say(ended)
+            return
+        try:
+            folder = self.recorder.start()
+        except (OSError, ValueError) as error:
+            self.say(f"The recording cannot begin: {error}")
+            return
+        self.say(f"Recording into {folder}.")
 
     def say(self, sentence: str) -> None:
         """Keep a message for the user."""
@@ -143,31 +191,46 @@ class Session:
         """Counters, rate, latency, quality, connection, recording and messages, as JSON can hold them."""
         with self._changed:
             latencies = np.array(self._latencies)
-            reasons = {text: number for text, number in self._reasons.values()}
-            arrivals = [one for one in self._arrivals if one > time.monotonic() - _RATE_SPAN]
             counters = {
                 "read": self._read,
                 "imaged": self._imaged,
                 "dropped": self._dropped,
                 "refused": self._refused,
-                "reasons": reasons,
+                "reasons": dict(self._reasons.values()),
             }
-        said = sorted([*self.source.messages, *self._messages])[-MESSAGES:]
+            quality, ended = self._quality, self._ended
         median, high = np.quantile(latencies, (0.5, 0.99)).tolist() if latencies.size else (None, None)
-        span = arrivals[-1] - arrivals[0] if len(arrivals) > 1 else 0.0
+        said = sorted([*self.source.messages.copy(), *self._messages.copy()])[-MESSAGES:]
         return {
             **counters,
-            "rate": (len(arrivals) - 1) / span if span > 0 else 0.0,
+            "rate": self._rate(),
             "latency_median": median,
             "latency_99": high,
-            "noise": None,
-            "reciprocity": None,
-            "dead": [],
-            "drifting": [],
-            "connection": ENDED if self._ended else self.source.connection,
+            "noise": quality.noise,
+            "reciprocity": quality.reciprocity,
+            "dead": self._names(quality.dead),
+            "drifting": self._names(quality.drifting),
+            "connection": ENDED if ended else self.source.connection,
             "recording": None if self.recorder is None else self.recorder.state(),
             "messages": [{"second": second, "text": text} for second, text in said],
         }
+
+    @property
+    def ended(self) -> bool:
+        """Whether the source has ended and its last frame is imaged."""
+        return self._finished
+
+    def _rate(self) -> float:
+        """Frames/s in the last two seconds."""
+        now = time.monotonic()
+        with self._changed:
+            recent = [one for one in self._arrivals if one > now - _RATE_SPAN]
+        span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
+        return (len(recent) - 1) / span if span > 0 else 0.0
+
+    def _names(self, electrodes: Sequence[int]) -> list[str]:
+        names = self.scene.names
+        return [names[one] if one < len(names) else str(one + 1) for one in electrodes]
 
     def _reading(self) -> None:
         try:
@@ -181,14 +244,35 @@ class Session:
                     if len(self._waiting) > _MOST_WAITING:
                         self._waiting.popleft()
                         self._dropped += 1
+                    self._watch.add(frame)
                     self._collect(frame)
                     self._changed.notify_all()
+                self._compare_length(frame)
         except Exception as error:  # of any device or file: the page reports it
             self.say(f"The source failed: {error}")
         finally:
             with self._changed:
                 self._ended = True
                 self._changed.notify_all()
+
+    def _compare_length(self, frame: LiveFrame) -> None:
+        """Report frames whose number of channels has changed and stays changed."""
+        if isinstance(frame.values, str):
+            return
+        length = frame.values.size
+        self._others = self._others + 1 if length != self._length else 0
+        if self._others == _OTHERS:
+            if self._length:
+                self.say(f"Frames now have {counted(length, 'channel')}; they had {self._length}.")
+            self._length, self._others = length, 0
+
+    def _judging(self) -> None:
+        while not self._closed.wait(_LOOK):
+            quality = self._watch.look()
+            with self._changed:
+                self._quality = quality
+            if said := self._rates(self._rate()):
+                self.say(said)
 
     def _collect(self, frame: LiveFrame) -> None:
         """Keep a frame for the new reference, if one is wanted."""
@@ -221,19 +305,29 @@ class Session:
             except Exception as error:  # a fault of a view must not end the recording
                 picture = Picture(None, status=FrameStatus.REFUSED, reason=f"{type(error).__name__}: {error}"[:300])
             self._publish(Result(frame, picture, time.monotonic() - frame.arrived))
+        self._closed.set()
         with self._changed:
+            if self._wanted:
+                self._messages.append(
+                    (time.monotonic() - self.source.begun, "The source ended before a new reference.")
+                )
             self._finished = True
             self._changed.notify_all()
 
     def _set_reference(self) -> None:
-        frames, self._reference = self._reference, None
+        with self._changed:
+            frames, self._reference = self._reference, None
         if frames is None:
             return
         try:
             self.view.set_reference(frames)
-            self.say(f"New reference: mean of {len(frames)} frames.")
         except ValueError as error:
             self.say(f"The old reference stays: {error}")
+            return
+        self._watch.renew(frames)
+        if self.recorder is not None:
+            self.recorder.renew(time.monotonic() - self.source.begun, frames)
+        self.say(f"New reference: mean of {counted(len(frames), 'frame')}.")
 
     def _publish(self, result: Result) -> None:
         with self._changed:
@@ -261,21 +355,23 @@ class Session:
         self._reasons.setdefault(kind, [reason, 0])[1] += 1
 
 
-def frames(source: AbstractSource, view: AbstractView, *, recorder: Any = None) -> Iterator[Result]:
+def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | None = None) -> Iterator[Result]:
     """Yield the newest result of a view each time the program asks, until the source has ended.
 
-    Frames that arrive while the program is busy are skipped; their events are added to the next result's.
+    Frames that arrive while the program is busy are skipped; their events are added before those of the next result.
+    `recorder`: where all frames are recorded.
     """
-    with Session(source, view, recorder=recorder, history=5.0) as session:
+    with Session(source, view, recorder=recorder, history=_SKIPPED) as session:
+        if recorder is not None:
+            session.record(True)
         last = -1
         while True:
             result = session.newest(last, 0.5)
-            if result is None:
-                if session._finished:
-                    return
-                continue
-            yield result
-            last = result.frame.number
+            if result is not None:
+                yield session.with_events(result, last)
+                last = result.frame.number
+            elif session.ended:
+                return
 
 
 def _size(result: Result) -> int:

@@ -108,7 +108,21 @@ def open_source(
         from jeit.live.simulated import simulated
 
         return simulated(text, rate)
+    kind = text.partition(":")[0]
+    if text == "-" or kind in ("serial", "tcp"):
+        from jeit.live.connections import connection_to
+        from jeit.live.line_source import LineSource
+        from jeit.live.lines import LineReading
+
+        return LineSource(text, connection_to(text), LineReading(description, reference), rate)
     path = Path(text)
+    if path.is_dir():
+        from jeit.live.folder_source import WatchedFolder
+
+        return WatchedFolder(path, description, reference, rate)
     if path.is_file():
         return PlayedRecording(text, read(path, description=description, like=reference), rate)
-    raise ValueError(f"source: there is no file or folder '{text}', and it names no device. Give - for standard input.")
+    raise ValueError(
+        f"source: there is no file or folder '{text[:80]}'. Give one, - for standard input, serial:PORT@BAUD, "
+        "tcp:HOST:PORT, or demo."
+    )

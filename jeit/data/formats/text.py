@@ -73,6 +73,29 @@ _PLAIN = _Way(",", False)
 _WAYS = (_PLAIN, *(_Way(delimiter, comma) for delimiter in (";", "\t", None) for comma in (False, True)))
 
 
+class LineNumbers:
+    """Numbers of lines that come one after another. Separators are found from a line, and kept as long as they fit."""
+
+    def __init__(self):
+        self._way: _Way | None = None
+
+    def __call__(self, line: str) -> list[float] | None:
+        """The numbers of a line, NaN for an empty cell between others; None if the line holds anything else."""
+        found = None if self._way is None else self._of(self._way, line)
+        if found is None:
+            way = _way_of([line])
+            found = self._of(way, line)
+            self._way = self._way if found is None else way
+        return found
+
+    @staticmethod
+    def _of(way: _Way, line: str) -> list[float] | None:
+        try:
+            return [float(cell or "nan") for cell in way.cells(line)] or None
+        except ValueError:
+            return None
+
+
 def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = None) -> Text:
     """The numbers of a text file. `delimiter` and `skip_rows`, the number of lines of a heading, are found out unless
     given.

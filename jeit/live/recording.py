@@ -1,0 +1,283 @@
+"""Recordings of live sessions: frames are written one by one, so that a recording is complete to its last whole frame
+whatever ends it.
+
+A recording is a folder with frames.csv (a line a frame: seconds, then volts; nan without a reading), refused.csv (lines
+that were no frames), events.csv, description.toml (of the sensor) and reference.npz (frames of the
+undisturbed sensor, with its protocol). `jeit stream`, `jeit series` and `jeit touch watch` read frames.csv.
+"""
+
+from __future__ import annotations
+
+import csv
+import errno
+import io
+import os
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jeit.arguments import counted
+from jeit.data import Measurement, write_table
+from jeit.live.pictures import LiveFrame
+
+FRAMES, REFUSED, EVENTS = "frames.csv", "refused.csv", "events.csv"
+REFERENCE, DESCRIPTION = "reference.npz", "description.toml"
+# Memory of frames that wait for a disk that is slow or full, bytes; seconds between trials to write to a full disk; and
+# between the moments at which everything written is on the disk itself.
+_MOST_WAITING, _RETRY, _SYNCHRONISE = 64_000_000, 1.0, 2.0
+# Size of a part of a recording, bytes: a reader needs eight times that, and may have a gigabyte.
+_PART = 100_000_000
+_LEAST_STEP = 1e-6
+_BINARY = getattr(os, "O_BINARY", 0)  # of Windows, which else changes line ends
+
+
+class Recorder:
+    """Writes recordings below `folder`, each into a new folder named by date and time.
+
+    `reference`: a measurement of the undisturbed sensor, which is written beside the frames, with a description that
+    reads them. Frames are written by a thread of their own. If the disk is full, frames wait in memory, 64 MB of them,
+    and are written once there is room again; the file ends with a whole frame at any time.
+    """
+
+    def __init__(self, folder: str | Path, *, reference: Measurement | None = None):
+        self.folder, self.reference = Path(folder), reference
+        self._changed = threading.Condition()
+        self._lines: deque[tuple[str, bytes]] = deque()
+        self._waiting = self._lost = 0
+        self._problem = ""
+        self._into: _Files | None = None
+        self._thread: threading.Thread | None = None
+        self._ending = False
+        self._last = -np.inf
+        self._channels = None if reference is None else reference.num_channels
+        self._first: int | None = None
+
+    def start(self) -> Path:
+        """Begin a recording, unless one is under way, and return its folder. Raises `OSError` if that cannot be
+        made."""
+        if self._into is not None:
+            return self._into.folder
+        folder = _new_folder(self.folder)
+        if self.reference is not None:
+            _write_reference(self.reference, folder)
+        with self._changed:
+            self._into, self._ending, self._problem = _Files(folder), False, ""
+            self._lost = 0
+            self._last, self._first = -np.inf, self._channels
+            self._thread = threading.Thread(target=self._writing, name="jeit live recorder", daemon=True)
+            self._thread.start()
+        return folder
+
+    def stop(self) -> str:
+        """End the recording, wait until all is written, ten seconds at most, and return a sentence about it; an empty
+        one if no recording was under way."""
+        with self._changed:
+            thread, into, self._ending = self._thread, self._into, True
+            self._changed.notify_all()
+        if thread is None or into is None:
+            return ""
+        thread.join(10.0)
+        with self._changed:
+            self._into = self._thread = None
+            lost = self._lost + len(self._lines)
+            self._lines.clear()
+            self._waiting = 0
+        said = f"Recorded: {counted(into.frames, 'frame')} in {into.folder}."
+        return f"{said} Not recorded, for there was no room: {counted(lost, 'line')}." if lost else said
+
+    def add(self, frame: LiveFrame) -> None:
+        """Record a frame; does nothing while no recording is under way."""
+        if self._into is None:
+            return
+        values = frame.values
+        if isinstance(values, str) or values.ndim != 1:
+            self._put(REFUSED, _row(frame.second, str(values)))
+            return
+        if self._first is None:
+            self._first = len(values)
+        if len(values) != self._first or values.dtype.kind not in "iuf":
+            self._put(REFUSED, _row(frame.second, " ".join(map(repr, values.tolist()))))
+            return
+        # A column of times is recognised by its rising.
+        second = max(frame.second, self._last + _LEAST_STEP)
+        self._last = second
+        self._put(FRAMES, f"{second:.6f},{','.join(map(repr, values.astype(float).tolist()))}\n".encode())
+
+    def mark(self, second: float, label: str) -> None:
+        """Record an event."""
+        if self._into is not None:
+            self._put(EVENTS, _row(second, label))
+
+    def renew(self, second: float, frames: np.ndarray) -> None:
+        """Record frames (N, M) of a new reference, beside the first one, and when it was taken."""
+        if self._into is None:
+            return
+        name = f"reference-{second:.3f}s.npy"
+        try:
+            np.save(self._into.folder / name, frames)
+        except OSError as error:
+            self._problem = f"The new reference is not recorded: {error.strerror}."
+            return
+        self.mark(second, f"new reference, {name}")
+
+    def state(self) -> dict[str, Any] | None:
+        """Folder, number of frames and bytes written, and what is wrong, of the recording under way; None without."""
+        with self._changed:
+            into = self._into
+            if into is None:
+                return None
+            return {
+                "folder": str(into.folder),
+                "frames": into.frames,
+                "bytes": into.bytes,
+                "problem": self._problem or None,
+            }
+
+    def _put(self, name: str, line: bytes) -> None:
+        with self._changed:
+            if self._waiting + len(line) > _MOST_WAITING:
+                self._lost += 1
+                self._problem = f"The disk is full or too slow: {counted(self._lost, 'line')} could not be recorded."
+                return
+            self._lines.append((name, line))
+            self._waiting += len(line)
+            self._changed.notify_all()
+
+    def _writing(self) -> None:
+        into = self._into
+        assert into is not None
+        synchronised = time.monotonic()
+        while True:
+            with self._changed:
+                while not self._lines and not self._ending:
+                    self._changed.wait(_SYNCHRONISE)
+                if not self._lines:
+                    break
+                name, line = self._lines[0]
+            try:
+                into.write(name, line)
+            except OSError as error:
+                self._problem = _described(error)
+                with self._changed:
+                    if self._ending:
+                        break
+                    self._changed.wait_for(lambda: self._ending, _RETRY)
+                continue
+            with self._changed:
+                self._lines.popleft()
+                self._waiting -= len(line)
+                if not self._lost:
+                    self._problem = ""
+            if time.monotonic() - synchronised > _SYNCHRONISE:
+                into.synchronise()
+                synchronised = time.monotonic()
+        into.close()
+
+
+class _Files:
+    """The files of a recording, each of which ends with a whole line at any time."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        self.frames = self.bytes = 0
+        self._open: dict[str, int] = {}
+        self._sizes: dict[str, int] = {}
+        self._parts = 1
+
+    def write(self, name: str, line: bytes) -> None:
+        """Write a line whole, or nothing of it. Raises `OSError` if it cannot be written."""
+        if name not in self._open:
+            self._begin(name, line)
+        descriptor, size = self._open[name], self._sizes[name]
+        if name == FRAMES and size > _PART:
+            os.close(descriptor)
+            del self._open[name]
+            self._parts += 1
+            self.write(name, line)
+            return
+        self._append(descriptor, size, line)
+        self._sizes[name] = size + len(line)
+        self.bytes += len(line)
+        self.frames += name == FRAMES
+
+    def _begin(self, name: str, line: bytes) -> None:
+        part = name if self._parts == 1 or name != FRAMES else f"frames-{self._parts}.csv"
+        heading = b"second,text\n"
+        if name == FRAMES:
+            channels = line.count(b",")
+            heading = ("second," + ",".join(f"v{one + 1}" for one in range(channels)) + "\n").encode()
+        descriptor = os.open(self.folder / part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY, 0o644)
+        try:
+            self._append(descriptor, 0, heading)
+        except OSError:
+            os.close(descriptor)
+            raise
+        self._open[name], self._sizes[name] = descriptor, len(heading)
+
+    @staticmethod
+    def _append(descriptor: int, size: int, line: bytes) -> None:
+        """Write a line at the end of a file of that size; if that fails, the file keeps its size."""
+        try:
+            done = os.write(descriptor, line)
+            while done < len(line):
+                done += os.write(descriptor, line[done:])
+        except OSError:
+            with suppress(OSError):
+                os.ftruncate(descriptor, size)
+                os.lseek(descriptor, size, os.SEEK_SET)
+            raise
+
+    def synchronise(self) -> None:
+        """Have all that is written on the disk itself."""
+        for descriptor in self._open.values():
+            with suppress(OSError):
+                os.fsync(descriptor)
+
+    def close(self) -> None:
+        self.synchronise()
+        for descriptor in self._open.values():
+            with suppress(OSError):
+                os.close(descriptor)
+        self._open.clear()
+
+
+def _new_folder(folder: Path) -> Path:
+    """A new folder below `folder`, named by date and time."""
+    folder.mkdir(parents=True, exist_ok=True)
+    name = datetime.now().astimezone().strftime("%Y-%m-%d_%H-%M-%S")
+    for number in range(1, 1000):
+        made = folder / (name if number == 1 else f"{name}_{number}")
+        with suppress(FileExistsError):
+            made.mkdir()
+            return made
+    raise FileExistsError(errno.EEXIST, "there are a thousand recordings of this second", str(folder))
+
+
+def _write_reference(reference: Measurement, folder: Path) -> None:
+    """Write the reference, and a description that reads frames.csv."""
+    try:
+        _, description = write_table(reference, folder / REFERENCE)
+    except ValueError:  # a body that a description cannot express
+        plain = Measurement(reference.voltages, reference.mask, reference.protocol, name=reference.name)
+        _, description = write_table(plain, folder / REFERENCE)
+    text = description.read_text("utf-8")
+    (folder / DESCRIPTION).write_text(text, "utf-8")
+
+
+def _row(second: float, text: str) -> bytes:
+    """A line of a table of times and texts."""
+    written = io.StringIO()
+    csv.writer(written, lineterminator="\n").writerow([f"{second:.6f}", " ".join(text.split())])
+    return written.getvalue().encode("utf-8", "replace")
+
+
+def _described(error: OSError) -> str:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "The disk is full: frames wait in memory until there is room."
+    return f"Frames cannot be written, and wait in memory: {error.strerror or error}."
