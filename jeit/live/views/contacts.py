@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -108,12 +107,8 @@ class ContactsView(AbstractView):
     def _follow(self, second: float, found: list[Contact]) -> None:
         tracker = self._tracker.follow(max(second, self._tracker.time + _STEP), found)
         # Only the last frame of a touch is needed here, whose memory would grow with time.
-        going = tuple(eqx.tree_at(lambda one: one.seen, touch, touch.seen[-1:]) for touch in tracker.open)
-        self._tracker = eqx.tree_at(lambda one: (one.open, one.closed), tracker, (going, ()), is_leaf=_is_tuple)
-
-
-def _is_tuple(one: Any) -> bool:
-    return isinstance(one, tuple)
+        going = tuple(replace(touch, seen=touch.seen[-1:]) for touch in tracker.open)
+        self._tracker = replace(tracker, open=going, closed=())
 
 
 def _noise_of(images: ConductivityView, still: Float[np.ndarray, "N M"]) -> ImageNoise | None:
