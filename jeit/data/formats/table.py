@@ -210,12 +210,13 @@ def measurement_from(
     return measurement if rate is None else measurement.at_rate(rate)
 
 
-def numbers(path: Path, layout: TableLayout) -> np.ndarray:
-    """The numbers of a text or NPY file, arranged as in the file. Raises `ValueError` if it holds anything but
-    numbers."""
+def numbers(path: Path, layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The numbers of a text or NPY file, arranged as in the file, and the names of its columns in the last line of a
+    heading, if it has one. Raises `ValueError` if it holds anything but numbers."""
     if path.suffix.lower() == ".npy":
-        return _voltages(_from_numpy(path, ()), layout, path)
-    return rectangle(read_text(path, layout.delimiter, layout.skip_rows), path.name)
+        return _voltages(_from_numpy(path, ()), layout, path), ()
+    text = read_text(path, layout.delimiter, layout.skip_rows)
+    return rectangle(text, path.name), text.heading
 
 
 def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:
