@@ -75,6 +75,7 @@ class QualityWatch:
                 self._frames.clear()
             self._frames.append(values)
 
+    @np.errstate(all="ignore")  # squares of numbers that are no voltages may overflow
     def look(self) -> Quality:
         """The quality of the latest frames; call it every half a second or so."""
         with self._lock:

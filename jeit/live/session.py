@@ -66,7 +66,8 @@ class Session:
         if reference is None and recorder is not None:
             reference = recorder.reference
         self._watch, self._quality, self._rates = QualityWatch(reference), Quality(), RateWatch()
-        self._length = 0 if reference is None else reference.num_channels
+        self._channels = None if reference is None else reference.num_channels
+        self._length = self._channels or 0
         self._others = 0
         self._changed = threading.Condition()
         self._waiting: deque[LiveFrame] = deque()
@@ -278,8 +279,10 @@ class Session:
         """Keep a frame for the new reference, if one is wanted."""
         if not self._wanted or isinstance(frame.values, str):
             return
-        if self._collected and len(self._collected[0]) != len(frame.values):
+        if self._channels is not None and frame.values.shape != (self._channels,):
             return
+        if self._collected and self._collected[0].shape != frame.values.shape:
+            self._collected = []
         self._collected.append(frame.values)
         if len(self._collected) == self._wanted:
             self._reference, self._wanted, self._collected = np.array(self._collected), 0, []

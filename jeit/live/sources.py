@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from jeit.arguments import describe, is_number
 from jeit.data import Measurement, read
@@ -59,19 +60,25 @@ class AbstractSource(abc.ABC):
 
 
 class PlayedRecording(AbstractSource):
-    """The frames of a measurement at its own rate, at `rate` frames/s, or else at ten frames/s."""
+    """Frames (F, M) of a recording, played at their `times` (F,), seconds, at `rate` frames/s, or else at ten
+    frames/s."""
 
-    def __init__(self, name: str, measurement: Measurement, rate: float | None = None):
+    def __init__(
+        self,
+        name: str,
+        frames: Float[np.ndarray, "F M"],
+        times: Float[np.ndarray, " F"] | None = None,
+        rate: float | None = None,
+    ):
         super().__init__(name)
-        self.frames = frames_of(measurement)
-        times = measurement.times
+        self.frames = np.asarray(frames)
         if rate is None and times is None:
             self.say(f"The recording has no times: it is played at {_USUAL_RATE:g} frames a second; see --rate.")
             rate = _USUAL_RATE
         if rate is not None or times is None:
             self.seconds = np.arange(len(self.frames)) / (rate or _USUAL_RATE)
         else:
-            self.seconds = np.asarray(times) - float(np.asarray(times)[0])
+            self.seconds = np.asarray(times) - float(times[0])
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
@@ -116,12 +123,14 @@ def open_source(
 
         return LineSource(text, connection_to(text), LineReading(description, reference), rate)
     path = Path(text)
-    if path.is_dir():
+    if text and path.is_dir():
         from jeit.live.folder_source import WatchedFolder
 
         return WatchedFolder(path, description, reference, rate)
     if path.is_file():
-        return PlayedRecording(text, read(path, description=description, like=reference), rate)
+        measured = read(path, description=description, like=reference)
+        times = None if measured.times is None else np.asarray(measured.times)
+        return PlayedRecording(text, frames_of(measured), times, rate)
     raise ValueError(
         f"source: there is no file or folder '{text[:80]}'. Give one, - for standard input, serial:PORT@BAUD, "
         "tcp:HOST:PORT, or demo."
