@@ -1,0 +1,84 @@
+"""Simulated sources: their places are where images of their frames have the change, and recordings of them are imaged
+by other commands."""
+
+import csv
+import itertools
+
+import numpy as np
+import pytest
+
+from jeit.cli import main
+from jeit.imaging.stream_preparation import StreamSettings, prepare_imager
+from jeit.inverse import stream
+from jeit.live.recording import Recorder
+from jeit.live.session import Session
+from jeit.live.simulated import simulated, simulated_skin, simulated_tank
+from jeit.mesh import centroids
+from tests.live.small_sensor import Blank
+
+
+@pytest.fixture(scope="module", params=["tank", pytest.param("skin", marks=pytest.mark.slow)])
+def played(request):
+    """A source, its imager with the centroids of its cells, and the sign of its changes."""
+    source = {"tank": simulated_tank, "skin": simulated_skin}[request.param]()
+    imager, calibration = prepare_imager(source.reference, StreamSettings(solver="one-step", num_points=500))
+    sign = {"tank": -1, "skin": 1}[request.param]
+    return source, imager, np.asarray(centroids(calibration.model.mesh)), sign * 1.0
+
+
+def test_the_change_in_an_image_is_where_the_source_says(played):
+    source, imager, cells, sign = played
+    seconds = np.arange(0.01, source.period, source.period / 97)
+    frames = [source._frames[source._state(one)] for one in seconds]
+    images = stream(imager, [source.reference.filled()[0], *frames])
+    touched, background = 0, next(images).conductivity
+    for second, image in zip(seconds, images, strict=True):
+        place = source.truth(second)
+        if place is None:
+            continue
+        touched += 1
+        change = sign * (image.conductivity - background)
+        strong = np.where(change > change.max() / 2, change, 0)
+        assert np.hypot(*(strong @ cells / strong.sum() - place)) < 0.006
+    assert touched > 40
+
+
+def test_it_repeats_itself_and_noise_depends_on_the_seed(played):
+    source = played[0]
+    assert source.truth(0.3) == source.truth(0.3 + source.period)
+    assert source.reference.num_frames == 50
+
+
+def test_frames_come_at_their_rate_and_end_at_the_limit():
+    seconds = [one.second for one in simulated_tank(rate=200, limit=20)]
+    assert len(seconds) == 20
+    np.testing.assert_allclose(seconds, np.arange(20) / 200, atol=0.03)
+    endless = iter(simulated("demo", 500))
+    assert [one.number for one in itertools.islice(endless, 5)] == list(range(5))
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Folder of a recording of the simulated skin: 150 frames in which it is stroked twice, at 60 frames/s."""
+    source = simulated_skin(rate=60, limit=150)
+    recorder = Recorder(tmp_path_factory.mktemp("live"), reference=source.reference)
+    session = Session(source, Blank(), recorder=recorder)
+    session.record(True)
+    folder = recorder.state()["folder"]
+    with session:
+        session.wait()
+    return folder
+
+
+@pytest.mark.slow
+def test_other_commands_image_a_recording(recorded, tmp_path):
+    given = [f"{recorded}/frames.csv", "--reference", f"{recorded}/reference.npz"]
+    main(["stream", *given, "--method", "one-step", "--film", "none", "-o", str(tmp_path / "stream"), "--quiet"])
+    with (tmp_path / "stream" / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 150
+    assert {one["status"] for one in rows} == {"imaged", "unchanged"}
+    seconds = np.array([float(one["second"]) for one in rows]) if "second" in rows[0] else None
+    assert seconds is None or abs(seconds[-1] - 149 / 60) < 0.1
+    main(["series", *given, "-o", str(tmp_path / "series"), "--quiet"])
+    assert (tmp_path / "series").is_dir()
