@@ -178,7 +178,7 @@ class Imager(eqx.Module):
             persistence=persistence,
         )
 
-    def with_reference(self, reference: Float[Array, " M"]) -> "Imager":
+    def with_reference(self, reference: Float[Array | np.ndarray, " M"]) -> "Imager":
         """The same imager for another frame (M,) of the undisturbed body, volts, such as after electrodes were wetted.
 
         Model, noise, hyperparameter and the channels in use stay, so nothing is compiled again. Raises `ValueError` for

@@ -105,11 +105,10 @@ def live(
     from jeit.arguments.extras import need_extra
     from jeit.cli.console import Steps, plain_console
     from jeit.imaging.stream_preparation import StreamSettings
+    from jeit.live.preparation import prepare
     from jeit.live.recording import Recorder
     from jeit.live.server import serve
     from jeit.live.session import Session
-    from jeit.live.sources import open_source
-    from jeit.live.views.choose import first_frames, open_view
 
     need_extra("live", "a page in the browser")
     check_positive({"--untouched": untouched} | ({} if rate is None else {"--rate": rate}))
@@ -124,32 +123,29 @@ def live(
     }
     given = {name: value for name, value in given.items() if value is not None}
     _check_use(given, model, calibration, contacts)
-    with naming_options({"solver": "--method", "max_steps": "--steps"}):
+    with naming_options(_NAMES):
         settings = StreamSettings(**given)
     console = plain_console()
     with Steps(console, quiet=quiet) as step, naming_options(_OPTIONS):
         step("read")
-        base = None
-        if reference is not None:
+        # A reference for a model is plain frames, as `jeit touch predict` reads them.
+        base = reference
+        if reference is not None and model is None:
             base = read_file("--reference", reference, format, description, key=reference_key)
-        frames = open_source(source, rate=rate, description=description, reference=base)
-        base = getattr(frames, "reference", None) if base is None else base
-        still = None
-        if base is None and calibration is None:
-            step(f"undisturbed, for {untouched:g} s")
-            still, frames = first_frames(frames, untouched)
-        view = open_view(
+        ready = prepare(
+            source,
             base,
-            still=still,
             description=description,
             model=model,
             calibration=calibration,
             contacts=contacts,
             settings=settings,
             rate=rate,
+            untouched=untouched,
             progress=step,
         )
-    with Session(frames, view, recorder=Recorder(output, reference=base)) as session:
+    recorder = Recorder(output, reference=ready.reference)
+    with Session(ready.source, ready.view, recorder=recorder) as session:
         if record:
             session.record(True)
         serve(
@@ -164,6 +160,7 @@ def live(
         _say(console, state)
 
 
+_NAMES = {"solver": "--method", "max_steps": "--steps"}
 _OPTIONS = {
     "source": "SOURCE",
     "rate": "--rate",
@@ -177,8 +174,7 @@ _OPTIONS = {
 
 def _check_use(given: dict, model: Path | None, calibration: Path | None, contacts: bool) -> None:
     """Raise `ValueError` for options of images together with a model or microphones, which use none of them."""
-    names = {"solver": "method", "max_steps": "steps"}
-    used = [f"--{names.get(one, one).replace('_', '-')}" for one in given] + ["--contacts"] * contacts
+    used = [_NAMES.get(one, f"--{one.replace('_', '-')}") for one in given] + ["--contacts"] * contacts
     for option, value in (("--model", model), ("--calibration", calibration)):
         if value is not None and used:
             raise ValueError(f"{used[0]} has no use with {option}; leave it out.")
@@ -187,9 +183,8 @@ def _check_use(given: dict, model: Path | None, calibration: Path | None, contac
 def _open(address: str, console, *, browser: bool, quiet: bool) -> None:
     """Print the address of the page, and open it where there is a display."""
     shown = browser and _has_display()
-    if not quiet:
-        hint = "" if shown else "  (open it in a browser)"
-        console.print(f"  {address}{hint}   Ctrl-C ends.", soft_wrap=True)
+    if not (quiet and shown):
+        console.print(f"  {address}" + ("" if shown else "  (open it in a browser)"), soft_wrap=True)
     if shown:
         import threading
         import webbrowser

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -24,7 +24,9 @@ class ConductivityView(AbstractView):
     by noise only.
     """
 
-    def __init__(self, imager: Imager, calibration: Calibration, *, title: str = "Conductivity change", notes=()):
+    def __init__(
+        self, imager: Imager, calibration: Calibration, *, title: str = "Conductivity change", notes: Sequence[str] = ()
+    ):
         """`imager`, `calibration`: as of `jeit.imaging.prepare_imager`; `title`, `notes`: for the page.
 
         Raises `ValueError` for objects of another kind, and for a surface in space, which has no flat image.

@@ -31,7 +31,8 @@ _LEAST_FRAMES = 10
 # Time between two frames with the same time, and seconds for which the name of a gesture stays on the image.
 _STEP, _SHOWN = 1e-6, 1.5
 
-Given, Made = TypeVar("Given"), TypeVar("Made")
+Given = TypeVar("Given")
+Made = TypeVar("Made")
 
 
 class Fed(Generic[Given, Made]):
@@ -83,7 +84,8 @@ class ContactsView(AbstractView):
         background = self.images.background
         markers = tuple(
             Marker(
-                *contact.centroid.tolist(),
+                float(contact.centroid[0]),
+                float(contact.centroid[1]),
                 label=f"{100 * contact.peak / background:+.0f} %",
                 radius=contact.deviation,
                 track=tracks.get(tuple(contact.centroid)),
@@ -172,7 +174,8 @@ class GestureView(AbstractView):
         markers = () if seen.second > self._shown[1] else (self._shown[0],)
         if seen.touched:
             course = self.watch.level.course(np.array([seen.second]), self._sign * change[None])
-            markers = (Marker(*course.centroid[0].tolist(), track=self._number + 1),)
+            x, y = course.centroid[0].tolist()
+            markers = (Marker(x, y, track=self._number + 1),)
         return Picture(self.grid(change), markers, image.status, image.reason, events)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:

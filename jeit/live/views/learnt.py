@@ -159,7 +159,8 @@ def _marker(found: Touches) -> tuple[Marker, ...]:
     if found.force is not None and np.isfinite(found.force[0]):
         std = "" if found.force_std is None else f" ± {found.force_std[0]:.2g}"
         words.insert(0, f"{found.force[0]:.2g}{std} N")
-    return (Marker(*place.tolist(), ", ".join(words), _RADIUS * float(np.sqrt(np.mean(deviation**2)))),)
+    x, y = place.tolist()
+    return (Marker(x, y, ", ".join(words), _RADIUS * float(np.sqrt(np.mean(deviation**2)))),)
 
 
 def _pressed(found: Touches) -> bool:

@@ -48,7 +48,7 @@ class SoundView(AbstractView):
         columns, rows = (max(2, round(side / size)) for side in (high - low).tolist())
         self._localiser = Localiser.create(array, method=method, map_shape=(rows, columns), compiled=False)
         edge = np.asarray(array.surface.outline.loops()[0])
-        places = np.asarray(array.surface.project(np.asarray(array.microphones).T)).T
+        places = np.asarray(array.surface.project(array.microphones.T)).T
         names = [str(one) for one in range(1, len(places) + 1)]
         likely = method == _LIKELIHOOD
         (x_min, y_min), (x_max, y_max) = low.tolist(), high.tolist()
