@@ -15,6 +15,7 @@ NAMES = (
     "optimisers",
     "realtime",
     "soak",
+    "live",
     "hearing",
     "design",
     "contact",

@@ -32,7 +32,8 @@ _FINGER, _HALF, _OFF, _STRENGTH, _STROKE, _PAUSE, _SPAN, _TURNED = 0.008, 0.03, 
 class SimulatedSensor(AbstractSource):
     """Frames of a simulated sensor whose state repeats itself, with Gaussian noise.
 
-    **Attributes**: `reference`: a measurement of the undisturbed sensor; `period`: seconds after which all is repeated.
+    **Attributes**: `reference`: a measurement of the undisturbed sensor; `states` (K, M): voltages of the states of a
+    period without noise, volts; `period`: seconds after which all is repeated.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class SimulatedSensor(AbstractSource):
         number of frames after which the source ends; `seed`: of the noise."""
         super().__init__(name)
         self.reference, self.rate, self.limit, self.period = reference, float(rate), limit, period
-        self._frames, self._places = rest + changes, places
+        self.states, self._places = rest + changes, places
         self._noise = _noise_of(rest)
         self._random = np.random.default_rng(seed)
 
@@ -63,7 +64,7 @@ class SimulatedSensor(AbstractSource):
         return None if np.isnan(x) else (x, y)
 
     def _state(self, second: float) -> int:
-        return int(second / self.period * len(self._frames)) % len(self._frames)
+        return int(second / self.period * len(self.states)) % len(self.states)
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
@@ -72,7 +73,7 @@ class SimulatedSensor(AbstractSource):
             if self.closing.wait(max(0.0, self.begun + number / self.rate - time.monotonic())):
                 break
             arrived = time.monotonic()
-            values = self._frames[self._state(arrived - self.begun)]
+            values = self.states[self._state(arrived - self.begun)]
             yield self.frame(values + self._noise * self._random.standard_normal(values.shape), arrived)
             number += 1
         self.connection = ENDED

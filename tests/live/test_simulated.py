@@ -29,7 +29,7 @@ def played(request):
 def test_the_change_in_an_image_is_where_the_source_says(played):
     source, imager, cells, sign = played
     seconds = np.arange(0.01, source.period, source.period / 97)
-    frames = [source._frames[source._state(one)] for one in seconds]
+    frames = [source.states[source._state(one)] for one in seconds]
     images = stream(imager, [source.reference.filled()[0], *frames])
     touched, background = 0, next(images).conductivity
     for second, image in zip(seconds, images, strict=True):
