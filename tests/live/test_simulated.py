@@ -31,13 +31,13 @@ def test_the_change_in_an_image_is_where_the_source_says(played):
     seconds = np.arange(0.01, source.period, source.period / 97)
     frames = [source.states[source._state(one)] for one in seconds]
     images = stream(imager, [source.reference.filled()[0], *frames])
-    touched, background = 0, next(images).conductivity
+    touched, background = 0, np.asarray(next(images).conductivity)
     for second, image in zip(seconds, images, strict=True):
         place = source.truth(second)
         if place is None:
             continue
         touched += 1
-        change = sign * (image.conductivity - background)
+        change = sign * (np.asarray(image.conductivity) - background)
         strong = np.where(change > change.max() / 2, change, 0)
         assert np.hypot(*(strong @ cells / strong.sum() - place)) < 0.006
     assert touched > 40
@@ -64,10 +64,11 @@ def recorded(tmp_path_factory):
     recorder = Recorder(tmp_path_factory.mktemp("live"), reference=source.reference)
     session = Session(source, Blank(), recorder=recorder)
     session.record(True)
-    folder = recorder.state()["folder"]
+    state = recorder.state()
+    assert state is not None
     with session:
         session.wait()
-    return folder
+    return state["folder"]
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ import pytest
 
 from jeit.data import write_table
 from jeit.live import folder_source, line_source
-from jeit.live.connections import Server, StandardInput, connection_to
+from jeit.live.connections import SerialPort, Server, StandardInput, connection_to
 from jeit.live.folder_source import WatchedFolder
 from jeit.live.line_source import LineSource
 from jeit.live.lines import LineReading
@@ -232,11 +232,15 @@ def test_a_text_that_names_no_source_is_refused_with_advice(text):
 
 def test_addresses_are_taken_apart():
     server = connection_to("tcp:[::1]:5000")
+    assert isinstance(server, Server)
     assert (server.host, server.port) == ("::1", 5000)
     with contextlib.suppress(ImportError):
         device = connection_to("serial:/dev/serial/by-id/usb-A@B@57600")
+        assert isinstance(device, SerialPort)
         assert (device.port, device.baud) == ("/dev/serial/by-id/usb-A@B", 57600)
-        assert connection_to("serial:COM3").baud == 115200
+        other = connection_to("serial:COM3")
+        assert isinstance(other, SerialPort)
+        assert other.baud == 115200
 
 
 @pytest.mark.parametrize("rate", [0, -1, float("nan"), float("inf")])
