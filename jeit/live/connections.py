@@ -75,7 +75,7 @@ class SerialPort(AbstractConnection):
 
     def open(self) -> None:
         try:
-            self.device = self.serial.Serial(self.port, self.baud, timeout=0.2)
+            self.device = self.serial.Serial(self.port, self.baud, timeout=0.2, exclusive=True)
         except ValueError as error:  # a rate that the driver does not know
             raise OSError(str(error)) from None
         except OSError as error:

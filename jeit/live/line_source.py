@@ -10,9 +10,9 @@ from jeit.live.lines import LineBuffer, LineReading
 from jeit.live.pictures import LiveFrame
 from jeit.live.sources import CONNECTED, ENDED, AbstractSource
 
-# Seconds of waiting for bytes at a time, before connecting again (doubled with each failure), and without any byte
-# until that is reported.
-_WAIT, _FIRST_DELAY, _LONGEST_DELAY, _SILENT = 0.2, 0.25, 2.0, 3.0
+# Seconds of waiting for bytes at a time, before connecting again (doubled with each failure), without any byte until
+# that is reported, and between comments of a device that are reported.
+_WAIT, _FIRST_DELAY, _LONGEST_DELAY, _SILENT, _BETWEEN = 0.2, 0.25, 2.0, 3.0, 2.0
 
 
 class LineSource(AbstractSource):
@@ -26,7 +26,7 @@ class LineSource(AbstractSource):
     def __init__(self, name: str, connection: AbstractConnection, reading: LineReading, rate: float | None = None):
         super().__init__(name)
         self.device, self.reading, self.rate = connection, reading, rate
-        self._note = ""
+        self._note, self._noted = "", -float("inf")
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()
@@ -61,7 +61,7 @@ class LineSource(AbstractSource):
 
     def _until_lost(self) -> Iterator[LiveFrame]:
         """Frames until the connection is lost, or the source has ended or is closed."""
-        buffer, last = LineBuffer(), time.monotonic()
+        buffer, last, first = LineBuffer(), time.monotonic(), self.device.lasting
         while not self.closing.is_set():
             try:
                 piece = self.device.read(_WAIT)
@@ -75,7 +75,8 @@ class LineSource(AbstractSource):
             if piece:
                 last, self.connection = arrived, CONNECTED
                 for line in buffer.feed(piece):
-                    yield from self._frames(line, arrived)
+                    yield from self._frames(line, arrived, first=first)
+                    first = False
             elif arrived - last > _SILENT and self.connection == CONNECTED:
                 self.connection = "waiting: the device sends nothing"
                 self.say("The device is connected and sends nothing.")
@@ -91,13 +92,17 @@ class LineSource(AbstractSource):
         elif rest.strip():  # the last line of a file may lack its end
             yield from self._frames(rest, time.monotonic())
 
-    def _frames(self, line: bytes, arrived: float) -> Iterator[LiveFrame]:
+    def _frames(self, line: bytes, arrived: float, *, first: bool = False) -> Iterator[LiveFrame]:
+        """The frame in a line, if there is one. `first`: whether the device may have been in the middle of the line."""
         values = self.reading(line)
-        if self.reading.note and self.reading.note != self._note:
-            self._note = self.reading.note
-            self.say(self._note if values is not None else f"The device sends: {self._note}")
+        note = self.reading.note
+        if note and note != self._note and (values is not None or arrived - self._noted > _BETWEEN):
+            self._note, self._noted = note, arrived
+            self.say(note if values is not None else f"The device sends: {note}")
         if values is None:
             return
+        if first and not isinstance(values, str) and not self.reading.begins_whole(values):
+            values = f"begun before connecting: {line[:200].decode('utf-8', 'replace')}"
         if self.rate is not None:
             due = self.begun + self._number / self.rate
             if self.closing.wait(max(0.0, due - time.monotonic())):

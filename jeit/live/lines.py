@@ -24,8 +24,8 @@ _WORD = re.compile(rb"magnitudes\s{0,40}:", re.IGNORECASE)
 _COMMENTS = ("#", "%", "//")
 # Characters of a line that is no frame, which are kept.
 _KEPT = 400
-# Relative difference from the reference within which a frame shows how numbers are turned into volts; frames that are
-# tried for that.
+# Relative difference from the reference within which a number is whole, and a frame shows how numbers are turned into
+# volts; frames that are tried for that.
 _LIKE, _TRIES = 0.5, 20
 
 
@@ -95,9 +95,18 @@ class LineReading:
         self.timed = layout is None or layout.time_column is not False
         self.note = ""
         self._numbers = LineNumbers()
-        self._factor: np.ndarray | None = None
-        self._tries = 0
+        self._factor, self._tries = np.ones(self.channels or 1), 0
+        self._known: np.ndarray | None = None
 
+    def begins_whole(self, values: np.ndarray) -> bool:
+        """Whether the first number of a frame may be whole: half of a number, with which a line begins if the device
+        was in its middle, differs much from that of the reference. True without a reference."""
+        usual = self._usual()
+        if values.shape != usual.shape or not np.isfinite(usual[0]):
+            return True
+        return bool(abs(values[0] - usual[0]) <= _LIKE * abs(usual[0]))
+
+    @np.errstate(all="ignore")  # numbers that are no voltages may overflow
     def __call__(self, line: bytes) -> Float[np.ndarray, " M"] | str | None:
         """The frame in a line; its text, shortened, if it is no frame; None for a comment."""
         text = line.decode("utf-8", "replace").replace("\x00", "\ufffd").strip()
@@ -117,26 +126,38 @@ class LineReading:
             return row
         return row * self._factors(row, "magnitudes: " if word else "")
 
-    def _factors(self, row: np.ndarray, word: str) -> Float[np.ndarray, " M"] | float:
-        """Volts per number of each channel."""
-        if self._factor is not None:
+    def _factors(self, row: np.ndarray, word: str) -> Float[np.ndarray, " M"]:
+        """Volts per number of each channel. Each frame shows those of the channels that the reader does not mask, until
+        all are known."""
+        if self._tries >= _TRIES:
             return self._factor
         self._tries += 1
-        used = np.isfinite(row) & (row != 0)
-        factor = np.ones(len(row))
-        if used.any():
-            try:
-                volts = self._read(row, word)
-            except ValueError as error:
-                self.note = f"The numbers of a line are taken for volts, for as a file they cannot be read: {error}"
-                volts = row
-                self._tries = _TRIES
-            factor = np.where(used, volts / np.where(used, row, 1.0), np.nan)
-            whole = bool(used.all()) and self._resembles(volts)
-            factor[~used] = np.nanmedian(np.abs(factor))
-            if whole or self._tries >= _TRIES:
-                self._factor = factor
-        return factor
+        used, volts = np.isfinite(row) & (row != 0), row
+        if not used.any():
+            return self._factor
+        try:
+            volts = self._read(row, word)
+        except (ValueError, OSError) as error:  # such as of a full disk
+            self.note = f"The numbers of a line are taken for volts, for as a file they cannot be read: {error}"
+            self._tries = _TRIES
+        found = np.where(used, volts / np.where(used, row, 1.0), np.nan)
+        if self._resembles(volts) or self._tries >= _TRIES:
+            self._known = found if self._known is None else np.where(np.isfinite(self._known), self._known, found)
+            found = self._known
+        if np.isfinite(found).all() and self._known is not None:
+            self._tries = _TRIES
+        self._factor = self._filled(found, row)
+        return self._factor
+
+    def _filled(self, factor: np.ndarray, row: np.ndarray) -> Float[np.ndarray, " M"]:
+        """Factors, with those of the size of the others, and the sign of the reference, for channels not known."""
+        known = np.isfinite(factor)
+        if known.all() or not known.any():
+            return np.where(known, factor, 1.0)
+        sign = np.sign(factor[known][0])
+        if (np.sign(factor[known]) != sign).any() and self.reference is not None:
+            sign = np.sign(np.nan_to_num(self._usual() * row))
+        return np.where(known, factor, sign * np.median(np.abs(factor[known])))
 
     def _read(self, row: np.ndarray, word: str) -> Float[np.ndarray, " M"]:
         """Volts that the reader of files finds in a line."""
@@ -156,9 +177,16 @@ class LineReading:
         """Whether a frame resembles the reference; True if there is none."""
         if self.reference is None:
             return True
-        usual = np.real(np.asarray(self.reference.voltages)).mean(axis=0)
+        usual = self._usual()
         known = np.isfinite(usual) & np.isfinite(volts)
         return bool(np.linalg.norm((volts - usual)[known]) < _LIKE * np.linalg.norm(usual[known]))
+
+    def _usual(self) -> Float[np.ndarray, " M"]:
+        """The mean frame of the reference, NaN for masked channels; empty if there is none."""
+        if self.reference is None:
+            return np.zeros(0)
+        usable = np.asarray(self.reference.mask).all(axis=0)
+        return np.where(usable, np.real(np.asarray(self.reference.voltages)).mean(axis=0), np.nan)
 
 
 def _described(description: str | Path | None, reference: Measurement | None) -> Description | None:

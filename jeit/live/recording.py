@@ -34,6 +34,8 @@ _MOST_WAITING, _RETRY, _SYNCHRONISE = 64_000_000, 1.0, 2.0
 # Size of a part of a recording, bytes: a reader needs eight times that, and may have a gigabyte.
 _PART = 100_000_000
 _LEAST_STEP = 1e-6
+# How names of files of frames begin; frames of another number of channels, one after another, that begin a new part.
+_STEM, _OTHERS = "frames", 3
 _BINARY = getattr(os, "O_BINARY", 0)  # of Windows, which else changes line ends
 
 
@@ -55,8 +57,8 @@ class Recorder:
         self._thread: threading.Thread | None = None
         self._ending = False
         self._last = -np.inf
-        self._channels = None if reference is None else reference.num_channels
-        self._first: int | None = None
+        self._channels = self._width = None if reference is None else reference.num_channels
+        self._others = self._part = self._size = 0
 
     def start(self) -> Path:
         """Begin a recording, unless one is under way, and return its folder. Raises `OSError` if that cannot be
@@ -69,7 +71,10 @@ class Recorder:
         with self._changed:
             self._into, self._ending, self._problem = _Files(folder), False, ""
             self._lost = 0
-            self._last, self._first = -np.inf, self._channels
+            self._last, self._width = -np.inf, self._channels
+            self._others, self._part, self._size = 0, 1, 0
+            self._lines.clear()
+            self._waiting = 0
             self._thread = threading.Thread(target=self._writing, name="jeit live recorder", daemon=True)
             self._thread.start()
         return folder
@@ -99,15 +104,35 @@ class Recorder:
         if isinstance(values, str) or values.ndim != 1:
             self._put(REFUSED, _row(frame.second, str(values)))
             return
-        if self._first is None:
-            self._first = len(values)
-        if len(values) != self._first or values.dtype.kind not in "iuf":
+        if not self._fits(values):
             self._put(REFUSED, _row(frame.second, " ".join(map(repr, values.tolist()))))
             return
         # A column of times is recognised by its rising.
         second = max(frame.second, self._last + _LEAST_STEP)
         self._last = second
-        self._put(FRAMES, f"{second:.6f},{','.join(map(repr, values.astype(float).tolist()))}\n".encode())
+        line = f"{second:.6f},{','.join(map(repr, values.astype(float).tolist()))}\n".encode()
+        if self._size + len(line) > _PART:
+            self._part, self._size = self._part + 1, 0
+        self._size += len(line)
+        self._put(FRAMES if self._part == 1 else f"frames-{self._part}.csv", line)
+
+    def _fits(self, values: np.ndarray) -> bool:
+        """Whether a frame has as many channels as the others. If the sensor is not known, three frames of another
+        number begin a new part."""
+        if values.dtype.kind not in "iuf":
+            return False
+        if self._width is None:
+            self._width = len(values)
+        if len(values) == self._width:
+            self._others = 0
+            return True
+        self._others += 1
+        if self._channels is not None or self._others < _OTHERS:
+            return False
+        if self._size:
+            self._part, self._size = self._part + 1, 0
+        self._width, self._others = len(values), 0
+        return True
 
     def mark(self, second: float, label: str) -> None:
         """Record an event."""
@@ -188,36 +213,30 @@ class _Files:
         self.frames = self.bytes = 0
         self._open: dict[str, int] = {}
         self._sizes: dict[str, int] = {}
-        self._parts = 1
 
     def write(self, name: str, line: bytes) -> None:
         """Write a line whole, or nothing of it. Raises `OSError` if it cannot be written."""
         if name not in self._open:
             self._begin(name, line)
-        descriptor, size = self._open[name], self._sizes[name]
-        if name == FRAMES and size > _PART:
-            os.close(descriptor)
-            del self._open[name]
-            self._parts += 1
-            self.write(name, line)
-            return
-        self._append(descriptor, size, line)
-        self._sizes[name] = size + len(line)
+        self._append(self._open[name], self._sizes[name], line)
+        self._sizes[name] += len(line)
         self.bytes += len(line)
-        self.frames += name == FRAMES
+        self.frames += name.startswith(_STEM)
 
     def _begin(self, name: str, line: bytes) -> None:
-        part = name if self._parts == 1 or name != FRAMES else f"frames-{self._parts}.csv"
+        """Make a file, with its heading."""
         heading = b"second,text\n"
-        if name == FRAMES:
-            channels = line.count(b",")
-            heading = ("second," + ",".join(f"v{one + 1}" for one in range(channels)) + "\n").encode()
-        descriptor = os.open(self.folder / part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY, 0o644)
+        if name.startswith(_STEM):
+            heading = ("second," + ",".join(f"v{one + 1}" for one in range(line.count(b","))) + "\n").encode()
+        descriptor = os.open(self.folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | _BINARY, 0o644)
         try:
             self._append(descriptor, 0, heading)
         except OSError:
             os.close(descriptor)
             raise
+        if name.startswith(_STEM):
+            for part in [one for one in self._open if one.startswith(_STEM)]:
+                os.close(self._open.pop(part))
         self._open[name], self._sizes[name] = descriptor, len(heading)
 
     @staticmethod

@@ -269,7 +269,11 @@ class Session:
 
     def _judging(self) -> None:
         while not self._closed.wait(_LOOK):
-            quality = self._watch.look()
+            try:
+                quality = self._watch.look()
+            except Exception as error:  # a fault here must not be one of the session
+                self.say(f"Noise and electrodes are no longer judged: {type(error).__name__}: {error}")
+                return
             with self._changed:
                 self._quality = quality
             if said := self._rates(self._rate()):

@@ -109,6 +109,16 @@ def test_a_disturbed_first_frame_does_not_fix_signs():
     np.testing.assert_allclose(frame_in(reading, ", ".join(map(repr, frame.tolist())).encode()), frame, rtol=1e-12)
 
 
+def test_a_channel_that_one_frame_shows_wrong_is_known_from_the_next():
+    """Of the first frame the reader masks a channel, and another is zero."""
+    reading, frames = LineReading(None, measured()), noisy(3)
+    first = frames[0].copy()
+    first[[2, 9]] = 0.0, 1e3
+    for values in (first, *frames[1:]):
+        found = frame_in(reading, ", ".join(map(repr, values.tolist())).encode())
+        np.testing.assert_allclose(found, values, rtol=1e-12)
+
+
 GARBAGE = [b"\xff\xfe\x00\x01", b"hello", b"1, 2, x", b"\x00" * 50, b",,,,", "½, 3".encode(), b"-" * 1000, b"1" * 9999]
 
 

@@ -33,6 +33,12 @@ def wait_for(condition, seconds=5.0):
         time.sleep(0.005)
 
 
+def state_of(recorder):
+    state = recorder.state()
+    assert state is not None
+    return state
+
+
 def test_a_recording_is_read_with_its_times_description_and_reference(tmp_path):
     reference = measured()
     recorder, frames = Recorder(tmp_path, reference=reference), noisy(30, seed=2)
@@ -54,7 +60,7 @@ def test_a_recording_is_read_with_its_times_description_and_reference(tmp_path):
         assert not known[4, 7]
         assert known.sum() == frames.size - 1
         np.testing.assert_array_equal(np.asarray(found.voltages)[known], frames[known])
-        np.testing.assert_allclose(found.times, np.arange(30) / 60, atol=1e-6)
+        np.testing.assert_allclose(np.asarray(found.times), np.arange(30) / 60, atol=1e-6)
         assert found.protocol.same_patterns(reference.protocol)
         assert found.electrodes is not None
     with (folder / "events.csv").open() as file:
@@ -73,7 +79,7 @@ def test_the_readers_of_skins_read_it_too(tmp_path):
     recorder.stop()
     found = read_frame_recording(folder / "frames.csv", load_description(folder / "description.toml"))
     np.testing.assert_array_equal(found.frames, frames)
-    np.testing.assert_allclose(found.seconds, np.arange(12) / 60, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(found.seconds), np.arange(12) / 60, atol=1e-6)
 
 
 def test_frames_of_one_moment_have_times_that_rise(tmp_path):
@@ -123,14 +129,14 @@ def test_a_full_disk_leaves_whole_frames_and_the_rest_follows_when_there_is_room
     monkeypatch.setattr(recording, "_RETRY", 0.02)
     for number, values in enumerate(frames):
         recorder.add(frame(number, values))
-    wait_for(lambda: recorder.state()["problem"])
-    assert "full" in recorder.state()["problem"]
+    wait_for(lambda: state_of(recorder)["problem"])
+    assert "full" in state_of(recorder)["problem"]
     content = (folder / "frames.csv").read_bytes()
     assert content == b"" or content.endswith(b"\n")
     assert len(content) <= room
     disk.room = 10**9
-    wait_for(lambda: recorder.state()["frames"] == 20)
-    assert recorder.state()["problem"] is None
+    wait_for(lambda: state_of(recorder)["frames"] == 20)
+    assert state_of(recorder)["problem"] is None
     assert recorder.stop().endswith(f"20 frames in {folder}.")
     rows = np.loadtxt(folder / "frames.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(rows[:, 1:], frames)
@@ -144,7 +150,7 @@ def test_what_finds_no_room_is_counted(tmp_path, monkeypatch):
     for number, values in enumerate(noisy(30)):
         recorder.add(frame(number, values))
     wait_for(lambda: recorder._lost)
-    assert "could not be recorded" in recorder.state()["problem"]
+    assert "could not be recorded" in state_of(recorder)["problem"]
     said = recorder.stop()
     assert "0 frames" in said
     assert "Not recorded, for there was no room: 30 lines" in said
@@ -161,6 +167,21 @@ def test_long_recordings_are_in_parts_that_are_read_alone(tmp_path, monkeypatch)
     found = np.concatenate([read(one).voltages for one in parts if one.exists()])
     assert sum(one.exists() for one in parts) > 3
     np.testing.assert_array_equal(found, frames)
+
+
+PARTS = ("frames.csv", "frames-2.csv", "frames-3.csv")
+
+
+def test_an_unknown_sensor_may_begin_with_half_a_line_and_change_its_channels(tmp_path):
+    recorder, frames = Recorder(tmp_path), noisy(9)
+    folder = recorder.start()
+    for number, values in enumerate([np.zeros(7), *frames[:6], *frames[6:, :30], frames[0], *frames[6:, :30]]):
+        recorder.add(frame(number, values))
+    recorder.stop()
+    refused = (folder / "refused.csv").read_text().splitlines()
+    widths = [np.loadtxt(folder / name, delimiter=",", skiprows=1, ndmin=2).shape for name in PARTS]
+    assert widths == [(1, 8), (4, CHANNELS + 1), (4, 31)]
+    assert len(refused) == 1 + 5
 
 
 def test_a_new_reference_is_kept_beside_the_first(tmp_path):

@@ -10,6 +10,8 @@ import pytest
 from jeit.cli import main
 from jeit.imaging.stream_preparation import StreamSettings, prepare_imager
 from jeit.inverse import stream
+from jeit.live.pictures import LiveFrame
+from jeit.live.quality import QualityWatch
 from jeit.live.recording import Recorder
 from jeit.live.session import Session
 from jeit.live.simulated import simulated, simulated_skin, simulated_tank
@@ -41,6 +43,16 @@ def test_the_change_in_an_image_is_where_the_source_says(played):
         strong = np.where(change > change.max() / 2, change, 0)
         assert np.hypot(*(strong @ cells / strong.sum() - place)) < 0.006
     assert touched > 40
+
+
+def test_no_electrode_of_it_is_dead_or_drifts(played):
+    source = played[0]
+    watch = QualityWatch(source.reference)
+    for second in np.arange(0, 30, 0.5):
+        for number in range(32):
+            watch.add(LiveFrame(number, 0.0, 0.0, source.states[source._state(second + number / 60)]))
+        quality = watch.look()
+        assert not [*quality.dead, *quality.drifting]
 
 
 def test_it_repeats_itself_and_noise_depends_on_the_seed(played):

@@ -122,8 +122,8 @@ def test_a_serial_device_unplugged_and_plugged_in_again(tmp_path):
         assert reading.said("Not connected")
         leader, follower = plug()
         reading.wait(lambda: source.connection == "connected")
-        os.write(leader, line(FRAMES[0]) + line(FRAMES[1]) + line(FRAMES[2])[:40])
-        reading.wait(lambda: len(reading.frames) == 2)
+        os.write(leader, line(FRAMES[4])[4:] + line(FRAMES[0]) + line(FRAMES[1]) + line(FRAMES[2])[:40])
+        reading.wait(lambda: len(reading.frames) == 3)
         os.close(follower)
         name.unlink()
         os.close(leader)
@@ -135,7 +135,8 @@ def test_a_serial_device_unplugged_and_plugged_in_again(tmp_path):
         assert reading.said("Connection lost")
         assert reading.said("Connected")
     np.testing.assert_array_equal(reading.numbers, FRAMES[[0, 1, 3]])
-    (cut,) = reading.texts
+    begun, cut = reading.texts
+    assert begun.startswith("begun before connecting: ")
     assert cut.startswith("cut off: ")
     os.close(leader)
     os.close(follower)
