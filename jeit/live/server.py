@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
 import socket
 import threading
@@ -58,10 +59,8 @@ def serve(
             threading.Thread(target=_stop_at_end, args=(hub, server), daemon=True).start()
         if opened is not None:
             opened(_address(host, listening.getsockname()[1], token))
-        try:
+        with contextlib.suppress(KeyboardInterrupt):
             server.run(sockets=[listening])
-        except KeyboardInterrupt:
-            pass
 
 
 def _stop_at_end(hub: Hub, server: object) -> None:
@@ -71,9 +70,11 @@ def _stop_at_end(hub: Hub, server: object) -> None:
 
 def _listen(host: str, port: int) -> socket.socket:
     """Listen at a host and port, with an error that says what to do."""
+    if not 0 <= port <= 65535:
+        raise OSError(f"port: {port} is none; they go from 1 to 65535, and 0 takes a free one")
     try:
         family, kind, number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    except (socket.gaierror, OverflowError, UnicodeError) as error:
+    except (socket.gaierror, UnicodeError) as error:
         raise OSError(f"cannot listen on {host!r}, port {port}: {error}") from error
     listening = socket.socket(family, kind, number)
     try:

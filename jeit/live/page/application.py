@@ -146,14 +146,12 @@ async def _act(command: Command, hub: Hub) -> tuple[str, str | None]:
     session = hub.session
     try:
         match command:
-            case Reference(do=name, count=count):
+            case Reference(count=count):
                 await asyncio.to_thread(session.take_reference, count)
-            case Mark(do=name, label=label):
+            case Mark(label=label):
                 await asyncio.to_thread(session.mark, label)
-            case Record(do=name, on=on):
+            case Record(on=on):
                 await asyncio.to_thread(session.record, on)
-            case _:
-                raise AssertionError(command)
     except (ValueError, OSError, RuntimeError) as error:
-        return name, str(error)
-    return name, None
+        return type(command).__name__.lower(), str(error)
+    return type(command).__name__.lower(), None

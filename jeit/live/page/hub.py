@@ -10,8 +10,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from jeit.live.pictures import LiveFrame, Picture, Scene
 from jeit.live.page.wire import picture_message, scene_message, to_json
+from jeit.live.pictures import LiveFrame, Picture, Scene
 
 _IN_FLIGHT = 2
 """Pictures sent to a page and not yet drawn: one on its way while another is drawn."""

@@ -1,7 +1,7 @@
 // The image of the body: pixels, outline, electrodes, contacts and their paths, regions, scale bar and colour bar.
 
 import { colourMap, LINES } from "./colours.js";
-import { round125, short, ticks, unitFor } from "./numbers.js";
+import { round, round125, ticks, unitFor } from "./numbers.js";
 import { colour, ColourScale, hides, smooth, widen } from "./pixels.js";
 
 const PATH_SECONDS = 5;
@@ -119,10 +119,11 @@ export class ImageView {
     pen.fillRect(0, 0, this.width, this.height);
     if (!scene) return;
     this.drawPixels();
+    const { lowest, highest, threshold } = this.scale;
+    if (this.drawn !== String([lowest, highest, threshold])) this.drawFixed();
     pen.drawImage(this.fixed, 0, 0, this.width, this.height);
     this.drawRegions();
     if (this.picture) this.drawMarkers();
-    this.drawBar();
     this.drawWords();
   }
 
@@ -167,7 +168,7 @@ export class ImageView {
     return Boolean(this.picture && !this.picture.pixels && this.picture.second - this.shown?.second > STALE_SECONDS);
   }
 
-  // Outline, electrodes and scale bar, which change with the size of the window only.
+  // Outline, electrodes, scale bar and colour bar, which are the same from picture to picture.
   drawFixed() {
     const pen = this.fixed.getContext("2d");
     const { scene, inks, box } = this;
@@ -199,7 +200,9 @@ export class ImageView {
     pen.textAlign = "left";
     pen.textBaseline = "alphabetic";
     const [number, unit] = length >= 1 ? [length, "m"] : [length * 1000, "mm"];
-    pen.fillText(`${short(number, 1)} ${unit}`, x, y - 7);
+    pen.fillText(`${round(number)} ${unit}`, x, y - 7);
+    this.drawBar(pen);
+    this.drawn = String([this.scale.lowest, this.scale.highest, this.scale.threshold]);
   }
 
   // Whether there is room for a name at every electrode.
@@ -329,8 +332,9 @@ export class ImageView {
     }
   }
 
-  drawBar() {
-    const { pen, bar, scale, inks, scene } = this;
+  // The colour bar; its ticks are those of the scale, which changes seldom.
+  drawBar(pen) {
+    const { bar, scale, inks, scene } = this;
     const { factor, unit } = unitFor(Math.max(Math.abs(scale.highest), Math.abs(scale.lowest)), scene.unit);
     const span = scale.highest - scale.lowest;
     for (let row = 0; row < bar.height; row += 1) {
@@ -350,7 +354,7 @@ export class ImageView {
     for (const value of ticks(scale.lowest * factor, scale.highest * factor, bar.height > 240 ? 8 : 4)) {
       const y = bar.y + bar.height * (1 - (value / factor - scale.lowest) / span);
       pen.fillRect(bar.x + bar.width, Math.round(y), 4, 1);
-      pen.fillText(Math.abs(value) < 1e-9 ? "0" : `${Number(value.toPrecision(3))}`.replace("-", "−"), bar.x + bar.width + 7, y);
+      pen.fillText(round(value), bar.x + bar.width + 7, y);
     }
     pen.textAlign = "right";
     pen.textBaseline = "alphabetic";

@@ -41,6 +41,8 @@ function drawNow(now) {
   view.draw();
   if (picture) {
     page.shown = picture;
+    view.canvas.dataset.number = picture.number;
+    view.canvas.dataset.second = picture.second;
     showLimits();
     showAgo();
     if (!picture.past) painted.port2.postMessage(picture.number);

@@ -38,6 +38,9 @@ export function round125(size) {
   return power * [5, 2, 1].find((step) => step * power <= size * (1 + 1e-9));
 }
 
+// A round number as text, such as a tick of an axis.
+export const round = (value) => String(Number(value.toPrecision(3))).replace("-", "−");
+
 // At most `most` round numbers from the lowest to the highest.
 export function ticks(lowest, highest, most = 5) {
   const span = highest - lowest;
@@ -45,7 +48,7 @@ export function ticks(lowest, highest, most = 5) {
   const step = [1, 2, 5, 10].map((part) => part * round125(span / most)).find((one) => span / one <= most);
   const found = [];
   for (let index = Math.ceil(lowest / step - 1e-9); index * step <= highest + 1e-9 * span; index += 1) {
-    found.push(index * step);
+    found.push(index === 0 ? 0 : index * step);
   }
   return found;
 }

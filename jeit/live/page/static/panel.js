@@ -31,7 +31,7 @@ export function showState(state) {
   write("rate", `${short(state.rate)} /s`);
   write("drawn", `${short(state.drawn.rate)} /s`);
   const { latency_median: median, latency_99: worst } = state.drawn;
-  write("latency", median === null ? "–" : `${milliseconds(median).replace(" ms", "")} (99 %: ${milliseconds(worst)})`);
+  write("latency", median === null ? "–" : `${milliseconds(median)} (99 %: ${milliseconds(worst)})`);
   write("dropped", String(state.dropped));
   write("refused", String(state.refused)).dataset.warn = state.refused > 0;
   write("noise", percent(state.noise));
@@ -50,7 +50,7 @@ export function showState(state) {
 }
 
 function showRecording(recording) {
-  const on = Boolean(recording?.folder) && recording.on !== false;
+  const on = Boolean(recording?.folder);
   element("record").setAttribute("aria-pressed", on);
   write("record", on ? "Stop recording" : "Record");
   const target = element("recording");

@@ -1,7 +1,7 @@
 // Values over time as lines: the last half minute, in a canvas.
 
 import { LINES } from "./colours.js";
-import { short, ticks } from "./numbers.js";
+import { round, ticks } from "./numbers.js";
 
 const SPAN = 30;
 const KEPT = 60;
@@ -56,7 +56,7 @@ export class Traces {
       const y = Math.round(toY(value)) + 0.5;
       this.line(faint, [[plot.left, y], [plot.right, y]]);
       pen.fillStyle = ink;
-      pen.fillText(Math.abs(value) < 1e-9 * (highest - lowest) ? "0" : short(Number(value.toPrecision(6)), 2), plot.left - 5, y);
+      pen.fillText(round(value), plot.left - 5, y);
     }
     pen.textBaseline = "alphabetic";
     for (const ago of [30, 20, 10, 0]) {
