@@ -103,8 +103,8 @@ def test_openeit_lines_have_the_volts_of_its_reader(tmp_path):
 
 def test_a_disturbed_first_frame_does_not_fix_signs():
     reading = LineReading(None, measured())
-    first = np.full(CHANNELS, 0.7)
-    reading(", ".join(map(repr, first.tolist())).encode())
+    first = RANDOM.uniform(1e-5, 1e-4, CHANNELS)
+    assert (frame_in(reading, ", ".join(map(repr, first.tolist())).encode()) < 0).any()  # taken for magnitudes
     frame = noisy(1)[0]
     np.testing.assert_allclose(frame_in(reading, ", ".join(map(repr, frame.tolist())).encode()), frame, rtol=1e-12)
 

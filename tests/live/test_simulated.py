@@ -64,7 +64,9 @@ def test_it_repeats_itself_and_noise_depends_on_the_seed(played):
 def test_frames_come_at_their_rate_and_end_at_the_limit():
     seconds = [one.second for one in simulated_tank(rate=200, limit=20)]
     assert len(seconds) == 20
-    np.testing.assert_allclose(seconds, np.arange(20) / 200, atol=0.03)
+    late = np.array(seconds) - np.arange(20) / 200
+    assert late.min() > -1e-3
+    assert np.median(late) < 0.05
     endless = iter(simulated("demo", 500))
     assert [one.number for one in itertools.islice(endless, 5)] == list(range(5))
 
