@@ -24,8 +24,8 @@ pytestmark = [
     pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium"),
 ]
 
-# Where the image is strongest, and the box of the disk, whose unchanged part has the colour of zero: pixels of the
-# canvas; and how many pixels have the colours of the strongest quarter.
+# Where the image is strongest, and the box of the electrodes, which are dark, and of which one is at each end of both
+# axes: pixels of the canvas; and how many pixels have strong colours.
 LOOK = """() => {
   const canvas = document.getElementById("image");
   const { width, height } = canvas;
@@ -39,9 +39,9 @@ LOOK = """() => {
     for (let column = 0; column < right; column += 1) {
       const at = 4 * (row * width + column);
       const [red, green, blue] = [data[at], data[at + 1], data[at + 2]];
-      const inside = Math.max(Math.abs(red - 247), Math.abs(green - 247), Math.abs(blue - 247)) <= 1;
-      columns[column] += inside;
-      rows[row] += inside;
+      const dark = Math.max(red, green, blue) < 80 && row > 30 && row < height - 30;
+      columns[column] += dark;
+      rows[row] += dark;
       const weight = Math.max(0, blue - red - 60);
       x += weight * (column + 0.5); y += weight * (row + 0.5); sum += weight; count += weight > 0;
     }
@@ -125,7 +125,7 @@ def shows(page, number):
 
 
 def place(look, radius=0.1):
-    """Place of the strongest colour, metres, by the box of the disk."""
+    """Place of the strongest colour, metres, by the box of the electrodes."""
     left, right, top, bottom = look["box"]
     scale = 2 * radius / (right - left)
     assert abs((bottom - top) - (right - left)) < 4
@@ -177,12 +177,14 @@ def test_measurement_buttons(serving, open_page):
     address = serving(session)
     page = open_page(address)
     page.wait_for_selector("#image[data-number]")
-    page.fill("#count", "12")
+    page.press("#count", "ControlOrMeta+a")
+    page.type("#count", "12")
     page.click("#reference")
-    page.fill("#label", "<i>rod</i> in")
-    page.click("#mark")
+    page.type("#label", "<i>rod</i> in")
+    page.press("#label", "Enter")
     assert until(lambda: len(session.asked) == 2)
-    page.fill("#label", "")
+    page.press("#label", "ControlOrMeta+a")
+    page.press("#label", "Delete")
     page.click("#image")
     page.keyboard.press("m")
     page.click("#record")
@@ -243,7 +245,8 @@ def test_colours(serving, open_page):
     assert page.input_value("#limit") == "4.00"
     assert text(page, "limit-unit") == "mS/m"
     fitted = page.evaluate(LOOK)
-    page.fill("#limit", "40")
+    page.press("#limit", "ControlOrMeta+a")
+    page.type("#limit", "40")
     page.press("#limit", "Enter")
     assert page.get_attribute("#fit", "aria-pressed") == "false"
     assert until(lambda: page.evaluate(LOOK)["count"] < 0.2 * fitted["count"])
@@ -320,7 +323,7 @@ def test_regions_and_channels_are_followed(serving, open_page):
     assert until(lambda: text(page, "readout").startswith("x 20.0 mm, y 0.0 mm: "))
     page.keyboard.press("Enter")
     assert until(lambda: "B" in text(page, "regions"))
-    page.fill("#channel", "2-3")
+    page.type("#channel", "2-3")
     page.press("#channel", "Enter")
     page.fill("#channel", "7")
     page.press("#channel", "Enter")

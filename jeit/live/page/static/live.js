@@ -195,7 +195,9 @@ element("reference").onclick = () => {
   note(`New reference: the mean of the next ${count} frames. Keep the sensor undisturbed.`);
 };
 element("mark").onclick = () => connection.send({ do: "mark", label: element("label").value.trim() || "event" });
-element("label").onkeydown = ({ key }) => key === "Enter" && element("mark").click();
+element("label").addEventListener("keydown", ({ key }) => {
+  if (key === "Enter") element("mark").click();
+});
 element("record").onclick = () => {
   connection.send({ do: "record", on: element("record").getAttribute("aria-pressed") !== "true" });
 };
