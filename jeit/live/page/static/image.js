@@ -33,7 +33,9 @@ export class ImageView {
   setScene(scene) {
     this.scene = scene;
     this.box = bounds([...scene.outline, ...scene.electrodes], scene.extent);
-    this.scale = new ColourScale(scene.diverging);
+    // A scale that the user chose outlives a lost connection.
+    if (this.scale?.diverging !== scene.diverging || this.unit !== scene.unit) this.scale = new ColourScale(scene.diverging);
+    this.unit = scene.unit;
     this.shown = this.picture = null;
     this.paths.clear();
     this.setTheme(this.theme);

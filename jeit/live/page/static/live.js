@@ -122,6 +122,7 @@ const connection = new Connection({
     write("title", scene.title);
     document.title = `${scene.title} – jeit live`;
     view.setScene(scene);
+    view.scale.threshold = Number(element("threshold").value) / 100;
     list("notes", scene.notes);
     element("channel-names").replaceChildren(...scene.channels.map((name) => new Option(name)));
     redraw();

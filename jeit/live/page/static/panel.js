@@ -43,7 +43,7 @@ export function showState(state) {
   });
   list("messages", state.messages.slice().reverse(), (item, { second, text }) => {
     const time = document.createElement("time");
-    time.textContent = `${short(second, 3)} s`;
+    time.textContent = `${second.toFixed(1)} s`;
     item.append(time, text);
   });
   showRecording(state.recording);
