@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,13 +16,15 @@ from jeit.data import Measurement, load_description, read, read_frame_recording
 from jeit.data.description import Description
 from jeit.imaging.stream_preparation import StreamSettings, described_reference, frames_of
 from jeit.live.pictures import AbstractView, LiveFrame
-from jeit.live.sources import AbstractSource, PlayedRecording, open_source
+from jeit.live.sources import CONNECTED, AbstractSource, PlayedRecording, open_source
 from jeit.live.views.conductivity import ConductivityView
 
 # Files that a folder of a learnt model holds, by kind.
 _NETWORK, _SKIN, _GESTURES = "network.jeit", "skin.skops", "gestures.skops"
 # Fewest frames of an undisturbed sensor, and most of which a reference is made.
 _FEWEST, _MOST = 3, 10_000
+# Seconds between looks at the connection of a source.
+_LOOK = 0.3
 
 
 class Prepared(NamedTuple):
@@ -78,8 +82,7 @@ def prepare(
                 "reference is missing: give a measured file of the undisturbed sensor, or a description, and the first "
                 "frames are the reference."
             )
-        report(f"undisturbed, {untouched:g} s")
-        still, opened = first_frames(opened, untouched)
+        still, opened = first_frames(opened, untouched, report)
         measured = described_reference(described, still)
     else:
         still = frames_of(measured)
@@ -91,12 +94,41 @@ def prepare(
     return Prepared(opened, ContactsView(images, still), measured)
 
 
-def first_frames(source: AbstractSource, seconds: float) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
+def first_frames(
+    source: AbstractSource, seconds: float, report: Callable[[str], None] | None = None
+) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
     """Read the frames of the first `seconds` of a source, and return them with a source of those that follow.
 
-    Frames that are no numbers, or of another length than most, are left out. Raises `ValueError` if fewer than three
-    remain.
+    Frames that are no numbers, or of another length than most, are left out. `report` is called with what is done, and
+    with the reason while a device is waited for. Raises `ValueError` if fewer than three frames remain.
     """
+    with _reporting(source, f"undisturbed, {seconds:g} s", report or (lambda said: None)):
+        return _first_frames(source, seconds)
+
+
+@contextmanager
+def _reporting(source: AbstractSource, task: str, report: Callable[[str], None]) -> Iterator[None]:
+    """Report a task, and whenever the state of the source's connection changes."""
+    done = threading.Event()
+
+    def follow() -> None:
+        said = CONNECTED
+        while not done.wait(_LOOK):
+            if source.connection != said:
+                said = source.connection
+                report(task if said == CONNECTED else said)
+
+    report(task)
+    thread = threading.Thread(target=follow, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def _first_frames(source: AbstractSource, seconds: float) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
     coming, rows = iter(source), []
     begun = None
     for frame in coming:
@@ -179,8 +211,7 @@ def _with_model(
         measured = getattr(opened, "reference", None) if measured is None else measured
         still = frames_of(measured) if still is None and measured is not None else still
     if still is None and not (isinstance(model, LearntSkin) and model.mean_reference is None):
-        report(f"undisturbed, {untouched:g} s")
-        still, opened = first_frames(opened, untouched)
+        still, opened = first_frames(opened, untouched, report)
     if isinstance(model, LearntSkin):
         from jeit.live.views.learnt import LearntSkinView
 
@@ -202,21 +233,22 @@ def _read_model(path: Path):
 
     Raises `ValueError` for a path without any, and for a folder with several.
     """
-    from jeit.touch import GestureModel, read_skin
-    from jeit.touch.networks import read_network
-
-    readers = {_SKIN: read_skin, _GESTURES: GestureModel.read, _NETWORK: read_network}
-    held = [one for one in readers if (path / one).is_file()] if path.is_dir() else []
-    if len(held) > 1:
-        raise ValueError(f"model: '{path}' holds {' and '.join(held)}; give one of these files.")
-    if held:
-        return readers[held[0]](path / held[0])
-    if not path.is_file():
-        raise ValueError(
-            f"model: '{path}' is no folder of 'jeit touch fit', 'jeit touch gestures' or 'jeit learn image'."
-        )
+    if path.is_dir():
+        held = [one for one in (_SKIN, _GESTURES, _NETWORK) if (path / one).is_file()]
+        if len(held) > 1:
+            raise ValueError(f"model: '{path}' holds {' and '.join(held)}; give one of these files.")
+        path = path / held[0] if held else path
+    if not path.is_file() or path.suffix not in (".skops", ".jeit"):
+        made = "'jeit touch fit', 'jeit touch gestures' or 'jeit learn image'"
+        raise ValueError(f"model: '{path}' is neither a folder of {made}, nor a file of such a folder.")
     if path.suffix == ".jeit":
+        from jeit.touch.networks import read_network
+
         return read_network(path)
+    from jeit.touch import GestureModel, read_skin
+
+    if path.name == _GESTURES:
+        return GestureModel.read(path)
     try:
         return read_skin(path)
     except ValueError as error:

@@ -145,9 +145,9 @@ def live(
             progress=step,
         )
     recorder = Recorder(output, reference=ready.reference)
+    if record:
+        recorder.start()
     with Session(ready.source, ready.view, recorder=recorder) as session:
-        if record:
-            session.record(True)
         serve(
             session,
             host=host,
