@@ -16,6 +16,7 @@ NAMES = (
     "realtime",
     "soak",
     "live",
+    "live_page",
     "hearing",
     "design",
     "contact",

@@ -50,6 +50,7 @@ function drawNow(now) {
   if (now - page.tracedAt >= TRACE_PERIOD) {
     page.tracedAt = now;
     drawTraces();
+    if (page.place) showValue();
   }
   showBanner();
 }
@@ -324,16 +325,22 @@ drawWith(view, {
   add: addRegion,
   redraw,
   point(place) {
-    if (!place || !view.scene) {
-      write("readout", "Drag on the image to follow a region; point to read a value.");
-      return;
-    }
-    const value = view.valueAt(place);
-    const { factor, unit } = unitFor(Math.abs(value), view.scene.unit);
-    const [x, y] = place.map((metres) => (1000 * metres).toFixed(1).replace("-", "−"));
-    write("readout", `x ${x} mm, y ${y} mm: ${Number.isNaN(value) ? "outside" : `${short(value * factor)} ${unit}`}`);
+    page.place = place;
+    showValue();
   },
 });
+
+// The value under the mouse or the cross.
+function showValue() {
+  if (!page.place || !view.scene) {
+    write("readout", "Drag on the image to follow a region; point to read a value.");
+    return;
+  }
+  const value = view.valueAt(page.place);
+  const { factor, unit } = unitFor(Math.max(Math.abs(view.scale.highest), Math.abs(view.scale.lowest)), view.scene.unit);
+  const [x, y] = page.place.map((metres) => (1000 * metres).toFixed(1).replace("-", "−"));
+  write("readout", `x ${x} mm, y ${y} mm: ${Number.isNaN(value) ? "outside" : `${short(value * factor)} ${unit}`}`);
+}
 
 // ---- pictures and films ----
 

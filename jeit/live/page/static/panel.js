@@ -31,6 +31,7 @@ export function showState(state) {
   write("rate", `${short(state.rate)} /s`);
   write("drawn", `${short(state.drawn.rate)} /s`);
   const { latency_median: median, latency_99: worst } = state.drawn;
+  Object.assign(element("latency").dataset, { median, worst });
   write("latency", median === null ? "–" : `${milliseconds(median)} (99 %: ${milliseconds(worst)})`);
   write("dropped", String(state.dropped));
   write("refused", String(state.refused)).dataset.warn = state.refused > 0;
