@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -140,13 +141,11 @@ def stream(view: AbstractView, reference, frames: np.ndarray, folder: Path, seco
                 session.newest(-1, 0.05)
             device.stdin.write("go\n")
             device.stdin.flush()
-            memory = []
-            for wait in (seconds / 4, 3 * seconds / 4 - 0.5):
-                try:
-                    device.wait(wait)
-                except subprocess.TimeoutExpired:
-                    memory.append(resident_memory())
+            with suppress(subprocess.TimeoutExpired):
+                device.wait(seconds / 4)
+            memory = [resident_memory()]
             device.wait()
+            memory.append(resident_memory())
             listening.join()
             state = session.state()
             recorded_in = state["recording"]["folder"]

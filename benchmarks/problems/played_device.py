@@ -6,10 +6,12 @@ unplugged the link goes, and when it is plugged in again it names another one.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import struct
 import sys
+import termios
 import time
 import tty
 from pathlib import Path
@@ -17,8 +19,9 @@ from pathlib import Path
 ENTRY = struct.Struct("<id")
 """What is noted of each frame that was sent whole: the number of its line, and `time.monotonic()` after that."""
 FAULTS = ("garbage", "half a line", "another number of channels", "no readings", "twice the rate", "unplugged")
-# Seconds for which the rate is doubled and the device unplugged, and of rest before it is.
-_DOUBLED, _UNPLUGGED, _REST = 2.0, 1.0, 0.1
+# Seconds for which the rate is doubled and the device unplugged, of rest before it is, and for which it then waits for
+# the reader.
+_DOUBLED, _UNPLUGGED, _REST, _PATIENCE = 2.0, 1.0, 0.1, 5.0
 
 
 class _Terminal:
@@ -35,10 +38,17 @@ class _Terminal:
         beside.replace(self.link)
 
     def unplug(self) -> None:
-        """Let it vanish."""
+        """Let it vanish, once all is read: what a device has not sent is not lost."""
+        end = time.monotonic() + _PATIENCE
+        while self._unread() and time.monotonic() < end:
+            time.sleep(1e-3)
         self.link.unlink()
         os.close(self.follower)
         os.close(self.leader)
+
+    def _unread(self) -> int:
+        """Number of bytes that wait for the reader."""
+        return struct.unpack("i", fcntl.ioctl(self.follower, termios.FIONREAD, b"\0" * 4))[0]
 
     def send(self, content: bytes) -> None:
         """Write all of it, as fast as it is read."""
