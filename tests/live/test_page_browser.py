@@ -4,9 +4,12 @@ What is drawn is read from the canvas: the place of a Gaussian and of a rod, whi
 strongest colour; each button, key and field by what it changes. Skipped where there is no browser or no Playwright.
 """
 
+import os
 import shutil
+import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -112,6 +115,11 @@ def until(condition, seconds=5.0):
             return False
         time.sleep(0.02)
     return True
+
+
+def resident_memory():
+    """Memory of this process, bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def drawn(page):
@@ -400,6 +408,32 @@ def test_two_browsers_and_a_sleeper(serving, open_page):
     newest = session.last
     assert until(lambda: drawn(two) > newest, 2.0)
     assert until(lambda: float(text(one, "drawn").removesuffix(" /s")) > 20, 10)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads memory as Linux has it")
+def test_a_browser_asleep_for_a_minute(browser, serving):
+    """A browser that is stopped for a minute costs the session nothing, and shows the newest 3 s after it wakes."""
+    session, processes = StandIn(30.0), browser.new_browser_cdp_session()
+    page = browser.new_context().new_page()
+    page.goto(serving(session))
+    assert until(lambda: drawn(page) > 10, 10)
+    found = processes.send("SystemInfo.getProcessInfo")["processInfo"]
+    renderers = [process["id"] for process in found if process["type"] == "renderer"]
+    before = resident_memory()
+    for pid in renderers:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        time.sleep(60)
+    finally:
+        for pid in renderers:
+            os.kill(pid, signal.SIGCONT)
+    newest = session.last
+    assert newest > 1500
+    assert until(lambda: drawn(page) > newest, 3.0)
+    assert until(lambda: text(page, "connection") == "connected")
+    # The session itself keeps a picture of 64 × 64 for each frame.
+    assert resident_memory() - before < 60e6
+    page.context.close()
 
 
 def test_a_lost_server_is_found_again(browser, serving):
