@@ -89,7 +89,10 @@ class SoundView(AbstractView):
         return Picture(loss.astype(np.float32), self._markers(found), reason=reason)
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
-        """Take the mean of frames (N, M) without a touch as silence, which is subtracted from later frames."""
+        """Take the mean of frames (N, M) without a touch as silence, which is subtracted from later frames.
+
+        Raises `ValueError` for another number of microphones, and if one that is calibrated has no reading.
+        """
         mean = mean_frame(frames)
         if mean.shape != self._silence.shape or not np.isfinite(mean[self.calibration.usable]).all():
             raise ValueError(f"reference: give intensities of all {len(self._silence)} microphones.")
