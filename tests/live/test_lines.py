@@ -9,13 +9,12 @@ from jeit.data import read
 from jeit.live.lines import LineBuffer, LineReading
 from tests.live.small_sensor import CHANNELS, description, measured, noisy
 
-RANDOM = np.random.default_rng(0)
-
 
 def pieces(content, longest):
     """Content in pieces of random length."""
+    random = np.random.default_rng(0)
     while content:
-        size = int(RANDOM.integers(1, longest + 1))
+        size = int(random.integers(1, longest + 1))
         yield content[:size]
         content = content[size:]
 
@@ -84,7 +83,7 @@ def test_a_line_has_the_volts_that_the_reader_finds_in_a_file(kind, tmp_path):
 
 
 def test_openeit_lines_have_the_volts_of_its_reader(tmp_path):
-    values = RANDOM.uniform(100, 900, 192).round(3)
+    values = np.random.default_rng(0).uniform(100, 900, 192).round(3)
     values[5] = 0
     line = "magnitudes : " + ", ".join(map(str, values.tolist())) + "\n"
     (tmp_path / "openeit.txt").write_text(line)
@@ -103,7 +102,7 @@ def test_openeit_lines_have_the_volts_of_its_reader(tmp_path):
 
 def test_a_disturbed_first_frame_does_not_fix_signs():
     reading = LineReading(None, measured())
-    first = RANDOM.uniform(1e-5, 1e-4, CHANNELS)
+    first = np.random.default_rng(0).uniform(1e-3, 1e-2, CHANNELS)
     assert (frame_in(reading, ", ".join(map(repr, first.tolist())).encode()) < 0).any()  # taken for magnitudes
     frame = noisy(1)[0]
     np.testing.assert_allclose(frame_in(reading, ", ".join(map(repr, frame.tolist())).encode()), frame, rtol=1e-12)
@@ -127,6 +126,46 @@ def test_garbage_is_text_or_numbers_of_another_number(line):
     found = LineReading(None, measured())(line)
     assert found is not None
     assert len(found) <= 400 if isinstance(found, str) else len(found) != CHANNELS
+
+
+def spoilt(content, random):
+    """Content with some bytes changed, left out, repeated, or numbers made huge."""
+    content = bytearray(content)
+    for _ in range(int(random.integers(1, 6))):
+        place = int(random.integers(len(content)))
+        kind = int(random.integers(5))
+        if kind == 0:
+            content[place] = int(random.integers(256))
+        elif kind == 1:
+            del content[place : place + int(random.integers(1, 200))]
+        elif kind == 2:
+            content[place:place] = random.bytes(int(random.integers(1, 50)))
+        elif kind == 3:
+            content[place:place] = random.choice(
+                [b"e308", b"e999", b"nan", b"inf", b"-", b"_", b"magnitudes:", b"\x00"]
+            )
+        else:
+            content[place:place] = content[: int(random.integers(1, 100))]
+        content = content or bytearray(b"x")
+    return bytes(content)
+
+
+@pytest.mark.parametrize("word", ["", "magnitudes : "])
+def test_spoilt_lines_are_frames_or_text_and_leave_whole_ones_right(word):
+    """Half of the lines are spoilt at random, from the first on."""
+    reading, buffer, random = LineReading(None, measured()), LineBuffer(5000), np.random.default_rng(0)
+    frames, right = noisy(400), 0
+    for number, values in enumerate(frames):
+        line = (word + ", ".join(map(repr, (abs(values) if word else values).tolist()))).encode()
+        whole = number % 2 == 1
+        for one in buffer.feed((line if whole else spoilt(line, random)) + b"\n"):
+            found = reading(one)
+            assert found is None or (len(found) <= 400 if isinstance(found, str) else found.ndim == 1)
+            if whole and number > 50:
+                assert isinstance(found, np.ndarray)
+                np.testing.assert_allclose(found, values, rtol=1e-12)
+                right += 1
+    assert right == 175
 
 
 def test_gaps_and_words_of_no_number_become_nan_and_comments_notes():
