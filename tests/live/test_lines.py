@@ -4,10 +4,10 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from small_sensor import CHANNELS, description, measured, noisy
 
 from jeit.data import read
 from jeit.live.lines import LineBuffer, LineReading
-from tests.live.small_sensor import CHANNELS, description, measured, noisy
 
 
 def pieces(content, longest):

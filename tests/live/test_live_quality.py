@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from small_sensor import CHANNELS, NOISE, PROTOCOL, measured, noisy, rest
 
 from jeit.live.pictures import LiveFrame
 from jeit.live.quality import Quality, QualityWatch, RateWatch
-from tests.live.small_sensor import CHANNELS, NOISE, PROTOCOL, measured, noisy, rest
 
 
 def looked(frames, watch=None, times=1):

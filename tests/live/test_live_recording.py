@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_sensor import CHANNELS, measured, noisy
 
 from jeit.data import load_description, read, read_frame_recording
 from jeit.live import recording
 from jeit.live.pictures import LiveFrame
 from jeit.live.recording import Recorder
-from tests.live.small_sensor import CHANNELS, measured, noisy
 
-ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).resolve().parent
 
 
 def frame(number, values, second=None):
@@ -197,7 +197,7 @@ KILLED = """
 import sys, time
 import numpy as np
 sys.path.insert(0, sys.argv[2])
-from tests.live.small_sensor import measured, noisy
+from small_sensor import measured, noisy
 from jeit.live.pictures import LiveFrame
 from jeit.live.recording import Recorder
 recorder = Recorder(sys.argv[1], reference=measured())
@@ -218,7 +218,7 @@ while True:
 def test_a_killed_process_leaves_all_whole_frames(tmp_path):
     """The process reports how many frames are written; at least as many are read, all of them right."""
     with subprocess.Popen(
-        [sys.executable, "-c", KILLED, str(tmp_path), str(ROOT)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", KILLED, str(tmp_path), str(HERE)], stdout=subprocess.PIPE, text=True
     ) as process:
         assert process.stdout is not None
         folder, written = Path(process.stdout.readline().strip()), 0

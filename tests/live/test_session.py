@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_sensor import CHANNELS, Blank, measured, noisy
 
 from jeit.data import read
 from jeit.inverse.streaming.stream import FrameStatus
@@ -15,7 +16,6 @@ from jeit.live.pictures import Picture
 from jeit.live.recording import Recorder
 from jeit.live.session import Session, frames
 from jeit.live.sources import ENDED, AbstractSource
-from tests.live.small_sensor import CHANNELS, Blank, measured, noisy
 
 
 class Given(AbstractSource):

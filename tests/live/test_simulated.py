@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
+from small_sensor import Blank
 
 from jeit.cli import main
 from jeit.imaging.stream_preparation import StreamSettings, prepare_imager
@@ -16,7 +17,6 @@ from jeit.live.recording import Recorder
 from jeit.live.session import Session
 from jeit.live.simulated import simulated, simulated_skin, simulated_tank
 from jeit.mesh import centroids
-from tests.live.small_sensor import Blank
 
 
 @pytest.fixture(scope="module", params=["tank", pytest.param("skin", marks=pytest.mark.slow)])

@@ -8,6 +8,7 @@ import time
 
 import numpy as np
 import pytest
+from small_sensor import CHANNELS, measured, noisy
 
 from jeit.data import write_table
 from jeit.live import folder_source, line_source
@@ -16,7 +17,6 @@ from jeit.live.folder_source import WatchedFolder
 from jeit.live.line_source import LineSource
 from jeit.live.lines import LineReading
 from jeit.live.sources import PlayedRecording, open_source
-from tests.live.small_sensor import CHANNELS, measured, noisy
 
 FRAMES = noisy(12)
 posix = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals and pipes of POSIX")
