@@ -197,8 +197,9 @@ element("reference").onclick = () => {
   note(`New reference: the mean of the next ${count} frames. Keep the sensor undisturbed.`);
 };
 element("mark").onclick = () => connection.send({ do: "mark", label: element("label").value.trim() || "event" });
-element("label").addEventListener("keydown", ({ key }) => {
+element("label").addEventListener("keydown", ({ key, target }) => {
   if (key === "Enter") element("mark").click();
+  if (key === "Enter" || key === "Escape") target.blur();
 });
 element("record").onclick = () => {
   connection.send({ do: "record", on: element("record").getAttribute("aria-pressed") !== "true" });
