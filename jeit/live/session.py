@@ -368,10 +368,10 @@ def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | N
     Frames that arrive while the program is busy are skipped; their events are added before those of the next result.
     `recorder`: where all frames are recorded.
     """
-    with Session(source, view, recorder=recorder, history=_SKIPPED) as session:
-        if recorder is not None:
-            session.record(True)
-        last = -1
+    session, last = Session(source, view, recorder=recorder, history=_SKIPPED), -1
+    if recorder is not None:
+        session.record(True)
+    with session:
         while True:
             result = session.newest(last, 0.5)
             if result is not None:

@@ -233,12 +233,12 @@ def test_stopping_ends_a_source_that_waits():
     assert time.monotonic() - start < 10.0
 
 
-def test_a_program_gets_the_newest_results_and_every_event():
+def test_a_program_gets_the_newest_results_and_every_event(tmp_path):
     def name(frame):
         return Picture(None, events=(f"gesture {frame.number}",) if frame.number % 7 == 3 else ())
 
     numbers, events = [], []
-    for result in frames(Given(noisy(80), pause=2e-3), Blank(name)):
+    for result in frames(Given(noisy(80), pause=2e-3), Blank(name), recorder=Recorder(tmp_path)):
         numbers.append(result.frame.number)
         events += result.picture.events
         time.sleep(0.02)
@@ -246,3 +246,5 @@ def test_a_program_gets_the_newest_results_and_every_event():
     assert len(numbers) < 40
     assert numbers[-1] == 79
     assert events == [f"gesture {one}" for one in range(3, 80, 7)]
+    (recorded,) = tmp_path.glob("*/frames.csv")
+    assert len(recorded.read_text().splitlines()) == 81
