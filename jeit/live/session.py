@@ -341,7 +341,7 @@ class Session:
             self._results.append(result)
             self._bytes += _size(result)
             oldest = result.frame.arrived - self.history
-            while self._bytes > _MOST_BYTES or self._results[0].frame.arrived < oldest:
+            while len(self._results) > 1 and (self._bytes > _MOST_BYTES or self._results[0].frame.arrived < oldest):
                 self._bytes -= _size(self._results.popleft())
             if result.picture.status == FrameStatus.REFUSED:
                 self._refused += 1

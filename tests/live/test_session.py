@@ -172,6 +172,10 @@ def test_results_are_kept_for_their_time_and_in_their_memory(monkeypatch):
     with Session(Given(noisy(60)), Blank(lambda frame: Picture(pixels))) as session:
         session.wait()
         assert 5 < len(session._results) <= 12
+    monkeypatch.setattr(session_module, "_MOST_BYTES", 10)
+    with Session(Given(noisy(5)), Blank(lambda frame: Picture(pixels))) as session:
+        session.wait()
+        assert [one.frame.number for one in session._results] == [4]
 
 
 def test_a_new_reference_is_the_next_frames_and_goes_into_the_recording(tmp_path):
