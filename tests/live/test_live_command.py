@@ -2,7 +2,12 @@
 does not fit. The page itself is not served here."""
 
 import json
+import re
+import signal
+import socket
+import subprocess
 import sys
+import urllib.request
 from types import SimpleNamespace
 
 import numpy as np
@@ -207,3 +212,36 @@ def test_a_browser_opens_where_there_is_a_display(monkeypatch, served, run, file
     _, output, _ = run(*given)
     assert ("open it in a browser" in output) != shown
     assert opened == ["http://127.0.0.1:1/"] * shown
+
+
+def test_a_port_that_is_taken_is_named(run, files):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        given = ("live", files / "frames.csv", "--reference", files / "rest.npz", "--method", "one-step", "--rate", 500)
+        status, _, error = run(*given, "--port", port, "--quiet")
+    assert status == 1
+    assert f"port {port} is taken" in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sent", "exits"), [(signal.SIGINT, 0), (signal.SIGTERM, 128 + signal.SIGTERM)])
+def test_a_process_serves_the_page_until_it_is_stopped(tmp_path, sent, exits):
+    """By Ctrl-C or SIGTERM; it prints its counters, and the recording has every frame read."""
+    command = [sys.executable, "-m", "jeit", "live", "demo", "--record", "--output", str(tmp_path / "out")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        try:
+            address = next(found for line in process.stdout if (found := re.search(r"http://\S+", line)))[0]
+            with urllib.request.urlopen(address, timeout=30) as page:
+                assert b"jeit live" in page.read()
+            process.send_signal(sent)
+            rest = process.stdout.read()
+            status = process.wait(30)
+        finally:
+            process.kill()
+        assert (status, process.stderr.read()) == (exits, "")
+    (folder,) = (tmp_path / "out").iterdir()
+    recorded = len((folder / "frames.csv").read_text().splitlines()) - 1
+    assert f"{recorded} frames:" in rest

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -61,7 +65,10 @@ def live(
     ] = None,
     contacts: Annotated[bool, typer.Option("--contacts", help="Find contacts, and show their paths.")] = False,
     method: Annotated[
-        str | None, typer.Option(help="gauss-newton (default), levenberg-marquardt, or one-step for linear images.")
+        str | None,
+        typer.Option(
+            help="gauss-newton (default), levenberg-marquardt, or one-step for linear images (default of demo)."
+        ),
     ] = None,
     hyperparameter: Annotated[
         str | None,
@@ -123,6 +130,8 @@ def live(
     }
     given = {name: value for name, value in given.items() if value is not None}
     _check_use(given, model, calibration, contacts)
+    if source.partition(":")[0] == "demo" and steps is None:
+        given.setdefault("solver", "one-step")  # compiles in half the time
     with naming_options(_NAMES):
         settings = StreamSettings(**given)
     console = plain_console()
@@ -147,17 +156,39 @@ def live(
     recorder = Recorder(output, reference=ready.reference)
     if record:
         recorder.start()
-    with Session(ready.source, ready.view, recorder=recorder) as session:
-        serve(
-            session,
-            host=host,
-            port=port,
-            stay=not until_end,
-            opened=lambda address: _open(address, console, browser=not no_browser, quiet=quiet),
-        )
+    with _terminated() as terminated:
+        with Session(ready.source, ready.view, recorder=recorder) as session:
+            serve(
+                session,
+                host=host,
+                port=port,
+                stay=not until_end,
+                opened=lambda address: _open(address, console, browser=not no_browser, quiet=quiet),
+            )
         state = session.state()
     if not quiet:
         _say(console, state)
+    if terminated:
+        raise typer.Exit(128 + signal.SIGTERM)
+
+
+@contextmanager
+def _terminated() -> Iterator[list[int]]:
+    """Let SIGTERM end what runs as Ctrl-C does, and collect it."""
+    got: list[int] = []
+
+    def stop(number: int, _) -> None:
+        got.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield got
+        return
+    earlier = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield got
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
 
 
 _NAMES = {"solver": "--method", "max_steps": "--steps"}
@@ -186,7 +217,6 @@ def _open(address: str, console, *, browser: bool, quiet: bool) -> None:
     if not (quiet and shown):
         console.print(f"  {address}" + ("" if shown else "  (open it in a browser)"), soft_wrap=True)
     if shown:
-        import threading
         import webbrowser
 
         # Some browsers return only when their window is closed.
