@@ -10,6 +10,7 @@ from collections.abc import Callable
 from ipaddress import ip_address
 from urllib.parse import quote
 
+from jeit.arguments.extras import need_extra
 from jeit.live.page.hub import AbstractSession, Hub
 
 
@@ -28,8 +29,9 @@ def serve(
     host that other machines reach. `opened` is called with the page's address once it can be opened. `stay`: stay until
     Ctrl-C when the session has ended, so that its last minute can be looked at.
 
-    Raises `OSError` if the address is taken or not this machine's, and `ModuleNotFoundError` without the extra `live`.
+    Raises `OSError` if the address is taken or not this machine's, and `ImportError` without the extra `live`.
     """
+    need_extra("live", "a page in the browser")
     import uvicorn
 
     from jeit.live.page.application import make_application
