@@ -221,14 +221,22 @@ export class ImageView {
     const drifts = this.drifting.includes(name);
     const points = curve.map(this.toCanvas);
     const middle = [0, 1].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
-    pen.strokeStyle = dead || drifts ? this.inks.warn : this.inks.ink;
-    pen.lineWidth = 5;
-    pen.beginPath();
-    this.curve(pen, curve, false);
-    pen.stroke();
+    // Discs lie on the image, whose colours may be dark or light: they get a light or dark rim.
+    const disc = Math.hypot(points[0][0] - points.at(-1)[0], points[0][1] - points.at(-1)[1]) < 2;
+    for (const [ink, line] of [[this.inks.paper, disc ? 8 : 0], [dead || drifts ? this.inks.warn : this.inks.ink, 5]]) {
+      if (!line) continue;
+      pen.strokeStyle = ink;
+      pen.lineWidth = line;
+      pen.beginPath();
+      this.curve(pen, curve, false);
+      pen.stroke();
+      pen.fillStyle = ink;
+      if (disc) pen.fill();
+    }
     const away = [middle[0] - centre[0], middle[1] - centre[1]];
     const distance = Math.hypot(...away) || 1;
-    const at = [0, 1].map((axis) => middle[axis] + (15 * away[axis]) / distance);
+    const above = Math.max(...points.map(([, y]) => middle[1] - y)) + 13;
+    const at = disc ? [middle[0], middle[1] - above] : [0, 1].map((axis) => middle[axis] + (15 * away[axis]) / distance);
     pen.lineWidth = 2.5;
     if (dead) {
       pen.beginPath();
@@ -249,10 +257,9 @@ export class ImageView {
     }
     if (!name || !(named || dead || drifts)) return;
     pen.font = this.font(12, dead || drifts ? "bold" : "");
-    pen.fillStyle = dead || drifts ? this.inks.warn : this.inks.faint;
     pen.textAlign = "center";
     pen.textBaseline = "middle";
-    pen.fillText(name, ...at);
+    this.halo(name, ...at, dead || drifts ? this.inks.warn : disc ? this.inks.ink : this.inks.faint, pen);
   }
 
   drawRegions() {
@@ -285,8 +292,7 @@ export class ImageView {
     pen.stroke();
   }
 
-  halo(text, x, y, ink) {
-    const { pen } = this;
+  halo(text, x, y, ink, pen = this.pen) {
     pen.lineWidth = 4;
     pen.lineJoin = "round";
     pen.strokeStyle = this.inks.paper;

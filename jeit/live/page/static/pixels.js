@@ -124,11 +124,12 @@ export class ColourScale {
       }
     } else {
       const span = this.highest - this.lowest;
-      const within = this.trough >= this.lowest && this.peak <= this.highest;
+      const within = this.trough >= this.lowest - 0.1 * span && this.peak <= this.highest;
       if (first || !within || this.peak - this.trough < 0.6 * span) {
+        const fromZero = this.peak > 0 && this.trough > -0.1 * this.peak && this.trough < 0.3 * this.peak;
         const pad = 0.05 * (this.peak - this.trough) || 0.5 * Math.abs(this.peak) || 1;
-        this.lowest = this.trough >= 0 && this.trough < 0.3 * this.peak ? 0 : this.trough - pad;
-        this.highest = this.peak + pad;
+        this.lowest = fromZero ? 0 : this.trough - pad;
+        this.highest = fromZero ? rounded(this.peak) : this.peak + pad;
       }
     }
   }
