@@ -28,12 +28,11 @@ from jeit.live.pictures import LiveFrame
 
 FRAMES, REFUSED, EVENTS = "frames.csv", "refused.csv", "events.csv"
 REFERENCE, DESCRIPTION = "reference.npz", "description.toml"
-# Memory of frames that wait for a disk that is slow or full, bytes; seconds between trials to write to a full disk; and
-# between the moments at which everything written is on the disk itself.
-_MOST_WAITING, _RETRY, _SYNCHRONISE = 64_000_000, 1.0, 2.0
+# Memory of frames that wait for a disk that is slow or full, bytes; seconds between trials to write to a full disk,
+# between the moments at which everything written is on the disk itself, and for which the end of a recording waits.
+_MOST_WAITING, _RETRY, _SYNCHRONISE, _LONGEST_END = 64_000_000, 1.0, 2.0, 10.0
 # Size of a part of a recording, bytes: a reader needs eight times that, and may have a gigabyte.
 _PART = 100_000_000
-_LEAST_STEP = 1e-6
 # How names of files of frames begin; frames of another number of channels, one after another, that begin a new part.
 _STEM, _OTHERS = "frames", 3
 _BINARY = getattr(os, "O_BINARY", 0)  # of Windows, which else changes line ends
@@ -56,7 +55,7 @@ class Recorder:
         self._into: _Files | None = None
         self._thread: threading.Thread | None = None
         self._ending = False
-        self._last = -np.inf
+        self._last = -1
         self._channels = self._width = None if reference is None else reference.num_channels
         self._others = self._part = self._size = 0
 
@@ -71,11 +70,13 @@ class Recorder:
         with self._changed:
             self._into, self._ending, self._problem = _Files(folder), False, ""
             self._lost = 0
-            self._last, self._width = -np.inf, self._channels
+            self._last, self._width = -1, self._channels
             self._others, self._part, self._size = 0, 1, 0
             self._lines.clear()
             self._waiting = 0
-            self._thread = threading.Thread(target=self._writing, name="jeit live recorder", daemon=True)
+            self._thread = threading.Thread(
+                target=self._writing, args=(self._into,), name="jeit live recorder", daemon=True
+            )
             self._thread.start()
         return folder
 
@@ -87,7 +88,7 @@ class Recorder:
             self._changed.notify_all()
         if thread is None or into is None:
             return ""
-        thread.join(10.0)
+        thread.join(_LONGEST_END)
         with self._changed:
             self._into = self._thread = None
             lost = self._lost + len(self._lines)
@@ -107,10 +108,9 @@ class Recorder:
         if not self._fits(values):
             self._put(REFUSED, _row(frame.second, " ".join(map(repr, values.tolist()))))
             return
-        # A column of times is recognised by its rising.
-        second = max(frame.second, self._last + _LEAST_STEP)
-        self._last = second
-        line = f"{second:.6f},{','.join(map(repr, values.astype(float).tolist()))}\n".encode()
+        # A column of times is recognised by its rising, here by a microsecond at least.
+        self._last = max(round(1e6 * frame.second), self._last + 1)
+        line = f"{self._last / 1e6:.6f},{','.join(map(repr, values.astype(float).tolist()))}\n".encode()
         if self._size + len(line) > _PART:
             self._part, self._size = self._part + 1, 0
         self._size += len(line)
@@ -174,35 +174,41 @@ class Recorder:
             self._waiting += len(line)
             self._changed.notify_all()
 
-    def _writing(self) -> None:
-        into = self._into
-        assert into is not None
+    def _writing(self, into: _Files) -> None:
         synchronised = time.monotonic()
-        while True:
-            with self._changed:
-                while not self._lines and not self._ending:
-                    self._changed.wait(_SYNCHRONISE)
-                if not self._lines:
-                    break
-                name, line = self._lines[0]
+        while (waiting := self._next(into)) is not None:
             try:
-                into.write(name, line)
+                into.write(*waiting)
             except OSError as error:
-                self._problem = _described(error)
                 with self._changed:
-                    if self._ending:
+                    if self._ends(into):
                         break
-                    self._changed.wait_for(lambda: self._ending, _RETRY)
+                    self._problem = _described(error)
+                    self._changed.wait_for(lambda: self._ends(into), _RETRY)
                 continue
             with self._changed:
+                if self._into is not into:  # it took so long that the recording was given up
+                    break
                 self._lines.popleft()
-                self._waiting -= len(line)
+                self._waiting -= len(waiting[1])
                 if not self._lost:
                     self._problem = ""
             if time.monotonic() - synchronised > _SYNCHRONISE:
                 into.synchronise()
                 synchronised = time.monotonic()
         into.close()
+
+    def _next(self, into: _Files) -> tuple[str, bytes] | None:
+        """Wait for a line to write, which stays the first in the queue; None once the recording ends."""
+        with self._changed:
+            while not self._lines or self._into is not into:
+                if self._ends(into):
+                    return None
+                self._changed.wait(_SYNCHRONISE)
+            return self._lines[0]
+
+    def _ends(self, into: _Files) -> bool:
+        return self._ending or self._into is not into
 
 
 class _Files:

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -82,11 +83,38 @@ def test_the_readers_of_skins_read_it_too(tmp_path):
     np.testing.assert_allclose(np.asarray(found.seconds), np.arange(12) / 60, atol=1e-6)
 
 
+def test_a_recording_that_was_cut_off_anywhere_in_a_line_is_read_to_the_frame_before(tmp_path):
+    """As a process is that is killed while the system copies a line that lies on two pages."""
+    recorder, frames = Recorder(tmp_path, reference=measured()), noisy(4)
+    frames[3, -1] = np.nan
+    folder = recorder.start()
+    for number, values in enumerate(frames):
+        recorder.add(frame(number, values))
+    recorder.stop()
+    content, described = (folder / "frames.csv").read_bytes(), load_description(folder / "description.toml")
+    whole = content[:-1].rindex(b"\n") + 1
+    for end in (
+        whole + 1,
+        whole + 9,
+        whole + 60,
+        len(content) - 40,
+        len(content) - 3,
+        len(content) - 2,
+        len(content) - 1,
+    ):
+        (folder / "frames.csv").write_bytes(content[:end])
+        found = np.asarray(read(folder / "frames.csv").voltages)
+        assert len(found) in (3, 4)
+        np.testing.assert_array_equal(found[:3], frames[:3])
+        np.testing.assert_array_equal(read_frame_recording(folder / "frames.csv", described).frames[:3], frames[:3])
+
+
 def test_frames_of_one_moment_have_times_that_rise(tmp_path):
     recorder = Recorder(tmp_path, reference=measured())
     folder = recorder.start()
-    for number, values in enumerate(noisy(5)):
-        recorder.add(frame(number, values, second=1.0))
+    seconds = 1.0 + np.array([0, 0, 4e-7, 5e-7, 1.4e-6, 1.5e-6, 1.5e-6, 3e-6])
+    for number, values in enumerate(noisy(8)):
+        recorder.add(frame(number, values, second=float(seconds[number])))
     recorder.stop()
     times = np.asarray(read(folder / "frames.csv").times)
     assert (np.diff(times) > 0).all()
@@ -140,6 +168,33 @@ def test_a_full_disk_leaves_whole_frames_and_the_rest_follows_when_there_is_room
     assert recorder.stop().endswith(f"20 frames in {folder}.")
     rows = np.loadtxt(folder / "frames.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(rows[:, 1:], frames)
+
+
+def test_a_recording_that_is_given_up_writes_nothing_into_the_next(tmp_path, monkeypatch):
+    """The disk hangs while the first recording ends; the second begins before the disk goes on."""
+    recorder, frames, goes_on, written = Recorder(tmp_path), noisy(3), threading.Event(), os.write
+
+    def hangs(descriptor, content):
+        goes_on.wait(5)
+        return written(descriptor, content)
+
+    monkeypatch.setattr(recording.os, "write", hangs)
+    monkeypatch.setattr(recording, "_LONGEST_END", 0.05)
+    first = recorder.start()
+    hung = recorder._thread
+    recorder.add(frame(0, frames[0]))
+    assert "Not recorded" in recorder.stop()
+    second = recorder.start()
+    recorder.add(frame(1, frames[1]))
+    goes_on.set()
+    assert hung is not None
+    hung.join(5)
+    recorder.add(frame(2, frames[2]))
+    monkeypatch.setattr(recording, "_LONGEST_END", 10.0)
+    assert "2 frames" in recorder.stop()
+    rows = np.loadtxt(second / "frames.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(rows[:, 1:], frames[1:])
+    assert len((first / "frames.csv").read_text().splitlines()) <= 2
 
 
 def test_what_finds_no_room_is_counted(tmp_path, monkeypatch):

@@ -36,11 +36,18 @@ def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name:
         whole = len(text.values) // count
         notes = (f"each frame is wrapped over lines: {counted(count, 'number')} are a frame.", *_cut(left))
         return Frames(text.values[: whole * count].reshape(whole, count), None, (*text.notes, *notes))
-    if len(text.lengths) > 1 and text.lengths[-1] < text.lengths[0]:
-        last = int(text.lengths[-1])
-        text = text._replace(values=text.values[:-last], lengths=text.lengths[:-1], notes=(*text.notes, *_cut(last)))
+    text = without_cut_line(text)
     found = frames_in_table(rectangle(text, name), counts, layout, text.heading)
     return found._replace(notes=(*text.notes, *found.notes))
+
+
+def without_cut_line(text: Text) -> Text:
+    """The text without a last line that is shorter than the first, for it is cut off; with a note about it."""
+    if len(text.lengths) < 2 or text.lengths[-1] >= text.lengths[0]:
+        return text
+    last = int(text.lengths[-1])
+    values = text.values[: len(text.values) - last]
+    return text._replace(values=values, lengths=text.lengths[:-1], notes=(*text.notes, *_cut(last)))
 
 
 def _wrapped(text: Text, counts: Sequence[int]) -> tuple[int, int] | None:

@@ -12,7 +12,7 @@ import numpy as np
 from jeit.arguments import listed
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
-from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text
+from jeit.data.formats.frames import Frames, frames_in_table, frames_in_text, without_cut_line
 from jeit.data.formats.text import read_text, rectangle
 from jeit.data.formats.unstated import driven_zeros, fitting_protocol, with_signs
 from jeit.data.measured_patterns import frames_of, less_their_mean
@@ -212,10 +212,13 @@ def measurement_from(
 
 def numbers(path: Path, layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...]]:
     """The numbers of a text or NPY file, arranged as in the file, and the names of its columns in the last line of a
-    heading, if it has one. Raises `ValueError` if it holds anything but numbers."""
+    heading, if it has one. A last line that is cut off is left out.
+
+    Raises `ValueError` if it holds anything but numbers.
+    """
     if path.suffix.lower() == ".npy":
         return _voltages(_from_numpy(path, ()), layout, path), ()
-    text = read_text(path, layout.delimiter, layout.skip_rows)
+    text = without_cut_line(read_text(path, layout.delimiter, layout.skip_rows))
     return rectangle(text, path.name), text.heading
 
 

@@ -25,7 +25,7 @@ _IN_MEMORY = 8
 _SAMPLE, _MOST_HEADING = 40, 100
 # A word before the numbers of a line; the end of a number that is cut off.
 _LABEL = re.compile(r"\s{0,40}([A-Za-z_][\w ()/\[\].-]{0,60})[:=]\s{0,40}(?=[-+.\d])")
-_CUT_NUMBER = re.compile(r"[-+]?\d*[.,]?\d*([eE][-+]?)?")
+_CUT_NUMBER = re.compile(r"[-+]?(\d*[.,]?\d*([eE][-+]?)?|na?)")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _COMMENTS = ("#", "%", "//")
 _SET = "Set [data] delimiter and skip_rows in the description, if it is a heading or cells are separated otherwise."
