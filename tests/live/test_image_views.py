@@ -172,9 +172,10 @@ def test_contacts_and_paths_are_those_of_the_batch(model, calibration, imager, s
 
 def test_a_long_session_of_contacts_keeps_little(calibration, imager, still, frames):
     view = ContactsView(ConductivityView(imager, calibration), still)
-    for number in range(60):
-        view.picture(LiveFrame(number, number / 60, 0.0, frames[number // 20]))
-    assert [len(one.seen) for one in view._tracker.open] == [1]
+    course = [*frames, *still, *still, *frames, *frames[::-1]]  # two touches, of which one ends
+    for number, frame in enumerate(course):
+        view.picture(LiveFrame(number, number / 60, 0.0, frame))
+    assert [(one.number, len(one.seen)) for one in view._tracker.open] == [(1, 1)]
     assert view._tracker.closed == ()
 
 

@@ -185,6 +185,9 @@ def test_gestures_are_those_of_the_watch(gestures):
         change = one.image.conductivity - watch.images.background
         np.testing.assert_array_equal(picture.pixels, view.grid(change))
         assert bool(picture.markers and picture.markers[0].track is not None) == one.touched
+        if one.touched:
+            place = watch.level.course(np.array([one.second]), change[None]).centroid[0]
+            assert (picture.markers[0].x, picture.markers[0].y) == tuple(place)
     assert sum(len(one.events) for one in made) >= 3
     named = next(number for number, one in enumerate(made) if one.events)
     assert made[named].markers[0].label == made[named].events[0].split(" at ")[0]
