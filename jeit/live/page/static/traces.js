@@ -5,6 +5,8 @@ import { round, ticks } from "./numbers.js";
 
 const SPAN = 30;
 const KEPT = 60;
+// Seconds without a value, as during a pause, after which a line begins anew.
+const GAP = 1;
 
 export class Traces {
   constructor(canvas) {
@@ -20,6 +22,7 @@ export class Traces {
     if (!this.series.has(key)) this.series.set(key, { colour, points: [] });
     const { points } = this.series.get(key);
     if (points.length && second < points[points.length - 1][0]) points.length = 0;
+    if (points.length && second - points.at(-1)[0] > GAP) points.push([points.at(-1)[0], NaN]);
     points.push([second, value]);
     if (points[0][0] < second - KEPT - 10) this.series.get(key).points = points.filter(([at]) => at >= second - KEPT);
     this.newest = second;
