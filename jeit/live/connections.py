@@ -48,10 +48,12 @@ class StandardInput(AbstractConnection):
         self.descriptor = descriptor
 
     def open(self) -> None:
+        """Connect; see `AbstractConnection.open`."""
         if self.descriptor is None:
             self.descriptor = sys.stdin.fileno()
 
     def read(self, timeout: float) -> bytes | None:
+        """Wait for bytes; see `AbstractConnection.read`."""
         assert self.descriptor is not None, "open first"
         # Elsewhere only sockets can be waited for: reading waits for bytes.
         if os.name == "posix" and not select.select([self.descriptor], [], [], timeout)[0]:
@@ -59,7 +61,7 @@ class StandardInput(AbstractConnection):
         return os.read(self.descriptor, _PIECE) or None
 
     def close(self) -> None:
-        pass  # not ours
+        """Leave it open: it is not ours."""
 
 
 class SerialPort(AbstractConnection):
@@ -74,6 +76,7 @@ class SerialPort(AbstractConnection):
         self.device: Any = None
 
     def open(self) -> None:
+        """Connect; see `AbstractConnection.open`."""
         try:
             self.device = self.serial.Serial(self.port, self.baud, timeout=0.2, exclusive=True)
         except ValueError as error:  # a rate that the driver does not know
@@ -84,6 +87,7 @@ class SerialPort(AbstractConnection):
             raise OSError(f"{said} (serial devices here: {others})") from None
 
     def read(self, timeout: float) -> bytes | None:
+        """Wait for bytes; see `AbstractConnection.read`."""
         device = self.device
         try:
             device.timeout = timeout
@@ -93,6 +97,7 @@ class SerialPort(AbstractConnection):
             raise OSError("the port was closed") from None
 
     def close(self) -> None:
+        """Disconnect; see `AbstractConnection.close`."""
         device, self.device = self.device, None
         if device is not None:
             with suppress(OSError):
@@ -114,11 +119,13 @@ class Server(AbstractConnection):
         self.socket: socket.socket | None = None
 
     def open(self) -> None:
+        """Connect; see `AbstractConnection.open`."""
         self.socket = socket.create_connection((self.host, self.port), timeout=_ANSWER)
         # A server whose cable is unplugged sends nothing, not even an end.
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
     def read(self, timeout: float) -> bytes | None:
+        """Wait for bytes; see `AbstractConnection.read`."""
         assert self.socket is not None, "open first"
         self.socket.settimeout(timeout)
         try:
@@ -127,6 +134,7 @@ class Server(AbstractConnection):
             return b""
 
     def close(self) -> None:
+        """Disconnect; see `AbstractConnection.close`."""
         if self.socket is not None:
             self.socket.close()
             self.socket = None

@@ -11,11 +11,12 @@ from ipaddress import ip_address
 from urllib.parse import quote
 
 from jeit.arguments.extras import need_extra
-from jeit.live.page.hub import AbstractSession, Hub
+from jeit.live.page.hub import Hub
+from jeit.live.session import Session
 
 
 def serve(
-    session: AbstractSession,
+    session: Session,
     *,
     host: str = "127.0.0.1",
     port: int = 0,

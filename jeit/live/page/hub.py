@@ -6,12 +6,12 @@ import asyncio
 import threading
 import time
 from collections import deque
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from jeit.live.page.wire import picture_message, scene_message, to_json
-from jeit.live.pictures import LiveFrame, Picture, Scene
+from jeit.live.session import Result, Session
 
 _IN_FLIGHT = 2
 """Pictures sent to a page and not yet drawn: one on its way while another is drawn."""
@@ -19,30 +19,6 @@ _IN_FLIGHT = 2
 _STATE_PERIOD = 0.5
 _LATENCIES = 10.0
 """Seconds over which a page's latency is computed."""
-
-
-class AbstractResult(Protocol):
-    """A frame with its picture, as `Session.newest` returns it."""
-
-    @property
-    def frame(self) -> LiveFrame: ...
-    @property
-    def picture(self) -> Picture: ...
-    @property
-    def latency(self) -> float: ...
-
-
-class AbstractSession(Protocol):
-    """What a page needs of a session, as `jeit.live.Session` has it."""
-
-    @property
-    def scene(self) -> Scene: ...
-    def newest(self, after: int, timeout: float) -> Any | None: ...
-    def result(self, number: int) -> Any | None: ...
-    def state(self) -> dict[str, Any]: ...
-    def take_reference(self, count: int) -> None: ...
-    def mark(self, label: str) -> None: ...
-    def record(self, on: bool) -> None: ...
 
 
 class Viewer:
@@ -106,13 +82,13 @@ class Viewer:
 class Hub:
     """Waits for a session's pictures in a thread, and wakes the pages in the server's event loop."""
 
-    def __init__(self, session: AbstractSession) -> None:
+    def __init__(self, session: Session) -> None:
         self.session = session
         self.scene = scene_message(session.scene)
         self.viewers: set[Viewer] = set()
         self.ended = threading.Event()
         self._closing = threading.Event()
-        self._newest: AbstractResult | None = None
+        self._newest: Result | None = None
         self._encoded: tuple[int, bytes] | None = None
         self._state: dict[str, Any] = {}
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -130,7 +106,7 @@ class Hub:
         self._closing.set()
         self._thread.join(5.0)
 
-    def newest(self) -> tuple[AbstractResult, bytes] | None:
+    def newest(self) -> tuple[Result, bytes] | None:
         """Return the newest picture, and its bytes; they are made once for all pages."""
         result = self._newest
         if result is None:
