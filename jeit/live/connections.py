@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import os
+import re
 import select
 import socket
 import sys
@@ -13,6 +14,7 @@ from typing import Any
 from jeit.arguments.extras import optional
 
 _PIECE = 65536
+_NUMBER = re.compile(r"^\[Errno \d+\] ")
 # Seconds for which a server may take to answer.
 _ANSWER = 5.0
 _BAUD, _MOST_BAUD = 115_200, 20_000_000
@@ -83,7 +85,7 @@ class SerialPort(AbstractConnection):
             raise OSError(str(error)) from None
         except OSError as error:
             others = ", ".join(self._others()) or "none"
-            said = str(error).split(": [Errno")[0]
+            said = _NUMBER.sub("", str(error).split(": [Errno")[0])
             raise OSError(f"{said} (serial devices here: {others})") from None
 
     def read(self, timeout: float) -> bytes | None:

@@ -125,7 +125,7 @@ def test_a_serial_device_unplugged_and_plugged_in_again(tmp_path):
     source = open_source(f"serial:{name}@115200", reference=measured())
     with Reading(source) as reading:
         reading.wait(lambda: source.connection.startswith("waiting"))
-        assert reading.said("Not connected")
+        assert reading.said(f"Not connected: could not open port {name} (serial devices here: ")
         leader, follower = plug()
         reading.wait(lambda: source.connection == "connected")
         os.write(leader, line(FRAMES[4])[4:] + line(FRAMES[0]) + line(FRAMES[1]) + line(FRAMES[2])[:40])
