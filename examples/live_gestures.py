@@ -63,7 +63,7 @@ def main() -> float:
         ax.text(second, 1e3 * max(strength) * (1.02 + 0.09 * (number % 3)), event.split(" at ")[0], fontsize=8)
     ax.set(xlabel="time (s)", ylabel="largest change (mS)", ylim=(0, 1.3e3 * max(strength)))
     figure.savefig("live_gestures.png", dpi=110)
-    # Every touch is named soon after it ends; one that goes on is named anew.
+    # A touch is named as soon as it has ended; one that goes on is named anew.
     return max(min(abs(second - end) for second, _ in named) for end in stream.offset.tolist())
 
 

@@ -99,9 +99,12 @@ def first_frames(
 ) -> tuple[Float[np.ndarray, "N M"], AbstractSource]:
     """Read the frames of the first `seconds` of a source, and return them with a source of those that follow.
 
-    Frames that are no numbers, or of another length than most, are left out. `report` is called with what is done, and
-    with the reason while a device is waited for. Raises `ValueError` if fewer than three frames remain.
+    Frames that are no numbers, or of another length than most, are left out; a recording is played from its beginning
+    nevertheless. `report` is called with what is done, and with the reason while a device is waited for. Raises
+    `ValueError` if fewer than three frames remain.
     """
+    if isinstance(source, PlayedRecording):
+        return _enough(list(source.frames[source.seconds <= seconds]), seconds), source
     with _reporting(source, f"undisturbed, {seconds:g} s", report or (lambda said: None)):
         return _first_frames(source, seconds)
 
@@ -137,16 +140,24 @@ def _first_frames(source: AbstractSource, seconds: float) -> tuple[Float[np.ndar
             rows.append(frame.values)
         if frame.second - begun >= seconds or len(rows) >= _MOST:
             break
+    try:
+        return _enough(rows, seconds), _Continued(source, coming)
+    except ValueError:
+        source.close()
+        raise
+
+
+def _enough(rows: list[np.ndarray], seconds: float) -> Float[np.ndarray, "N M"]:
+    """Frames of the usual length as one array; raises `ValueError` if these are fewer than three."""
     widths = [len(one) for one in rows]
     usual = max(set(widths), key=widths.count, default=0)
     rows = [one for one in rows if len(one) == usual]
     if len(rows) < _FEWEST:
-        source.close()
         raise ValueError(
             f"untouched: the first {seconds:g} s have {counted(len(rows), 'frame')} of numbers; {_FEWEST} are needed. "
             "Give a longer time, or a reference."
         )
-    return np.array(rows, float), _Continued(source, coming)
+    return np.array(rows, float)
 
 
 class _Continued(AbstractSource):

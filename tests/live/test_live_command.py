@@ -20,6 +20,7 @@ from thread_limits import libraries_found_once
 import jeit.live
 from jeit.cli import main
 from jeit.data import load_description, write_table
+from jeit.imaging.stream_preparation import StreamSettings
 from jeit.live.commands.live import _has_display
 from jeit.touch import LearntSkin, Presses, learn_gestures, write_skin
 
@@ -150,6 +151,16 @@ def test_what_does_not_fit_is_said(served, run, files, monkeypatch, given, said)
     assert error.count("\n") == 1
     assert said in error
     assert not served.results
+
+
+def test_a_recording_is_played_from_its_beginning(files):
+    """The frames of its first tenth of a second are the reference besides."""
+    settings = StreamSettings(solver="one-step")
+    given = {"description": files / "sensor.toml", "rate": 200.0, "untouched": 0.1, "settings": settings}
+    ready = jeit.live.prepare(str(files / "frames.csv"), **given)
+    np.testing.assert_allclose(ready.reference.filled()[0], noisy(40, seed=3)[:21].mean(axis=0))
+    frames = [frame.values for frame in ready.source]
+    np.testing.assert_array_equal(frames, noisy(40, seed=3))
 
 
 def test_contacts_are_shown_where_asked_for(served, run):
