@@ -85,6 +85,11 @@ def served():
         assert not thread.is_alive()
 
 
+def idle() -> Any:
+    """A session without pictures."""
+    return StandIn(None)
+
+
 def answer(address, path="/", method="GET", **headers):
     """Status, headers and text that the server answers."""
     connection = http.client.HTTPConnection("127.0.0.1", address.port, timeout=5)
@@ -345,18 +350,18 @@ def test_taken_port_and_unknown_host():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(OSError, match=rf"port {port}.*choose another"):
-            serve(StandIn(None), port=port)
+            serve(idle(), port=port)
     with pytest.raises(OSError, match="no such host"):
-        serve(StandIn(None), host="no such host", port=1)
+        serve(idle(), host="no such host", port=1)
     with pytest.raises(OSError, match="70000"):
-        serve(StandIn(None), port=70000)
+        serve(idle(), port=70000)
 
 
 def test_hub_outlives_a_closed_loop():
     """The thread that waits for pictures ends when its server is gone."""
     import asyncio
 
-    session = StandIn(200.0)
+    session: Any = StandIn(200.0)
     hub = Hub(session)
 
     async def begin():
