@@ -157,7 +157,8 @@ TYPED = [
     "docs/choosing-a-hyperparameter.md",
     "README.md",
 ]
-# Minutes, until Ctrl-C, or files that no page makes; each has tests of its own. The image of the tank is that of test_main_job.py.
+# Minutes, until Ctrl-C, or files that no page makes; each has tests of its own. The image of the tank is that of
+# test_main_job.py.
 LONG = (
     *("jeit layout optimise", "jeit study run", "jeit learn image", "jeit listen", "jeit live"),
     "jeit reconstruct datamat_3_4.mat",
