@@ -15,6 +15,8 @@ NAMES = (
     "optimisers",
     "realtime",
     "soak",
+    "live",
+    "live_page",
     "hearing",
     "design",
     "contact",

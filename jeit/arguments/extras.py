@@ -13,6 +13,7 @@ EXTRAS = {
     "learn": {"sklearn": "scikit-learn", "skops": "skops", "optax": "optax", "networkx": "networkx"},
     "sound": {"soundfile": "soundfile"},
     "large": {"pyamg": "pyamg"},
+    "live": {"starlette": "starlette", "uvicorn": "uvicorn", "websockets": "websockets", "serial": "pyserial"},
     "vision": {"cv2": "opencv-python-headless"},
     "view": {"pyvista": "pyvista"},
     "cluster": {"dask": "dask", "distributed": "distributed", "zarr": "zarr", "xarray": "xarray"},

@@ -28,6 +28,7 @@ from jeit.start import discarded_damaged, quick_compilation
 # fast.
 _REPEATING = (
     "study",
+    "live",
     "stream",
     "layout optimise",
     "touch fit",

@@ -14,6 +14,7 @@ COMMANDS = {
     "describe": "jeit.cli.commands.describe",
     "reconstruct": "jeit.cli.commands.reconstruct",
     "view": "jeit.cli.commands.view",
+    "live": "jeit.live.commands.live",
     "stream": "jeit.cli.commands.stream",
     "series": "jeit.cli.commands.series",
     "choose": "jeit.cli.commands.choose",

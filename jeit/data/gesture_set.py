@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from jeit.arguments import readings
 from jeit.data.description import Description, TableLayout
 from jeit.data.formats import table
+from jeit.data.formats.text import frames_in_table
 from jeit.data.measurement import Measurement
 from jeit.files import need, npz_arrays, written_whole
 
@@ -64,7 +65,8 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
 
     An NPZ file holds `frames` or `voltages` (F, M), and optionally `seconds` or `time` (F,), and `reference` (M,) or
     (r, M) of the untouched skin. A table (.csv, .txt, .dat, .npy) has one frame per row unless `[data]` of the
-    description states otherwise; its frames named "reference" are taken as the reference.
+    description states otherwise; its frames named "reference" are taken as the reference. If it has a column more than
+    the protocol has channels, the first column holds the times, as `jeit.data.read` finds them.
 
     Without a description, or without a protocol in it, any number of channels is accepted, and voltages keep the unit
     of the file. Raises `FileNotFoundError`, and `ValueError` for another kind of file, for a number of channels that
@@ -83,8 +85,12 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
     channels = None if protocol is None else protocol.num_measurements
     try:
         arrays = npz_arrays(path, *_FRAMES, *_TIMES, "reference", *layout.keys) if path.suffix == ".npz" else {}
-        frames = _frames(_table(path, arrays, layout), layout, path.name, channels)
-        seconds = next((_times(arrays[one], one, len(frames)) for one in _TIMES if one in arrays), None)
+        (values, heading), seconds = _table(path, arrays, layout), None
+        in_rows = not arrays and layout.frames_in != "columns" and layout.time_column is not False
+        if in_rows and channels is not None and values.shape[1] == channels + 1:
+            values, seconds, _ = frames_in_table(values, [channels], layout, heading)
+        frames = _frames(values, layout, path.name, channels)
+        seconds = next((_times(arrays[one], one, len(frames)) for one in _TIMES if one in arrays), seconds)
         reference = None
         if "reference" in arrays:
             reference = _checked("reference", np.atleast_2d(arrays["reference"]) * layout.scale, frames.shape[1])
@@ -96,14 +102,15 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
     return FrameRecording(frames, seconds, reference, path.name)
 
 
-def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> np.ndarray:
-    """The numbers of a file, arranged as in the file."""
+def _table(path: Path, arrays: dict[str, np.ndarray], layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The numbers of a file, arranged as in the file, and the names of its columns, if it has any."""
     if not arrays:
-        return np.atleast_2d(table.numbers(path, layout))
+        values, heading = table.numbers(path, layout)
+        return np.atleast_2d(values), heading
     key = next((one for one in (*layout.keys, *_FRAMES) if one in arrays), None)
     if key is None:
         raise ValueError(f"there is no array 'frames'; the file holds {', '.join(arrays[''][:12])}.")
-    return np.atleast_2d(arrays[key])
+    return np.atleast_2d(arrays[key]), ()
 
 
 def _frames(given: np.ndarray, layout: TableLayout, name: str, channels: int | None) -> Float[np.ndarray, "F M"]:

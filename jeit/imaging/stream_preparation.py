@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import check_kind
-from jeit.data import Measurement
+from jeit.data import Measurement, screen
+from jeit.data.description import Description
 from jeit.forward import ForwardModel
 from jeit.imaging.method import NamedPrior, check_body, check_hyperparameter, check_prior, prior_for
 from jeit.imaging.preparation import (
@@ -113,6 +114,28 @@ def prepare_imager(
             memory=settings.memory,
         )
     return imager, calibration
+
+
+def described_reference(
+    description: Description, frames: Float[np.ndarray, "N M"], *, name: str = "reference"
+) -> Measurement:
+    """The mean of frames (N, M), volts, of an undisturbed sensor, as a measurement of the sensor that is described.
+
+    Raises `ValueError` for a description without geometry, electrodes or protocol, and as `jeit.data.screen`.
+    """
+    protocol = description.protocol(description.origin)
+    if protocol is None or description.domain is None or description.electrodes is None:
+        said = {"geometry": description.domain, "electrodes": description.electrodes, "protocol": protocol}
+        missing = ", ".join(f"[{section}]" for section, one in said.items() if one is None)
+        raise ValueError(f"{description.origin}: images need {missing} too; describe it.")
+    return screen(
+        frames,
+        protocol,
+        electrodes=description.electrodes,
+        domain=description.domain,
+        name=name,
+        notes=description.notes,
+    ).mean_frame()
 
 
 def frames_of(measurement: Measurement) -> Float[np.ndarray, "F M"]:

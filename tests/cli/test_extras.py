@@ -35,6 +35,7 @@ NEEDED = [
     ("learn image", "mesh", "cad.toml -o out"),
     ("listen recording", "sound", "one.flac --model model -o out"),
     ("listen fit", "learn", "clips -o out"),
+    ("live", "live", "demo"),
     ("locate", "sound", "one.flac --calibration calibration.json -o out"),
     ("study report", "cluster", "study.toml"),
     ("study resume", "cluster", "study.toml"),

@@ -165,7 +165,7 @@ def test_a_signal_ends_it_and_all_is_written(files, model, run, tmp_path, monkey
         ("stream.npz", {"--rate": "0"}, "--rate must be positive"),
         ("stream.npz", {"--untouched": "0"}, "--untouched must be positive"),
         ("stream.npz", {"--patience": "nan"}, "--patience must be positive"),
-        ("stream.npz", {"--skin": "bare.toml"}, "images of touches need [geometry], [electrodes] too"),
+        ("stream.npz", {"--skin": "bare.toml"}, "images need [geometry], [electrodes] too"),
         ("stream.npz", {"--skin": "nowhere.toml"}, "there is no such file"),
         ("stream.npz", {"--gestures": "nowhere"}, "`jeit touch gestures` makes one"),
         ("stream.npz", {"--gestures": "stream.npz"}, "is not a gesture model"),

@@ -21,6 +21,8 @@ MOST = {
     "hear_a_stroke": 3e-3,
     "how_far_to_trust": 0.61,
     "learn_a_prior": 0.97,
+    "live_gestures": 1.0,
+    "live_places": 4e-3,
     "localisation_error": 2.5e-3,
     "prosthesis": 6e-3,
 }

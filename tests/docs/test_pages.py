@@ -157,8 +157,12 @@ TYPED = [
     "docs/choosing-a-hyperparameter.md",
     "README.md",
 ]
-# Minutes, or files that no page makes; each has tests of its own. The image of the tank is that of test_main_job.py.
-LONG = ("jeit layout optimise", "jeit study run", "jeit learn image", "jeit listen", "jeit reconstruct datamat_3_4.mat")
+# Minutes, until Ctrl-C, or files that no page makes; each has tests of its own. The image of the tank is that of
+# test_main_job.py.
+LONG = (
+    *("jeit layout optimise", "jeit study run", "jeit learn image", "jeit listen", "jeit live"),
+    "jeit reconstruct datamat_3_4.mat",
+)
 # Options that leave less to do of what takes long as it is written.
 LESS = {"jeit choose data1.mat": "--num-points 800", "jeit layout compare": "--cell-mm 8 --places 16"}
 READ = [page for page in PAGES if blocks(page, "python") and page.relative_to(ROOT).as_posix() not in TYPED]

@@ -55,7 +55,7 @@ def recognises(path: Path) -> bool:
         if first is None:
             return False
         head += file.read(_HEAD - len(head))
-    return _usual([len(one) for one in _frames(head)]) in _PROTOCOLS
+    return _usual([len(one) for one in frames_in(head)]) in _PROTOCOLS
 
 
 def read(
@@ -106,7 +106,7 @@ def numbers(path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
     Raises `ValueError` if frames are of no protocol of the firmware, or of two.
     """
     content = content_of(path)
-    frames = list(_frames(content))
+    frames = list(frames_in(content))
     lengths = [len(one) for one in frames]
     count = _usual(lengths)
     if not frames:
@@ -147,7 +147,7 @@ def numbers(path: Path) -> tuple[Float[np.ndarray, "F M"], tuple[str, ...]]:
     return values, tuple(notes)
 
 
-def _frames(content: bytes) -> Iterator[array]:
+def frames_in(content: bytes) -> Iterator[array]:
     """Numbers of each frame: NaN for a cell that is none. Empty cells, and words after the last number, are left
     out."""
     words = [(one.start(), one.end()) for one in _WORD.finditer(content)]

@@ -13,7 +13,14 @@ from jaxtyping import Inexact
 from jeit.arguments import listed
 from jeit.data.described_protocol import PROTOCOL_ARRAYS
 from jeit.data.description import Description, TableLayout, load_description
-from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read_text, rectangle
+from jeit.data.formats.text import (
+    Frames,
+    frames_in_table,
+    frames_in_text,
+    read_text,
+    rectangle,
+    without_cut_line,
+)
 from jeit.data.measurement import Measurement
 from jeit.data.screening import screen
 from jeit.data.unstated import driven_zeros, fitting_protocol, with_signs
@@ -216,12 +223,16 @@ def measurement_from(
     return measurement if rate is None else measurement.at_rate(rate)
 
 
-def numbers(path: Path, layout: TableLayout) -> np.ndarray:
-    """The numbers of a text or NPY file, arranged as in the file. Raises `ValueError` if it holds anything but
-    numbers."""
+def numbers(path: Path, layout: TableLayout) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The numbers of a text or NPY file, arranged as in the file, and the names of its columns in the last line of a
+    heading, if it has one. A last line that is cut off is left out.
+
+    Raises `ValueError` if it holds anything but numbers.
+    """
     if path.suffix.lower() == ".npy":
-        return _voltages(_from_numpy(path, ()), layout, path)
-    return rectangle(read_text(path, layout.delimiter, layout.skip_rows), path.name)
+        return _voltages(_from_numpy(path, ()), layout, path), ()
+    text = without_cut_line(read_text(path, layout.delimiter, layout.skip_rows))
+    return rectangle(text, path.name), text.heading
 
 
 def frames_from(table: np.ndarray, layout: TableLayout, name: str) -> np.ndarray:

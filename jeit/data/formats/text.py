@@ -29,7 +29,7 @@ _IN_MEMORY = 8
 _SAMPLE, _MOST_HEADING = 40, 100
 # A word before the numbers of a line; the end of a number that is cut off.
 _LABEL = re.compile(r"\s{0,40}([A-Za-z_][\w ()/\[\].-]{0,60})[:=]\s{0,40}(?=[-+.\d])")
-_CUT_NUMBER = re.compile(r"[-+]?\d*[.,]?\d*([eE][-+]?)?")
+_CUT_NUMBER = re.compile(r"[-+]?(\d*[.,]?\d*([eE][-+]?)?|na?)")
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _COMPLEX = re.compile(r"\(?[-+]?[\d.]+(?:[eE][-+]?\d+)?[-+]{1,2}[\d.]+(?:[eE][-+]?\d+)?[ijIJ]\)?")
 # Fewest columns of which a first line of their numbers is no frame.
@@ -83,6 +83,29 @@ class _Way(NamedTuple):
 
 _PLAIN = _Way(",", False)
 _WAYS = (_PLAIN, *(_Way(delimiter, comma) for delimiter in (";", "\t", None) for comma in (False, True)))
+
+
+class LineNumbers:
+    """Numbers of lines that come one after another. Separators are found from a line, and kept as long as they fit."""
+
+    def __init__(self):
+        self._way: _Way | None = None
+
+    def __call__(self, line: str) -> list[float] | None:
+        """The numbers of a line, NaN for an empty cell between others; None if the line holds anything else."""
+        found = None if self._way is None else self._of(self._way, line)
+        if found is None:
+            way = _way_of([line])
+            found = self._of(way, line)
+            self._way = self._way if found is None else way
+        return found
+
+    @staticmethod
+    def _of(way: _Way, line: str) -> list[float] | None:
+        try:
+            return [float(cell or "nan") for cell in way.cells(line)] or None
+        except ValueError:
+            return None
 
 
 def read_text(path: Path, delimiter: str | None = None, skip_rows: int | None = None) -> Text:
@@ -256,11 +279,18 @@ def frames_in_text(text: Text, counts: Sequence[int], layout: TableLayout, name:
         whole = len(text.values) // count
         notes = (f"each frame is wrapped over lines: {counted(count, 'number')} are a frame.", *_cut(left))
         return Frames(text.values[: whole * count].reshape(whole, count), None, (*text.notes, *notes))
-    if len(text.lengths) > 1 and text.lengths[-1] < text.lengths[0]:
-        last = int(text.lengths[-1])
-        text = text._replace(values=text.values[:-last], lengths=text.lengths[:-1], notes=(*text.notes, *_cut(last)))
+    text = without_cut_line(text)
     found = frames_in_table(rectangle(text, name), counts, layout, text.heading)
     return found._replace(notes=(*text.notes, *found.notes))
+
+
+def without_cut_line(text: Text) -> Text:
+    """The text without a last line that is shorter than the first, for it is cut off; with a note about it."""
+    if len(text.lengths) < 2 or text.lengths[-1] >= text.lengths[0]:
+        return text
+    last = int(text.lengths[-1])
+    values = text.values[: len(text.values) - last]
+    return text._replace(values=values, lengths=text.lengths[:-1], notes=(*text.notes, *_cut(last)))
 
 
 def _wrapped(text: Text, counts: Sequence[int]) -> tuple[int, int] | None:

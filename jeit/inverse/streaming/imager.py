@@ -18,7 +18,7 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jeit.arguments import brief, describe, is_number
+from jeit.arguments import brief, counted, describe, is_number
 from jeit.electrodes.point import IntegratedElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
@@ -177,6 +177,27 @@ class Imager(eqx.Module):
             solver=chosen,
             persistence=persistence,
         )
+
+    def with_reference(self, reference: Float[Array | np.ndarray, " M"]) -> "Imager":
+        """The same imager for another frame (M,) of the undisturbed body, volts, such as after electrodes were wetted.
+
+        Model, noise, hyperparameter and the channels in use stay, so nothing is compiled again. Raises `ValueError` for
+        a frame of another shape, one without a reading of a channel in use, and one that differs from the model's by a
+        factor of ten or in sign.
+        """
+        frame, used = np.asarray(reference, float), np.asarray(self.mask)
+        if frame.shape != used.shape:
+            raise ValueError(
+                f"reference has shape {frame.shape}; give ({used.size},), a frame of the undisturbed body."
+            )
+        if (missing := np.flatnonzero(used & ~np.isfinite(frame))).size:
+            raise ValueError(
+                f"reference has no reading of {counted(missing.size, 'channel')} in use, the first number {missing[0]}."
+            )
+        predicted = np.asarray(self.expected) + np.asarray(self.offset)
+        _check_reference(frame[used], predicted[used])
+        changed = as_array(np.where(used, frame, predicted)), as_array(np.where(used, predicted - frame, 0))
+        return eqx.tree_at(lambda one: (one.expected, one.offset), self, changed)
 
     @property
     def start(self) -> Float[Array, " n"]:

@@ -225,13 +225,18 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
 
 
 def _images(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
-    session = _Session(imager)
+    state = StreamState(imager)
     for number, frame in enumerate(frames):
-        yield session.image(number, frame)
+        yield state.image(number, frame)
 
 
-class _Session:
-    """State of a stream between frames. NumPy is used where JAX's dispatch would take longer than the computation."""
+class StreamState:
+    """State of a stream between frames, for programs that receive frames one by one; `stream` is made of it.
+
+    Everything is compiled when it is created. `check`: the check of frames.
+    """
+
+    # NumPy is used where JAX's dispatch would take longer than the computation.
 
     def __init__(self, imager: Imager):
         self.imager = imager

@@ -15,8 +15,7 @@ from jaxtyping import Float
 from jeit.arguments import check_kind, counted
 from jeit.data import FrameRecording, Measurement
 from jeit.data.description import Description
-from jeit.data.screening import screen
-from jeit.imaging.stream_preparation import StreamSettings, prepare_imager
+from jeit.imaging.stream_preparation import StreamSettings, described_reference, prepare_imager
 from jeit.inverse import Imager, stream
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.nonlinear.solvers import OneStep
@@ -58,19 +57,7 @@ class TouchImages:
         `jeit.imaging.prepare_imager` does.
         """
         check_kind("description", description, Description, "a Description, as of load_description('skin.toml')")
-        protocol = description.protocol(description.origin)
-        if protocol is None or description.domain is None or description.electrodes is None:
-            said = {"geometry": description.domain, "electrodes": description.electrodes, "protocol": protocol}
-            missing = ", ".join(f"[{section}]" for section, one in said.items() if one is None)
-            raise ValueError(f"{description.origin}: images of touches need {missing} too; describe it.")
-        reference = screen(
-            untouched,
-            protocol,
-            electrodes=description.electrodes,
-            domain=description.domain,
-            name="untouched",
-            notes=description.notes,
-        ).mean_frame()
+        reference = described_reference(description, untouched, name="untouched")
         imager, calibration = prepare_imager(reference, settings, progress=progress)
         if calibration.model.mesh.dimension != 2:
             raise ValueError(f"{description.origin}: touches are detected on sheets (2-D); this is a solid.")

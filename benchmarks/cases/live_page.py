@@ -1,0 +1,89 @@
+"""Latency from a frame's last byte to the picture in a browser: a simulated tank, imaged and drawn by Chromium.
+
+The page reports each picture once it is painted, and the server takes the time of the report's arrival: the report's
+way back counts as well, so that no two clocks are compared. Simulating, imaging, serving and the browser share the
+machine's cores. The browser has no window, and paints without a graphics card.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+
+from benchmarks.harness.case import Case, Options, Result, Table, judged
+from benchmarks.harness.tables import duration
+from benchmarks.harness.timing import say
+from jeit.imaging.stream_preparation import StreamSettings
+from jeit.live.server import serve
+from jeit.live.session import Session
+from jeit.live.simulated import simulated_tank
+from jeit.live.views.conductivity import ConductivityView
+
+RATE, WINDOW = 60.0, 10.0
+"""Frames a second, and seconds over which the page's latency is computed."""
+MEDIAN, HIGH, PICTURES = 0.05, 0.1, 20.0
+"""Half and 99 % of the pictures may be this late, seconds; and so many a second are drawn at least."""
+SIZES = ((1280, 800), (2000, 1100))
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+def run(options: Options) -> Result:
+    """Linear images, and Gauss-Newton, in windows of two sizes."""
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    try:
+        from playwright.sync_api import sync_playwright
+    except ModuleNotFoundError:
+        return Result([], notes=["Playwright is needed: pip install playwright."])
+    if program is None:
+        return Result([], notes=[f"A browser is needed: {', '.join(BROWSERS)}."])
+    rows, asked = [], []
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        for name, solver in (("linear", "one-step"), ("Gauss-Newton", "gauss-newton")):
+            tank = simulated_tank(RATE)
+            view = ConductivityView.prepare(tank.reference, StreamSettings(solver=solver))
+            with _served(Session(tank, view)) as (session, address):
+                for width, height in SIZES[: 1 if options.quick else None]:
+                    page = browser.new_page(viewport={"width": width, "height": height})
+                    page.goto(address)
+                    found = np.array([_sample(page) for _ in range(1 if options.quick else 6)])
+                    page.close()
+                    median, high = np.median(found[:, 0]), np.max(found[:, 1])
+                    drawn, state = np.mean(found[:, 2]), session.state()
+                    left_out = f"{state['dropped']:,} of {state['read']:,}"
+                    row = [name, f"{width} × {height}", duration(median), duration(high), f"{drawn:.1f}", left_out]
+                    say(" | ".join(row))
+                    rows.append(row)
+                    met = bool(median <= MEDIAN and high <= HIGH and drawn >= PICTURES)
+                    what = f"{name}, {width} px: ≤ {1e3 * MEDIAN:.0f} ms, 99 % ≤ {1e3 * HIGH:.0f} ms, ≥ 20 a second"
+                    asked.append(judged(what, f"{row[2]}, {row[3]}, {row[4]}", met))
+        browser.close()
+    header = ["images", "window", "latency: median", "worst 99 % of 10 s", "drawn a second", "not shown"]
+    return Result([Table(header, rows, f"16 electrodes, 208 voltages, {RATE:g} frames/s")], asked)
+
+
+def _sample(page) -> list[float]:
+    """Median latency, latency of 99 %, and pictures drawn a second, of the next ten seconds."""
+    time.sleep(WINDOW + 1.0)
+    latency = page.locator("#latency")
+    times = [float(latency.get_attribute(f"data-{name}")) for name in ("median", "worst")]
+    return [*times, float(page.inner_text("#drawn").split()[0])]
+
+
+@contextmanager
+def _served(session: Session):
+    opened, addresses = threading.Event(), []
+    options = {"opened": lambda address: (addresses.append(address), opened.set())}
+    thread = threading.Thread(target=serve, args=(session,), kwargs=options)
+    with session:
+        thread.start()
+        opened.wait(10)
+        yield session, addresses[0]
+    thread.join(10)
+
+
+CASE = Case("live_page", "a device's frames drawn in a browser: latency, and pictures a second", run, 6)

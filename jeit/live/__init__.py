@@ -1,0 +1,7 @@
+"""Image a device's frames while they come: sources of frames, recordings, and a page in the browser."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

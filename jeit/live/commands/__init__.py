@@ -1,0 +1,3 @@
+"""Commands of live sessions."""
+
+from __future__ import annotations

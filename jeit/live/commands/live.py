@@ -1,0 +1,243 @@
+"""`jeit live`: image a device's frames while they come, on a page in the browser."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jeit.cli.options import (
+    AsIs,
+    Contact,
+    Description,
+    Format,
+    Quiet,
+    ReferenceKey,
+    check_positive,
+    naming_options,
+    number_or_name,
+    read_file,
+)
+
+
+def live(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="demo, a simulated tank in which a rod goes round, or demo:skin, a skin that is stroked; - for lines "
+            "on standard input; a recording; serial:PORT@BAUD; tcp:HOST:PORT; or a folder into which an instrument "
+            "writes a file for each frame.",
+            show_default=False,
+        ),
+    ],
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            help="Measured file of the undisturbed body; says protocol and electrodes. Without it, a description says "
+            "them, and the first frames are the reference.",
+            show_default=False,
+        ),
+    ] = None,
+    reference_key: ReferenceKey = None,
+    format: Format = None,
+    description: Description = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of 'jeit touch fit', 'jeit touch gestures' or 'jeit learn image': places and forces, gestures "
+            "as they are named, or depth.",
+            show_default=False,
+        ),
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="File of 'jeit calibrate-microphones': a frame is an intensity for each microphone.",
+            show_default=False,
+        ),
+    ] = None,
+    contacts: Annotated[bool, typer.Option("--contacts", help="Find contacts, and show their paths.")] = False,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help="gauss-newton (default), levenberg-marquardt, or one-step for linear images (default of demo)."
+        ),
+    ] = None,
+    hyperparameter: Annotated[
+        str | None,
+        typer.Option(help="A number, or the rule that chooses it (default noise-figure).", metavar="VALUE|RULE"),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Most iterations for a frame (default 4).")] = None,
+    memory: Annotated[
+        float | None,
+        typer.Option(help="Frames over which an image changes: smooths in time (Kalman). 0 (default): none."),
+    ] = None,
+    contact: Contact = None,
+    num_points: Annotated[int | None, typer.Option(help="Nodes of the mesh, about (default 1200).")] = None,
+    as_is: AsIs = False,
+    rate: Annotated[
+        float | None,
+        typer.Option(help="Frames in a second of a recording or of the demonstration, unless as recorded."),
+    ] = None,
+    untouched: Annotated[
+        float, typer.Option(help="Seconds at the beginning in which the sensor is undisturbed, without a --reference.")
+    ] = 1.0,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for recordings; made when one begins.")] = Path(
+        "jeit-live"
+    ),
+    record: Annotated[bool, typer.Option("--record", help="Record from the first frame on.")] = False,
+    host: Annotated[
+        str, typer.Option(help="Address to listen at; 0.0.0.0 lets other machines in that have the token.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen at; 0 takes a free one.", min=0, max=65535)] = 0,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address, and open nothing.")] = False,
+    until_end: Annotated[
+        bool, typer.Option("--until-end", help="Stop when the source ends, not on Ctrl-C alone.")
+    ] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Image frames as they come, on a page in the browser; 'jeit live demo' needs no device.
+
+    What is shown follows from what is given: the change of conductivity, contacts (--contacts), a learnt skin, gestures
+    or depth (--model), or the loss map of microphones (--calibration). The page takes a new reference, records, marks
+    events, pauses and steps back. Ctrl-C ends it.
+    """
+    from jeit.arguments.extras import need_extra
+    from jeit.cli.console import Steps, plain_console
+    from jeit.imaging.stream_preparation import StreamSettings
+    from jeit.live.preparation import prepare
+    from jeit.live.recording import Recorder
+    from jeit.live.server import serve
+    from jeit.live.session import Session
+
+    need_extra("live", "a page in the browser")
+    check_positive({"--untouched": untouched} | ({} if rate is None else {"--rate": rate}))
+    given = {
+        "solver": method,
+        "max_steps": steps,
+        "hyperparameter": None if hyperparameter is None else number_or_name(hyperparameter),
+        "memory": memory,
+        "contact": contact,
+        "num_points": num_points,
+        "as_is": as_is or None,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    _check_use(given, model, calibration, contacts)
+    if source.partition(":")[0] == "demo" and steps is None:
+        given.setdefault("solver", "one-step")  # compiles in half the time
+    with naming_options(_NAMES):
+        settings = StreamSettings(**given)
+    console = plain_console()
+    with Steps(console, quiet=quiet) as step, naming_options(_OPTIONS):
+        step("read")
+        # A reference for a model is plain frames, as `jeit touch predict` reads them.
+        base = reference
+        if reference is not None and model is None:
+            base = read_file("--reference", reference, format, description, key=reference_key)
+        ready = prepare(
+            source,
+            base,
+            description=description,
+            model=model,
+            calibration=calibration,
+            contacts=contacts,
+            settings=settings,
+            rate=rate,
+            untouched=untouched,
+            progress=step,
+        )
+    recorder = Recorder(output, reference=ready.reference)
+    if record:
+        recorder.start()
+    with _terminated() as terminated:
+        with Session(ready.source, ready.view, recorder=recorder) as session:
+            serve(
+                session,
+                host=host,
+                port=port,
+                stay=not until_end,
+                opened=lambda address: _open(address, console, browser=not no_browser, quiet=quiet),
+            )
+        state = session.state()
+    if not quiet:
+        _say(console, state)
+    if terminated:
+        raise typer.Exit(128 + signal.SIGTERM)
+
+
+@contextmanager
+def _terminated() -> Iterator[list[int]]:
+    """Let SIGTERM end what runs as Ctrl-C does, and collect it."""
+    got: list[int] = []
+
+    def stop(number: int, _) -> None:
+        got.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield got
+        return
+    earlier = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield got
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
+
+
+_NAMES = {"solver": "--method", "max_steps": "--steps"}
+_OPTIONS = {
+    "source": "SOURCE",
+    "rate": "--rate",
+    "description": "--description",
+    "reference": "--reference",
+    "model": "--model",
+    "calibration": "--calibration",
+    "untouched": "--untouched",
+}
+
+
+def _check_use(given: dict, model: Path | None, calibration: Path | None, contacts: bool) -> None:
+    """Raise `ValueError` for options of images together with a model or microphones, which use none of them."""
+    used = [_NAMES.get(one, f"--{one.replace('_', '-')}") for one in given] + ["--contacts"] * contacts
+    for option, value in (("--model", model), ("--calibration", calibration)):
+        if value is not None and used:
+            raise ValueError(f"{used[0]} has no use with {option}; leave it out.")
+
+
+def _open(address: str, console, *, browser: bool, quiet: bool) -> None:
+    """Print the address of the page, and open it where there is a display."""
+    shown = browser and _has_display()
+    if not (quiet and shown):
+        console.print(f"  {address}" + ("" if shown else "  (open it in a browser)"), soft_wrap=True)
+    if shown:
+        import webbrowser
+
+        # Some browsers return only when their window is closed.
+        threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+
+
+def _has_display() -> bool:
+    """Whether a window can be opened; a text browser would take the terminal."""
+    if sys.platform in ("win32", "darwin"):
+        return True
+    return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER"))
+
+
+def _say(console, state: dict) -> None:
+    """Print the counters of a session."""
+    from jeit.arguments import counted
+
+    words = [f"{state[name]} {name}" for name in ("imaged", "dropped", "refused") if state[name]]
+    console.print(f"\n{counted(state['read'], 'frame')}: {', '.join(words) or 'none imaged'}")
+    if state["latency_median"] is not None:
+        median, high = 1e3 * state["latency_median"], 1e3 * state["latency_99"]
+        console.print(f"latency to the picture: median {median:.1f} ms, 99 % within {high:.1f} ms")
+    for reason, number in sorted(state["reasons"].items(), key=lambda one: -one[1])[:5]:
+        console.print(f"  {number} × {reason}", soft_wrap=True)

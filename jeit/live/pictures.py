@@ -1,0 +1,98 @@
+"""What passes between the parts of a live session: frames of a source, and the picture that a view makes of each."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.inverse.streaming.stream import FrameStatus
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """A frame as a source delivers it.
+
+    **Fields**: `number`: position in order of arrival, from 0; `second`: time since the session began, seconds;
+    `arrived`: `time.monotonic()` when its last byte was read; `values`: voltages (M,), volts, NaN for a channel without
+    a reading, or the text of a line that is no frame.
+    """
+
+    number: int
+    second: float
+    arrived: float
+    values: Float[np.ndarray, " M"] | str
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A place that a view estimates: a contact, a touch, a sound.
+
+    **Fields**: `x`, `y`: metres; `label`: text beside it, such as "2.1 N" or "stroke 93 %"; `radius`: radius of the
+    region that holds the place with a probability of 68 %, metres, NaN if unknown; `track`: number of the contact that
+    it belongs to, so that its path can be drawn, or None.
+    """
+
+    x: float
+    y: float
+    label: str = ""
+    radius: float = float("nan")
+    track: int | None = None
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What a view makes of one frame.
+
+    **Fields**: `pixels` (H, W): float32 image in the scene's unit, row 0 at the largest y, NaN outside the body; None
+    for a refused frame or a view without an image; `markers`: estimated places; `status`, `reason`: as in
+    `jeit.inverse.streaming.FrameImage`; `events`: sentences for the page's list of events, such as a named gesture.
+    """
+
+    pixels: Float[np.ndarray, "H W"] | None
+    markers: tuple[Marker, ...] = ()
+    status: FrameStatus = FrameStatus.IMAGED
+    reason: str = ""
+    events: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a page needs to know of a view once, before the first picture.
+
+    **Fields**: `title`; `quantity`, `unit`: what pixels are, such as "conductivity change", "S/m"; `diverging`: whether
+    colours are centred on zero; `extent`: x of left and right edge, y of lower and upper edge of the image, metres;
+    `outline`: closed curves of the body, metres, each (n, 2); `electrodes`: a curve (n, 2) of each electrode, metres;
+    `names`: their names; `channels`: a name for each channel (M,), such as "1-2 → 3-4"; `notes`: remarks for the user.
+    """
+
+    title: str
+    quantity: str
+    unit: str
+    diverging: bool
+    extent: tuple[float, float, float, float]
+    outline: Sequence[Float[np.ndarray, "n 2"]]
+    electrodes: Sequence[Float[np.ndarray, "n 2"]] = ()
+    names: Sequence[str] = ()
+    channels: Sequence[str] = ()
+    notes: Sequence[str] = field(default=())
+
+
+class AbstractView(abc.ABC):
+    """A kind of view: turns frames into pictures, one after another, in the order of their numbers."""
+
+    scene: Scene
+
+    @abc.abstractmethod
+    def picture(self, frame: LiveFrame) -> Picture:
+        """The picture of a frame; a refused frame gives a picture without pixels, with the reason."""
+
+    @abc.abstractmethod
+    def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:
+        """Take the mean of frames (N, M) of the undisturbed sensor, volts, as the new reference.
+
+        Raises `ValueError` for frames that cannot be a reference; the old one stays.
+        """

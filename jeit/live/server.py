@@ -1,0 +1,115 @@
+"""Serve the page of a live session: on this machine alone, unless another host is asked for, and then with a token."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import socket
+import threading
+from collections.abc import Callable
+from ipaddress import ip_address
+from urllib.parse import quote
+
+from jeit.arguments.extras import need_extra
+from jeit.live.page.hub import Hub
+from jeit.live.session import Session
+
+
+def serve(
+    session: Session,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    token: str | None = None,
+    opened: Callable[[str], None] | None = None,
+    stay: bool = False,
+) -> None:
+    """Serve the page of a started session until the session ends, or until Ctrl-C.
+
+    `host`, `port`: where to listen; port 0 takes a free one. `token`: what the address must hold; one is made for a
+    host that other machines reach. `opened` is called with the page's address once it can be opened. `stay`: stay until
+    Ctrl-C when the session has ended, so that its last minute can be looked at.
+
+    Raises `OSError` if the address is taken or not this machine's, and `ImportError` without the extra `live`.
+    """
+    need_extra("live", "a page in the browser")
+    import uvicorn
+
+    from jeit.live.page.application import make_application
+    from jeit.live.page.guard import is_loopback
+    from jeit.live.page.wire import LONGEST_COMMAND
+
+    if token is None and not is_loopback(host):
+        token = secrets.token_urlsafe(24)
+    hub = Hub(session)
+    listening = _listen(host, port)
+    with listening:
+        config = uvicorn.Config(
+            make_application(hub, host=host, token=token),
+            log_level="error",
+            access_log=False,  # it would hold the token
+            ws="websockets-sansio",
+            ws_max_size=LONGEST_COMMAND,
+            ws_max_queue=64,
+            ws_per_message_deflate=False,  # costs more time than it saves bytes
+            server_header=False,
+            proxy_headers=False,
+            limit_concurrency=200,
+            timeout_graceful_shutdown=2,
+        )
+        server = uvicorn.Server(config)
+        if not stay:
+            threading.Thread(target=_stop_at_end, args=(hub, server), daemon=True).start()
+        if opened is not None:
+            opened(_address(host, listening.getsockname()[1], token))
+        with contextlib.suppress(KeyboardInterrupt):
+            server.run(sockets=[listening])
+
+
+def _stop_at_end(hub: Hub, server: object) -> None:
+    hub.ended.wait()
+    server.should_exit = True  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    """Listen at a host and port, with an error that says what to do."""
+    if not 0 <= port <= 65535:
+        raise OSError(f"port: {port} is none; they go from 1 to 65535, and 0 takes a free one")
+    try:
+        family, kind, number, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    except (socket.gaierror, UnicodeError) as error:
+        raise OSError(f"cannot listen on {host!r}, port {port}: {error}") from error
+    listening = socket.socket(family, kind, number)
+    try:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(address)
+        listening.listen(128)
+    except OSError as error:
+        listening.close()
+        remedy = f"port {port} is taken or not allowed: choose another, or 0 for any free one"
+        raise OSError(error.errno, f"cannot listen on {host}, port {port} ({error.strerror}); {remedy}") from error
+    return listening
+
+
+def _address(host: str, port: int, token: str | None) -> str:
+    """The address to open; of a host that stands for all addresses, the one that other machines reach."""
+    shown = host
+    try:
+        if ip_address(host).is_unspecified:
+            shown = _own_address()
+        if ip_address(shown).version == 6:
+            shown = f"[{shown}]"
+    except ValueError:
+        pass
+    query = f"?token={quote(token, safe='')}" if token else ""
+    return f"http://{shown}:{port}/{query}"
+
+
+def _own_address() -> str:
+    """This machine's address in its network; nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+            return str(probe.getsockname()[0])
+        except OSError:
+            return "127.0.0.1"

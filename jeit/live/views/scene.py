@@ -1,0 +1,144 @@
+"""Scenes: outline, electrodes, channels and raster of a body, as a page draws them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from jeit.electrodes import AbstractElectrodes
+from jeit.image import Raster
+from jeit.live.pictures import Scene
+from jeit.mesh import Mesh
+from jeit.protocol import Protocol
+
+# Number of pixels along the longer side of an image, and of corners of a circle.
+_PIXELS, _CORNERS = 160, 36
+# Coefficient of a pattern, relative to its largest, below which an electrode takes no part.
+_NOTHING = 1e-9
+
+
+class PixelGrid:
+    """Raster of a plane mesh, or of a slice through a solid at half its height, for images of a page.
+
+    `extent`: x of the left and right edge, y of the lower and upper edge, metres. Raises `ValueError` for a surface in
+    space.
+    """
+
+    def __init__(self, mesh: Mesh, longest: int = _PIXELS):
+        points = np.asarray(mesh.points)[:, :2]
+        (x_min, y_min), (x_max, y_max) = points.min(axis=0), points.max(axis=0)
+        size = max(x_max - x_min, y_max - y_min) / longest
+        shape = max(1, round((y_max - y_min) / size)), max(1, round((x_max - x_min) / size))
+        raster = Raster.create(mesh, shape=shape, extent=(x_min, x_max, y_min, y_max))
+        cell = np.asarray(raster.cell)
+        self.extent = raster.extent
+        self._inside = np.flatnonzero(cell.ravel() >= 0)
+        self._cell = cell.ravel()[self._inside]
+        self._blank = np.full(shape, np.nan, np.float32)
+
+    @property
+    def inside(self) -> np.ndarray:
+        """True for pixels (H, W) in the body."""
+        found = np.zeros(self._blank.size, bool)
+        found[self._inside] = True
+        return found.reshape(self._blank.shape)
+
+    def __call__(self, image: Float[np.ndarray, " m"]) -> Float[np.ndarray, "H W"]:
+        """Pixels (H, W) of an image (m,) on the cells, single precision; NaN outside the body."""
+        pixels = self._blank.copy()
+        pixels.ravel()[self._inside] = image[self._cell]
+        return pixels
+
+
+def scene_of(
+    mesh: Mesh,
+    electrodes: AbstractElectrodes,
+    protocol: Protocol,
+    grid: PixelGrid,
+    *,
+    title: str,
+    quantity: str,
+    unit: str,
+    diverging: bool,
+    notes: Sequence[str] = (),
+) -> Scene:
+    """The scene of a body with electrodes, whose images are sampled on `grid`."""
+    outline = closed_outline(mesh) if mesh.dimension == 2 else _slice_outline(grid)
+    names = [str(number) for number in range(1, electrodes.num_electrodes + 1)]
+    return Scene(
+        title=title,
+        quantity=quantity,
+        unit=unit,
+        diverging=diverging,
+        extent=grid.extent,
+        outline=outline,
+        electrodes=electrode_curves(mesh, electrodes),
+        names=names,
+        channels=channel_names(protocol),
+        notes=tuple(notes),
+    )
+
+
+def channel_names(protocol: Protocol) -> list[str]:
+    """Names of the channels of a protocol, such as "1-2 → 3-4": electrodes that drive and that measure, from 1."""
+    drive, measurement = np.asarray(protocol.channel_drive), np.asarray(protocol.channel_measurement)
+    return [f"{_pattern(one)} → {_pattern(other)}" for one, other in zip(drive, measurement, strict=True)]
+
+
+def electrode_curves(mesh: Mesh, electrodes: AbstractElectrodes) -> list[Float[np.ndarray, "n 2"]]:
+    """A curve (n, 2) of each electrode as seen from above, metres; a single point for an electrode without a size."""
+    pen = _CurvePen()
+    electrodes.draw(mesh, pen)
+    return pen.curves
+
+
+def _pattern(row: np.ndarray) -> str:
+    """Electrodes of a pattern: those with positive before those with negative coefficients; "…" for more than two."""
+    size = np.abs(row).max()
+    plus, minus = (np.flatnonzero(sign * row > _NOTHING * size) + 1 for sign in (1, -1))
+    if len(plus) + len(minus) > 2:
+        return f"{(plus if len(plus) else minus)[0]}…"
+    return "-".join(map(str, (*plus, *minus)))
+
+
+def closed_outline(mesh: Mesh) -> list[Float[np.ndarray, "n 2"]]:
+    """Closed curves (n, 2) along the boundary of a plane mesh, metres."""
+    facets, points = np.asarray(mesh.facets), np.asarray(mesh.points)
+    starts = np.flatnonzero(np.append(True, facets[1:, 0] != facets[:-1, 1]))
+    return [points[np.append(part[:, 0], part[0, 0])] for part in np.split(facets, starts[1:])]
+
+
+def _slice_outline(grid: PixelGrid) -> list[np.ndarray]:
+    """Edge of a slice through a solid, where the pixels end."""
+    from contourpy import contour_generator
+
+    inside = np.pad(grid.inside.astype(float), 1)
+    rows, columns = grid.inside.shape
+    x_min, x_max, y_min, y_max = grid.extent
+    x = x_min + (np.arange(-1, columns + 1) + 0.5) * (x_max - x_min) / columns
+    y = y_max - (np.arange(-1, rows + 1) + 0.5) * (y_max - y_min) / rows
+    return [np.asarray(line) for line in contour_generator(x, y, inside).lines(0.5)]
+
+
+class _CurvePen:
+    """Collector of electrodes as curves; see `jeit.electrodes.electrodes.ElectrodePen`."""
+
+    def __init__(self):
+        self.curves: list[np.ndarray] = []
+
+    def lines(self, pieces: list[np.ndarray], middle: np.ndarray) -> None:
+        self.curves.append(np.concatenate([np.asarray(one)[:, :2] for one in pieces]) if pieces else middle[None, :2])
+
+    def disc(self, middle: np.ndarray, radius: float) -> None:
+        angle = np.linspace(0, 2 * np.pi, _CORNERS + 1)
+        circle = np.column_stack([np.cos(angle), np.sin(angle)])
+        self.curves.append(np.asarray(middle)[:2] + float(radius) * circle)
+
+    def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) / 2
+        self.curves.append(np.asarray(middle)[:2] + corners * [width, height])
+
+    def dot(self, middle: np.ndarray) -> None:
+        self.curves.append(np.asarray(middle)[None, :2])

@@ -1,0 +1,91 @@
+"""Quality of a live stream, against frames whose noise, dead and drifting electrodes are known."""
+
+import numpy as np
+import pytest
+from small_sensor import CHANNELS, NOISE, PROTOCOL, measured, noisy, rest
+
+from jeit.live.pictures import LiveFrame
+from jeit.live.quality import Quality, QualityWatch, RateWatch
+
+
+def looked(frames, watch=None, times=1):
+    watch = QualityWatch(measured()) if watch is None else watch
+    quality = watch.look()
+    for _ in range(times):
+        for number, values in enumerate(frames):
+            watch.add(LiveFrame(number, 0.0, 0.0, values))
+        quality = watch.look()
+    return quality
+
+
+def reciprocity_of(frames):
+    found = looked(frames).reciprocity
+    assert found is not None
+    return found
+
+
+def test_noise_is_that_of_the_frames_also_while_something_moves():
+    random = np.random.default_rng(0)
+    moving = 0.2 * np.sin(0.05 * np.arange(32))[:, None] * random.uniform(size=CHANNELS) * rest()
+    for frames in (noisy(32), noisy(32) + moving):
+        assert looked(frames).noise == pytest.approx(NOISE, rel=0.25)
+
+
+def test_reciprocity_is_that_of_the_mean_frame():
+    assert 0 < reciprocity_of(noisy(32)) < 1e-4
+    spoilt = noisy(32) * np.where(np.arange(CHANNELS) < CHANNELS // 2, 1.1, 1.0)
+    assert reciprocity_of(spoilt) > 0.02
+
+
+@pytest.mark.parametrize("lost", [np.nan, 0.0, 5.0])
+@pytest.mark.parametrize("dead", [[2], [1, 6]])
+def test_dead_electrodes_are_named_and_their_neighbours_are_not(lost, dead):
+    frames = noisy(32)
+    frames[:, PROTOCOL.channels_touching(dead)] = lost
+    assert list(looked(frames).dead) == dead
+
+
+def test_a_strong_touch_is_no_dead_electrode():
+    frames = noisy(32)
+    frames[:, np.random.default_rng(1).permutation(CHANNELS) < 0.45 * CHANNELS] *= 1.8
+    assert list(looked(frames).dead) == []
+
+
+def test_an_electrode_drifts_if_its_channels_stay_off():
+    frames = noisy(32)
+    frames[:, PROTOCOL.channels_touching([4])] *= 1.12
+    watch = QualityWatch(measured())
+    assert list(looked(frames, watch, times=5).drifting) == []
+    assert list(looked(frames, watch, times=20).drifting) == [4]
+    assert list(looked(frames, watch).dead) == []
+    watch.renew(frames)
+    assert list(looked(frames, watch, times=30).drifting) == []
+
+
+def test_a_touch_that_passes_is_no_drift():
+    touched, still = noisy(32), noisy(32)
+    touched[:, PROTOCOL.channels_touching([4])] *= 1.3
+    watch, quality = QualityWatch(measured()), Quality()
+    for _ in range(10):
+        looked(still, watch, times=2)
+        quality = looked(touched, watch, times=1)
+    assert list(quality.drifting) == []
+
+
+def test_few_frames_text_and_other_sensors_give_nothing():
+    watch = QualityWatch(measured())
+    for values in (*["text"] * 20, *np.zeros((20, 3)), *noisy(3)):
+        watch.add(LiveFrame(0, 0.0, 0.0, values))
+    assert watch.look().noise is None
+    alone = QualityWatch(None)
+    assert looked(noisy(32), alone).noise == pytest.approx(NOISE, rel=0.25)
+    assert looked(noisy(32), alone).reciprocity is None
+    assert looked(np.full((32, CHANNELS), np.nan)).noise is None
+    assert looked(np.full((32, CHANNELS), np.inf)).noise is None
+    assert looked(np.random.default_rng(0).uniform(-1e300, 1e300, (32, CHANNELS))).noise is None
+
+
+def test_a_rate_that_doubles_is_reported_once():
+    watch = RateWatch()
+    said = [watch(rate) for rate in (0, 59, 61, 60, 60, 90, 60, 119, 120, 121, 120, 118, 0)]
+    assert [one for one in said if one] == ["The frame rate has changed from 60 to 121 frames a second."]

@@ -1,0 +1,496 @@
+"""The page of a live session in a real browser, Debian's Chromium, driven by Playwright.
+
+What is drawn is read from the canvas: the place of a Gaussian and of a rod, which are known, against the place of the
+strongest colour; each button, key and field by what it changes. Skipped where there is no browser or no Playwright.
+"""
+
+import os
+import shutil
+import signal
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stand_in import StandIn
+
+playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
+pytest.importorskip("uvicorn", reason="the page needs the extra live")
+
+from jeit.live.server import serve  # noqa: E402, after its server was found
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs a browser: apt-get install chromium"),
+]
+
+# Where the image is strongest, and the box of the electrodes, which are dark, and of which one is at each end of both
+# axes: pixels of the canvas; and how many pixels have strong colours.
+LOOK = """() => {
+  const canvas = document.getElementById("image");
+  const { width, height } = canvas;
+  const copy = new OffscreenCanvas(width, height).getContext("2d", { willReadFrequently: true });
+  copy.drawImage(canvas, 0, 0);
+  const data = copy.getImageData(0, 0, width, height).data;
+  const right = width - (width < 520 ? 62 : 84);
+  const columns = new Int32Array(width), rows = new Int32Array(height);
+  let x = 0, y = 0, sum = 0, count = 0;
+  for (let row = 0; row < height; row += 1) {
+    for (let column = 0; column < right; column += 1) {
+      const at = 4 * (row * width + column);
+      const [red, green, blue] = [data[at], data[at + 1], data[at + 2]];
+      const dark = Math.max(red, green, blue) < 80 && row > 30 && row < height - 30;
+      columns[column] += dark;
+      rows[row] += dark;
+      const weight = Math.max(0, blue - red - 60);
+      x += weight * (column + 0.5); y += weight * (row + 0.5); sum += weight; count += weight > 0;
+    }
+  }
+  const ends = (counts) => [counts.findIndex((one) => one > 12), counts.findLastIndex((one) => one > 12) + 1];
+  const box = [...ends(columns), ...ends(rows)];
+  return { x: x / sum, y: y / sum, box, count };
+}"""
+
+
+@pytest.fixture
+def serving():
+    """Start a session and serve it; gives the address. It ends after the pages are closed."""
+    running = []
+
+    def start(session, **options):
+        opened, addresses = threading.Event(), []
+        options |= {"opened": lambda address: (addresses.append(address), opened.set())}
+        thread = threading.Thread(target=serve, args=(session,), kwargs=options)
+        session.__enter__()
+        thread.start()
+        running.append((session, thread))
+        assert opened.wait(10)
+        return addresses[0]
+
+    yield start
+    for session, thread in running:
+        session.stop()
+        thread.join(10)
+        assert not thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as driver:
+        program = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield program
+        program.close()
+
+
+@pytest.fixture
+def open_page(browser, serving):
+    """Open an address in a window of its own; whatever the console reports as an error fails the test."""
+    contexts, faults = [], []
+
+    def opened(address, width=1280, height=800, theme="light"):
+        context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme)
+        contexts.append(context)
+        page = context.new_page()
+        page.on(
+            "console", lambda message: faults.append(message.text) if message.type in ("error", "warning") else None
+        )
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.goto(address)
+        return page
+
+    yield opened
+    for context in contexts:
+        context.close()
+    assert faults == []
+
+
+def until(condition, seconds=5.0):
+    """Wait for a condition, and say whether it came."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def resident_memory():
+    """Memory of this process, bytes."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def drawn(page):
+    """Number of the frame whose picture is drawn; -1 before the first."""
+    return int(page.get_attribute("#image", "data-number") or -1)
+
+
+def shows(page, number):
+    """Wait until the picture of a frame is drawn."""
+    assert until(lambda: drawn(page) == number, 10), (number, drawn(page))
+
+
+def place(look, radius=0.1):
+    """Place of the strongest colour, metres, by the box of the electrodes."""
+    left, right, top, bottom = look["box"]
+    scale = 2 * radius / (right - left)
+    assert abs((bottom - top) - (right - left)) < 4
+    return np.array([look["x"] - (left + right) / 2, (top + bottom) / 2 - look["y"]]) * scale
+
+
+def text(page, name):
+    return page.inner_text(f"#{name}")
+
+
+@pytest.mark.parametrize("width", [400, 1280, 2000])
+def test_gaussian_appears_where_it_is(serving, open_page, width):
+    """The strongest colour is within 4 mm of the Gaussian, whose label hides a part of it, at each width and time."""
+    session = StandIn(None)
+    address = serving(session)
+    page = open_page(address, width, 1000)
+    for number, second in enumerate((0.7, 2.9, 4.8, 7.1)):
+        session.publish(number, second)
+        shows(page, number)
+        found = place(page.evaluate(LOOK))
+        assert np.linalg.norm(found - session.place(second)) < 4e-3, (second, found)
+
+
+def test_rod_of_the_demonstration_appears_where_it_is(serving, open_page):
+    """The strongest colour is within 10 mm of the simulated rod in a picture of `jeit live demo`."""
+    from jeit.live.session import Session
+    from jeit.live.simulated import simulated_tank
+    from jeit.live.views.conductivity import ConductivityView
+
+    source = simulated_tank(30.0)
+    address = serving(Session(source, ConductivityView.prepare(source.reference)))
+    page = open_page(address)
+    assert until(lambda: drawn(page) > 5, 10)
+    first = drawn(page)
+    for _ in range(3):
+        page.click("#pause")
+        time.sleep(0.3)
+        second = float(page.get_attribute("#image", "data-second"))
+        found = place(page.evaluate(LOOK))
+        assert np.linalg.norm(found - source.truth(second)) < 10e-3, (second, found, source.truth(second))
+        page.click("#pause")
+        time.sleep(0.7)
+    assert drawn(page) > first + 10
+
+
+def test_measurement_buttons(serving, open_page):
+    """Reference, event and recording reach the session, with what is typed, and the page shows what came of them."""
+    session = StandIn()
+    address = serving(session)
+    page = open_page(address)
+    page.wait_for_selector("#image[data-number]")
+    page.press("#count", "ControlOrMeta+a")
+    page.type("#count", "12")
+    page.click("#reference")
+    page.type("#label", "<i>rod</i> in")
+    page.press("#label", "Enter")
+    assert until(lambda: len(session.asked) == 2)
+    page.press("#label", "ControlOrMeta+a")
+    page.press("#label", "Delete")
+    page.click("#image")
+    page.keyboard.press("m")
+    page.click("#record")
+    assert until(lambda: text(page, "recording") == "12 frames, 34.6 kB")
+    assert (text(page, "record"), page.get_attribute("#recording", "title")) == ("Stop recording", "recordings/one")
+    page.click("#record")
+    assert until(lambda: text(page, "recording") == "not recording")
+    assert session.asked == [
+        ("reference", 12),
+        ("mark", "<i>rod</i> in"),
+        ("mark", "event"),
+        ("record", True),
+        ("record", False),
+    ]
+    assert until(lambda: "Event: <i>rod</i> in" in text(page, "messages"))
+    assert page.locator("#messages i").count() == 0
+    page.fill("#count", "0")
+    page.click("#reference")
+    assert until(lambda: "whole number" in text(page, "banner"))
+    assert len(session.asked) == 5
+
+
+def test_pause_and_steps(serving, open_page):
+    """Pause stops the picture, steps show neighbours, the slider goes back in time, and going on shows the newest."""
+    session = StandIn(30.0)
+    address = serving(session)
+    page = open_page(address)
+    assert until(lambda: drawn(page) > 60, 10)
+    page.click("#pause")
+    time.sleep(0.3)
+    number = drawn(page)
+    time.sleep(0.3)
+    assert drawn(page) == number
+    assert text(page, "pause") == "Go on"
+    for action, by in (("#back", -1), ("#back", -2), ("#on", -1)):
+        page.click(action)
+        shows(page, number + by)
+    assert text(page, "ago").startswith("−0.0")
+    page.click("#readout")
+    page.keyboard.press("Shift+ArrowLeft")
+    shows(page, number - 11)
+    page.keyboard.press("ArrowRight")
+    shows(page, number - 10)
+    page.evaluate("when => { when.value = -1; when.dispatchEvent(new Event('input')); }", page.query_selector("#when"))
+    assert until(lambda: abs(drawn(page) - (number - 30)) <= 6)
+    page.keyboard.press(" ")
+    assert until(lambda: drawn(page) > number + 20)
+    assert (text(page, "pause"), text(page, "ago")) == ("Pause", "now")
+
+
+def test_colours(serving, open_page):
+    """Scale fitted and kept, its limit typed, values hidden, pixels smoothed, light and dark: each as it says."""
+    session = StandIn(None)
+    address = serving(session)
+    page = open_page(address)
+    session.publish(0, 1.0)
+    shows(page, 0)
+    assert page.input_value("#limit") == "4.00"
+    assert text(page, "limit-unit") == "mS/m"
+    fitted = page.evaluate(LOOK)
+    page.press("#limit", "ControlOrMeta+a")
+    page.type("#limit", "40")
+    page.press("#limit", "Enter")
+    assert page.get_attribute("#fit", "aria-pressed") == "false"
+    assert until(lambda: page.evaluate(LOOK)["count"] < 0.2 * fitted["count"])
+    page.fill("#limit", "nonsense")
+    page.press("#limit", "Enter")
+    assert until(lambda: "type a number" in text(page, "banner"))
+    assert page.input_value("#limit") == "40.0"
+    page.click("#fit")
+    assert until(lambda: page.input_value("#limit") == "4.00")
+    page.keyboard.press("f")
+    assert page.get_attribute("#fit", "aria-pressed") == "false"
+    page.click("#fit")
+    for _ in range(16):
+        page.keyboard.press("]")
+    assert text(page, "threshold-value") == "80 %"
+    assert until(lambda: page.evaluate(LOOK)["count"] < 0.5 * fitted["count"])
+    for _ in range(16):
+        page.keyboard.press("[")
+    picture = "() => document.getElementById('image').toDataURL()"
+    seen = set()
+    for choice in ("pixels", "0", "1", "2"):
+        page.select_option("#smoothing", choice)
+        time.sleep(0.2)
+        seen.add(page.evaluate(picture))
+    assert len(seen) == 4
+    paper = "() => getComputedStyle(document.body).backgroundColor"
+    light = page.evaluate(paper)
+    page.click("#theme")
+    assert page.evaluate(paper) != light
+    page.keyboard.press("l")
+    assert page.evaluate(paper) == light
+
+
+def test_pictures_and_films_are_saved(serving, open_page):
+    """The picture is a PNG of the canvas' size, the film a video; both are downloads with names of their own."""
+    session = StandIn()
+    address = serving(session)
+    page = open_page(address)
+    page.wait_for_selector("#image[data-number]")
+    with page.expect_download() as download:
+        page.click("#save")
+    content = download.value.path().read_bytes()
+    assert download.value.suggested_filename.endswith(".png")
+    assert content[:8] == b"\x89PNG\r\n\x1a\n"
+    size = page.evaluate("() => { const c = document.getElementById('image'); return [c.width, c.height]; }")
+    assert [int.from_bytes(content[at : at + 4], "big") for at in (16, 20)] == size
+    page.click("#film")
+    assert text(page, "film") == "Stop film"
+    time.sleep(1.5)
+    with page.expect_download() as download:
+        page.click("#film")
+    content = download.value.path().read_bytes()
+    assert download.value.suggested_filename.endswith((".webm", ".mp4"))
+    assert content[:4] == b"\x1aE\xdf\xa3" or content[4:8] == b"ftyp"
+    assert len(content) > 5000
+
+
+def test_regions_and_channels_are_followed(serving, open_page):
+    """A region drawn with the mouse, one set by keys, and a channel get a line each, and can be removed again."""
+    session = StandIn()
+    address = serving(session)
+    page = open_page(address)
+    page.wait_for_selector("#image[data-number]")
+    box = page.locator("#image").bounding_box()
+    x, y = box["x"] + box["width"] * 0.45, box["y"] + box["height"] * 0.5
+    page.mouse.move(x, y)
+    page.mouse.down()
+    for right, down in ((60, 0), (60, 60), (0, 60)):
+        page.mouse.move(x + right, y + down, steps=3)
+    page.mouse.up()
+    assert until(lambda: text(page, "regions") == "A\n×")
+    page.focus("#image")
+    page.keyboard.press("Shift+ArrowRight")
+    assert until(lambda: text(page, "readout").startswith("x 20.0 mm, y 0.0 mm: "))
+    page.keyboard.press("Enter")
+    assert until(lambda: "B" in text(page, "regions"))
+    page.type("#channel", "2-3")
+    page.press("#channel", "Enter")
+    page.fill("#channel", "7")
+    page.press("#channel", "Enter")
+    assert until(lambda: text(page, "channels").split() == ["2-3", "×", "7-8", "×"])
+    page.fill("#channel", "41")
+    page.press("#channel", "Enter")
+    assert until(lambda: "from 1 to 40" in text(page, "banner"))
+    coloured = """(name) => {
+      const canvas = document.getElementById(name);
+      const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+      copy.drawImage(canvas, 0, 0);
+      const data = copy.getImageData(0, 0, canvas.width, canvas.height).data;
+      let count = 0;
+      for (let at = 0; at < data.length; at += 4) count += Math.abs(data[at] - data[at + 2]) > 90;
+      return count;
+    }"""
+    for name in ("regions-trace", "channels-trace"):
+        assert until(lambda name=name: page.evaluate(coloured, name) > 40), name
+    page.click("[aria-label='Stop following A']")
+    page.click("[aria-label='Stop following B']")
+    page.click("[aria-label='Stop following 2-3']")
+    assert until(lambda: text(page, "channels").split() == ["7-8", "×"])
+    assert page.locator("#regions-trace").is_hidden()
+
+
+def test_what_is_wrong_is_shown(serving, open_page):
+    """Refused frames with reasons, dead electrodes in colour, a disk that is full, a device that is gone."""
+    session = StandIn(None)
+    warned = """() => {
+      const canvas = document.getElementById("image");
+      const copy = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+      copy.drawImage(canvas, 0, 0);
+      const data = copy.getImageData(0, 0, canvas.width - 84, canvas.height).data;
+      let count = 0;
+      for (let at = 0; at < data.length; at += 4) {
+        count += data[at] === 0xb3 && data[at + 1] === 0x40 && data[at + 2] === 0x0a;
+      }
+      return count;
+    }"""
+    address = serving(session)
+    page = open_page(address)
+    session.publish(0, 1.0)
+    shows(page, 0)
+    assert page.evaluate(warned) == 0
+    session.extra = {
+        "refused": 3,
+        "dropped": 17,
+        "reasons": {"half a line": 3},
+        "dead": ["4"],
+        "drifting": ["2", "7"],
+        "connection": "waiting: /dev/ttyUSB0 is unplugged",
+        "recording": {"folder": "one", "frames": 5, "bytes": 10, "problem": "The disk is full."},
+    }
+    assert until(lambda: text(page, "dead") == "4")
+    assert text(page, "drifting") == "2, 7"
+    assert (text(page, "refused"), text(page, "dropped"), text(page, "reasons")) == ("3", "17", "3 × half a line")
+    assert "unplugged" in text(page, "connection")
+    assert "The disk is full." in text(page, "recording")
+    assert until(lambda: page.evaluate(warned) > 50)
+    session.publish(1, 2.0, refused="41 channels, not 40")
+    assert until(lambda: text(page, "banner") == "Refused: 41 channels, not 40")
+    session.publish(2, 2.1)
+    assert until(lambda: page.locator("#banner").is_hidden())
+
+
+def test_two_browsers_and_a_sleeper(serving, open_page):
+    """Two pages each draw; one that is busy for seconds is sent nothing meanwhile, and wakes with the newest."""
+    session = StandIn()
+    address = serving(session)
+    one, two = open_page(address), open_page(address, 400, 800)
+    for page in (one, two):
+        assert until(lambda page=page: drawn(page) > 30, 10)
+    two.evaluate("() => { const end = performance.now() + 3000; while (performance.now() < end); }")
+    newest = session.last
+    assert until(lambda: drawn(two) > newest, 2.0)
+    assert until(lambda: float(text(one, "drawn").removesuffix(" /s")) > 20, 10)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="reads memory as Linux has it")
+def test_a_browser_asleep_for_a_minute(browser, serving):
+    """A browser that is stopped for a minute costs the session nothing, and shows the newest 3 s after it wakes."""
+    session, processes = StandIn(30.0), browser.new_browser_cdp_session()
+    page = browser.new_context().new_page()
+    page.goto(serving(session))
+    assert until(lambda: drawn(page) > 10, 10)
+    found = processes.send("SystemInfo.getProcessInfo")["processInfo"]
+    renderers = [process["id"] for process in found if process["type"] == "renderer"]
+    before = resident_memory()
+    for pid in renderers:
+        os.kill(pid, signal.SIGSTOP)
+    try:
+        time.sleep(60)
+    finally:
+        for pid in renderers:
+            os.kill(pid, signal.SIGCONT)
+    newest = session.last
+    assert newest > 1500
+    assert until(lambda: drawn(page) > newest, 3.0)
+    assert until(lambda: text(page, "connection") == "connected")
+    # The session itself keeps a picture of 64 × 64 for each frame.
+    assert resident_memory() - before < 60e6
+    page.context.close()
+
+
+def test_a_lost_server_is_found_again(browser, serving):
+    """When the server goes the page says so, and it draws again when the server is back."""
+    session, context = StandIn(), browser.new_context()
+    page = context.new_page()
+    address = serving(session)
+    page.goto(address)
+    page.wait_for_selector("#image[data-number]")
+    session.stop()
+    assert until(lambda: "cannot be reached" in text(page, "banner"))
+    port = int(address.rstrip("/").rpartition(":")[2])
+    serving(StandIn(), port=port)
+    assert until(lambda: page.locator("#banner").is_hidden(), 10)
+    assert until(lambda: text(page, "connection") == "connected")
+    context.close()
+
+
+def test_no_page_scrolls_sideways(serving, open_page):
+    """Nothing is wider than the window, from 400 to 2,000 pixels, and a wide one needs no scrolling at all."""
+    session = StandIn()
+    address = serving(session)
+    for width, height in ((400, 850), (600, 900), (900, 700), (1280, 800), (2000, 1100)):
+        page = open_page(address, width, height)
+        page.wait_for_selector("#image[data-number]")
+        size = page.evaluate("() => [document.body.scrollWidth, document.body.scrollHeight]")
+        assert size[0] <= width
+        assert size[1] <= height or width <= 860
+
+
+def lightness(colours):
+    """CIE lightness of sRGB colours (n, 3), and the colours as a person without green cones sees them.
+
+    Matrix of Machado, Oliveira and Fernandes, IEEE Trans. Vis. Comput. Graph. 15 (2009), for deuteranopia.
+    """
+    part = np.asarray(colours) / 255
+    linear = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+    luminance = linear @ [0.2126, 0.7152, 0.0722]
+    matrix = np.array([[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]])
+    return 116 * np.cbrt(luminance) - 16, linear @ matrix.T
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_colour_maps_are_even_and_readable(serving, open_page, theme):
+    """Lightness runs one way from end to end, or from the middle; ends stay apart for those without green cones."""
+    address = serving(StandIn())
+    page = open_page(address)
+    read = """async ([diverging, theme]) =>
+      Array.from((await import(new URL("colours.js", location.href))).colourMap(diverging, theme))"""
+    sequential = np.reshape(page.evaluate(read, [False, theme]), (256, 3))
+    diverging = np.reshape(page.evaluate(read, [True, theme]), (256, 3))
+    light, _ = lightness(sequential)
+    assert np.all(np.diff(light) > -0.3)
+    assert np.ptp(light) > 60
+    light, seen = lightness(diverging)
+    outward = np.sign(np.diff(light)) * (1 if theme == "dark" else -1)
+    assert np.mean(outward[:126] <= 0) > 0.98
+    assert np.mean(outward[129:] >= 0) > 0.98
+    assert np.abs(light[0] - light[-1]) < 12
+    assert np.linalg.norm(seen[0] - seen[-1]) > 0.25

@@ -1,0 +1,267 @@
+"""Sources against devices that are played here: a pseudo-terminal, a server, a pipe, a folder; lost and found again."""
+
+import contextlib
+import os
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+from small_sensor import CHANNELS, measured, noisy
+
+from jeit.data import write_table
+from jeit.live import folder_source, line_source
+from jeit.live.connections import SerialPort, Server, StandardInput, connection_to
+from jeit.live.folder_source import WatchedFolder
+from jeit.live.line_source import LineSource
+from jeit.live.lines import LineReading
+from jeit.live.sources import PlayedRecording, open_source
+
+FRAMES = noisy(12)
+posix = pytest.mark.skipif(os.name != "posix", reason="needs pseudo-terminals and pipes of POSIX")
+
+
+def line(values):
+    return (", ".join(map(repr, values.tolist())) + "\n").encode()
+
+
+class Reading:
+    """A source that is read by a thread, which keeps the frames."""
+
+    def __init__(self, source):
+        self.source, self.frames = source, []
+        self.thread = threading.Thread(target=self._read, daemon=True)
+
+    def _read(self):
+        for one in self.source:
+            self.frames.append(one)
+
+    def __enter__(self):
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.source.close()
+        self.thread.join(5)
+        assert not self.thread.is_alive()
+
+    def wait(self, condition, seconds=5.0):
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, (len(self.frames), self.source.connection, list(self.source.messages))
+            time.sleep(0.005)
+
+    def said(self, word):
+        return any(word in text for _, text in self.source.messages)
+
+    @property
+    def numbers(self):
+        return [one.values for one in self.frames if not isinstance(one.values, str)]
+
+    @property
+    def texts(self):
+        return [one.values for one in self.frames if isinstance(one.values, str)]
+
+
+def are_due(seconds, expected):
+    """Whether frames come when they should: none early, and most of them soon, whatever else the machine does."""
+    late = np.asarray(seconds) - expected
+    return late.min() > -1e-3 and np.median(late) < 0.05
+
+
+@pytest.fixture(autouse=True)
+def _soon(monkeypatch):
+    monkeypatch.setattr(line_source, "_FIRST_DELAY", 0.02)
+    monkeypatch.setattr(line_source, "_WAIT", 0.02)
+
+
+@posix
+def test_lines_of_a_pipe_with_garbage_between_them():
+    read, write = os.pipe()
+    with Reading(LineSource("-", StandardInput(read), LineReading(None, measured()))) as reading:
+        content = line(FRAMES[0])
+        os.write(write, content[:50])
+        time.sleep(0.05)
+        assert reading.frames == []
+        os.write(write, content[50:] + b"\xff\xfe garbage\n# ready\n" + line(FRAMES[1])[:-30] + b"\n" + line(FRAMES[2]))
+        os.write(write, line(FRAMES[3]).strip())
+        os.close(write)
+        reading.wait(lambda: reading.source.connection == "ended")
+    np.testing.assert_array_equal([reading.numbers[one] for one in (0, 2, 3)], FRAMES[[0, 2, 3]])
+    assert len(reading.numbers[1]) < CHANNELS
+    assert reading.texts == ["\ufffd\ufffd garbage"]
+    assert [one.number for one in reading.frames] == list(range(5))
+    assert reading.said("The device sends: # ready")
+    os.close(read)
+
+
+@posix
+def test_lines_that_have_arrived_are_played_at_a_rate():
+    read, write = os.pipe()
+    os.write(write, b"".join(map(line, FRAMES)))
+    os.close(write)
+    source = LineSource("-", StandardInput(read), LineReading(), rate=100)
+    seconds = [one.second for one in source]
+    assert are_due(seconds, np.arange(12) / 100)
+    os.close(read)
+
+
+@posix
+def test_a_serial_device_unplugged_and_plugged_in_again(tmp_path):
+    """A link names the device, as those of udev do: it vanishes, and then names another pseudo-terminal."""
+    pytest.importorskip("serial")
+    name = tmp_path / "device"
+
+    def plug():
+        leader, follower = os.openpty()
+        import tty
+
+        tty.setraw(follower)
+        name.unlink(missing_ok=True)
+        name.symlink_to(os.ttyname(follower))
+        return leader, follower
+
+    source = open_source(f"serial:{name}@115200", reference=measured())
+    with Reading(source) as reading:
+        reading.wait(lambda: source.connection.startswith("waiting"))
+        assert reading.said(f"Not connected: could not open port {name} (serial devices here: ")
+        leader, follower = plug()
+        reading.wait(lambda: source.connection == "connected")
+        os.write(leader, line(FRAMES[4])[4:] + line(FRAMES[0]) + line(FRAMES[1]) + line(FRAMES[2])[:40])
+        reading.wait(lambda: len(reading.frames) == 3)
+        os.close(follower)
+        name.unlink()
+        os.close(leader)
+        reading.wait(lambda: source.connection.startswith("waiting"))
+        leader, follower = plug()
+        reading.wait(lambda: source.connection == "connected")
+        os.write(leader, line(FRAMES[3]))
+        reading.wait(lambda: len(reading.numbers) == 3)
+        assert reading.said("Connection lost")
+        assert reading.said("Connected")
+    np.testing.assert_array_equal(reading.numbers, FRAMES[[0, 1, 3]])
+    begun, cut = reading.texts
+    assert begun.startswith("begun before connecting: ")
+    assert cut.startswith("cut off: ")
+    os.close(leader)
+    os.close(follower)
+
+
+def test_a_server_that_goes_and_comes_back():
+    listening = socket.create_server(("127.0.0.1", 0))
+    port = listening.getsockname()[1]
+    source = open_source(f"tcp:127.0.0.1:{port}", reference=measured())
+    with Reading(source) as reading:
+        for sent in (FRAMES[:5], FRAMES[5:]):
+            peer, _ = listening.accept()
+            with peer:
+                for one in sent:
+                    peer.sendall(line(one))
+                reading.wait(lambda sent=sent: len(reading.frames) >= (5 if len(sent) == 5 else 12))
+        assert reading.said("the other side has closed the connection")
+    listening.close()
+    np.testing.assert_array_equal(reading.numbers, FRAMES)
+
+
+def test_a_server_that_is_not_there_is_waited_for_and_can_be_given_up():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    with Reading(LineSource("tcp", Server("127.0.0.1", port), LineReading())) as reading:
+        reading.wait(lambda: reading.source.connection.startswith("waiting"))
+    assert sum("Not connected" in text for _, text in reading.source.messages) == 1
+
+
+def test_a_silent_device_is_reported(monkeypatch):
+    monkeypatch.setattr(line_source, "_SILENT", 0.05)
+    listening = socket.create_server(("127.0.0.1", 0))
+    source = LineSource("tcp", Server("127.0.0.1", listening.getsockname()[1]), LineReading())
+    with Reading(source) as reading:
+        peer, _ = listening.accept()
+        reading.wait(lambda: source.connection == "waiting: the device sends nothing")
+        peer.sendall(line(FRAMES[0]))
+        reading.wait(lambda: source.connection == "connected")
+        peer.close()
+    listening.close()
+
+
+def test_files_that_appear_in_a_folder_are_frames(tmp_path, monkeypatch):
+    monkeypatch.setattr(folder_source, "_PATIENCE", 0.1)
+    reference = measured()
+    (tmp_path / "old.csv").write_bytes(line(FRAMES[0]))
+    source = open_source(str(tmp_path), reference=reference)
+    assert isinstance(source, WatchedFolder)
+    with Reading(source) as reading:
+        time.sleep(0.05)
+        for number in (1, 2):
+            (tmp_path / f"frame{number}.csv").write_bytes(line(FRAMES[number]))
+            reading.wait(lambda number=number: len(reading.frames) == number)
+        with (tmp_path / "frame3.csv").open("wb") as file:  # written in two parts
+            file.write(line(FRAMES[3])[:100])
+            file.flush()
+            time.sleep(0.06)
+            file.write(line(FRAMES[3])[100:])
+        reading.wait(lambda: len(reading.frames) == 3)
+        (tmp_path / ".hidden.csv").write_bytes(line(FRAMES[4]))
+        (tmp_path / "broken.csv").write_bytes(b"no numbers\n")
+        reading.wait(lambda: len(reading.frames) == 4)
+        write_table(reference.frames(slice(0, 2)), tmp_path / "many.npz")
+        reading.wait(lambda: len(reading.frames) == 6)
+    assert reading.said("Left out: 1 file")
+    np.testing.assert_array_equal(reading.numbers, [*FRAMES[1:4], *np.asarray(reference.voltages)[:2]])
+    assert "broken.csv" in reading.texts[0]
+
+
+def test_a_file_is_read_once_it_keeps_its_size(tmp_path):
+    source = open_source(str(tmp_path), reference=measured())
+    assert isinstance(source, WatchedFolder)
+    path = tmp_path / "frame.csv"
+    path.write_bytes(line(FRAMES[0]))
+    assert list(source._file(path.name, path.stat().st_size)) == []
+    path.write_bytes(line(FRAMES[0]) + line(FRAMES[1]))
+    assert list(source._file(path.name, path.stat().st_size)) == []
+    assert len(list(source._file(path.name, path.stat().st_size))) == 2
+
+
+def test_a_recording_is_played_at_its_own_rate_or_another():
+    frames, times = noisy(10), 7.0 + np.arange(10) / 50
+    for rate, expected in ((None, 50), (200, 200)):
+        seconds = [one.second for one in PlayedRecording("made", frames, times, rate)]
+        assert are_due(seconds, np.arange(10) / expected)
+    untimed = PlayedRecording("made", frames[:3])
+    assert "no times" in untimed.messages[0][1]
+    assert [len(one.values) for one in untimed] == [CHANNELS] * 3
+
+
+def test_a_file_is_opened_as_a_recording(tmp_path):
+    path, _ = write_table(measured(4), tmp_path / "tank.npz")
+    found = [one.values for one in open_source(str(path), rate=1000)]
+    np.testing.assert_array_equal(found, measured(4).voltages)
+
+
+WRONG = ["serial:", "serial:@9600", "serial:/dev/x@fast", "serial:/dev/x@0", "tcp:host", "tcp::80", "tcp:h:99999"]
+
+
+@pytest.mark.parametrize("text", [*WRONG, "demo:cat", "/no/such/file", "http:example", ""])
+def test_a_text_that_names_no_source_is_refused_with_advice(text):
+    with pytest.raises(ValueError, match=r"give|Give|there is no|demo"):
+        open_source(text)
+
+
+def test_addresses_are_taken_apart():
+    server = connection_to("tcp:[::1]:5000")
+    assert isinstance(server, Server)
+    assert (server.host, server.port) == ("::1", 5000)
+    with contextlib.suppress(ImportError):
+        device = connection_to("serial:/dev/serial/by-id/usb-A@B@57600")
+        assert isinstance(device, SerialPort)
+        assert (device.port, device.baud) == ("/dev/serial/by-id/usb-A@B", 57600)
+        other = connection_to("serial:COM3")
+        assert isinstance(other, SerialPort)
+        assert other.baud == 115200
+
+
+@pytest.mark.parametrize("rate", [0, -1, float("nan"), float("inf")])
+def test_a_rate_is_positive(rate):
+    with pytest.raises(ValueError, match="rate must be positive"):
+        open_source("-", rate=rate)
