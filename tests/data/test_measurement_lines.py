@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from conftest import disk_voltages
 
 from jeit import data, protocol
 
@@ -21,9 +20,9 @@ def hexadecimal(frame, scale=1e5):
     return "!V " + ",".join(f"{one:08X}" for one in words)
 
 
-def test_lines_of_a_cn0565(tmp_path):
+def test_lines_of_a_cn0565(tank, tmp_path):
     """With times before them, answers between them, a lost character, and a last line that is cut off."""
-    frame = disk_voltages(FIXED) * (1 + 0.2j)
+    frame = tank(FIXED) * (1 + 0.2j)
     line = hexadecimal(frame)
     text = f"OK\n[10:00:01] {line}\r\n!C 0\nOK\n{line[:-30]}{line}\n{line}\n{line[:100]}"
     (tmp_path / "a.log").write_text(text)
@@ -42,9 +41,9 @@ def test_lines_of_a_cn0565(tmp_path):
     assert data.reciprocity_error(found.frame(0)) < 1e-2
 
 
-def test_other_distances_of_a_cn0565_are_described(tmp_path):
+def test_other_distances_of_a_cn0565_are_described(tank, tmp_path):
     path, made = tmp_path / "a.txt", protocol.skip(8, 3, measurement_skipped=0, order="fixed", current=2e-3)
-    frame = disk_voltages(made, 0.1)
+    frame = tank(made, 0.1)
     path.write_text(hexadecimal(frame + 0j) + "\n")
     with pytest.raises(ValueError, match="32 voltages in a frame; with force and sense distance 1 they are 40 "):
         data.read(path)
@@ -72,10 +71,10 @@ def rows_of(frames, heading, first=0):
     return "\n".join(lines) + "\n"
 
 
-def test_a_logger_of_named_electrodes(tmp_path):
+def test_a_logger_of_named_electrodes(tank, tmp_path):
     """In any order of the lines; a line that is missing is masked, and columns of words are left out."""
     heading = "frame_id,block,k,f_plus_index,s_plus_index,s_minus_index,f_minus_index,real_raw,imag_raw"
-    frames = np.stack([disk_voltages(FIXED, change) for change in (0, 0.1)]) * (1 + 0.1j)
+    frames = np.stack([tank(FIXED, change) for change in (0, 0.1)]) * (1 + 0.1j)
     text = rows_of(frames, heading)
     (tmp_path / "a.csv").write_text(text)
     (tmp_path / "description.toml").write_text(RING + '8\n[data]\ncomponent = "complex"\n')
@@ -113,26 +112,26 @@ def unified(frame, radius=0.1, current=2.0):
     return UNIFIED.format(places=places, lines="\n".join(lines))
 
 
-def test_the_unified_data_format(tmp_path):
+def test_the_unified_data_format(tank, tmp_path):
     """With electrodes where the file places them, in its units."""
     made = protocol.adjacent(8, order="fixed", current=2e-3)
-    (tmp_path / "a.ohm").write_text(unified(disk_voltages(made)))
+    (tmp_path / "a.ohm").write_text(unified(tank(made)))
     no_places = RING.replace('layout = "ring"\n', "").replace("clockwise = true\nnumber = ", "")
     (tmp_path / "a.toml").write_text(no_places)
     found = data.read(tmp_path / "a.ohm")
     assert found.protocol.same_patterns(made)
-    np.testing.assert_allclose(found.voltages[0], disk_voltages(made), rtol=1e-8)
+    np.testing.assert_allclose(found.voltages[0], tank(made), rtol=1e-8)
     np.testing.assert_allclose(found.electrodes.position[0], [0, 0.1], atol=1e-9)
     # Resistances, of the reference's current.
     ohms = [f"{a + 1} {b + 1} {m + 1} {n + 1} {value / 2e-3}"
-            for (a, b, m, n), value in zip(QUADRUPOLES, disk_voltages(made), strict=True)]  # fmt: skip
+            for (a, b, m, n), value in zip(QUADRUPOLES, tank(made), strict=True)]  # fmt: skip
     (tmp_path / "b.dat").write_text("# a b m n r/Ohm\n" + "\n".join(ohms))
-    np.testing.assert_allclose(data.read(tmp_path / "b.dat", like=found).voltages[0], disk_voltages(made), rtol=1e-8)
+    np.testing.assert_allclose(data.read(tmp_path / "b.dat", like=found).voltages[0], tank(made), rtol=1e-8)
     # Apparent resistivities with their factors.
     (tmp_path / "c.dat").write_text(
         "# a b m n k rhoa\n" + "\n".join(f"{' '.join(one.split()[:4])} 2 {2 * float(one.split()[4])}" for one in ohms)
     )
-    np.testing.assert_allclose(data.read(tmp_path / "c.dat", like=found).voltages[0], disk_voltages(made), rtol=1e-8)
+    np.testing.assert_allclose(data.read(tmp_path / "c.dat", like=found).voltages[0], tank(made), rtol=1e-8)
     assert any("1 mA multiplies the resistances" in note for note in data.read(tmp_path / "b.dat").notes)
 
 
@@ -149,17 +148,17 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_what_is_wrong_in_a_line_is_named(name, tmp_path):
+def test_what_is_wrong_in_a_line_is_named(tank, name, tmp_path):
     old, new, said = FAULTS[name]
-    text = unified(disk_voltages(FIXED))
+    text = unified(tank(FIXED))
     assert old in text
     (tmp_path / "a.ohm").write_text(text.replace(old, new, 1))
     with pytest.raises(ValueError, match=said):
         data.read(tmp_path / "a.ohm", "quadrupoles")
 
 
-def test_a_file_of_fewer_lines_than_it_states(tmp_path):
-    (tmp_path / "a.ohm").write_text(unified(disk_voltages(FIXED))[:-60])
+def test_a_file_of_fewer_lines_than_it_states(tank, tmp_path):
+    (tmp_path / "a.ohm").write_text(unified(tank(FIXED))[:-60])
     found = data.read(tmp_path / "a.ohm")
     assert any("it states 40 measurements, and holds" in note for note in found.notes)
 
