@@ -55,11 +55,11 @@ class RestingSkin(eqx.Module):
         check_model(model)
         conductivity = cell_conductivity(model.mesh, check_conductivity(model.mesh, conductivity))
         strips = Strips.create(model.system.pattern, np.asarray(model.mesh.points), np.asarray(touchable))
-        if 8 * float(strips.number * strips.wanted) ** 2 > most:
+        if 8 * float(strips.num_strips * strips.selected_per_strip) ** 2 > most:
             return None
         solved = evaluate(model, solved_system_of, conductivity)
         rest = channel_voltages(model.protocol, solved.impedance())
-        known = fields_and_inverse(solved, strips, max(strips.number - 1, 1))
+        known = fields_and_inverse(solved, strips, max(strips.num_strips - 1, 1))
         return cls(model, rest, cell_stiffness(model, conductivity), strips, *known)
 
     def changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:

@@ -154,7 +154,7 @@ def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | N
     touched[np.asarray(mesh.cells)[cells[real]]] = True
     if strips is None:
         strips = Strips.create(model.system.pattern, np.asarray(mesh.points), touched)
-    nowhere = strips.number * strips.wanted  # one entry for all untouched nodes
+    nowhere = strips.num_strips * strips.selected_per_strip  # one entry for all untouched nodes
     place = np.where(touched, strips.place, nowhere).astype(np.int32)[np.asarray(mesh.cells)]
     corners, found = np.zeros((*cells.shape, mesh.cells.shape[1]), np.int32), []
     for start in range(0, len(cells), _AT_ONCE):

@@ -93,7 +93,7 @@ def _linear(model: ForwardModel, conductivity, touched: TouchedCells):
 
 def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
     touched_at = touched_nodes(model, touched)
-    reach = -(-touched_at.strips.reach(touched_at.nodes) // _STRIPS) * _STRIPS
+    reach = -(-touched_at.strips.max_strip_distance(touched_at.nodes) // _STRIPS) * _STRIPS
     solved = evaluate(model, solved_system_of, conductivity)
     known = fields_and_inverse(solved, touched_at.strips, reach)
     touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))
