@@ -2,8 +2,8 @@
 
 A mesh that suffices for a smooth image resolves a body of a few cells badly. The error of the voltages is proportional
 to the edge length on the surface, differs between channels, and resembles the effect of another body. Bodies that were
-found are therefore fitted again on a mesh that is bisected at their surfaces. The rest of the problem, including the
-voltages of the background, is unchanged.
+found are therefore fitted again on a mesh that is bisect_with_parents at their surfaces. The rest of the problem,
+including the voltages of the background, is unchanged.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jeit.forward.changes import solved_fields
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh
-from jeit.mesh.bisection import bisected
+from jeit.mesh.bisection import bisect_with_parents
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
@@ -64,11 +64,11 @@ def finer(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> Finer:
     bodies, model = fit.bodies, problem.model
     assert isinstance(bodies, Ellipsoids)
     tagged, names = _tagged(model.mesh, model.electrodes)
-    mesh, cell = bisected(tagged, partial(bodies.edges, fit.coefficients, edges[0]))
+    mesh, cell = bisect_with_parents(tagged, partial(bodies.edges, fit.coefficients, edges[0]))
     for edge in edges[1:]:
         if mesh.num_points < _MOST * tagged.num_points:
             break
-        mesh, cell = bisected(tagged, partial(bodies.edges, fit.coefficients, edge))
+        mesh, cell = bisect_with_parents(tagged, partial(bodies.edges, fit.coefficients, edge))
     there = on_host(ForwardModel(mesh, _on(mesh, model.electrodes, iter(names)), model.protocol))
     background = problem.background[cell]
     moved = solved_fields(there, background).voltages - solved_fields(model, problem.background).voltages
@@ -85,7 +85,8 @@ def _tagged(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]
 
 
 def _on(mesh: Mesh, electrodes: AbstractElectrodes, names) -> AbstractElectrodes:
-    """Electrodes on the bisected mesh: those that cover facets from the tags `names`, all others unchanged."""
+    """Electrodes on the bisect_with_parents mesh: those that cover facets from the tags `names`, all others
+    unchanged."""
     if isinstance(electrodes, CombinedElectrodes):
         return CombinedElectrodes(*[_on(mesh, part, names) for part in electrodes.parts])
     if isinstance(electrodes, FacetElectrodes):

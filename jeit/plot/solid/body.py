@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 
-from jeit.electrodes.electrode_shapes import Draped, ElectrodeShapes, surface_triangles
+from jeit.electrodes.electrode_shapes import ElectrodeShapes, ProjectionSurface, surface_triangles
 from jeit.mesh import Mesh
 from jeit.plot.axes import SOFT
 from jeit.plot.imaging.electrodes import METAL, at_one_place
@@ -67,7 +67,7 @@ def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, 
 
     `through`: whether the electrodes in front become translucent if they would hide much of the body.
     """
-    surface, size = Draped(points, triangles), float(np.ptp(points, axis=0).max())
+    surface, size = ProjectionSurface(points, triangles), float(np.ptp(points, axis=0).max())
     polygons = shapes.polygons()
     normals = surface.normals(np.array([corners.mean(axis=0) for corners in polygons]))
     rims = _rims(polygons, shapes.electrode, 1e-6 * size)
@@ -112,7 +112,7 @@ def number_electrodes(
     Electrodes seen close to each other share one text.
     """
     middles = shapes.middles()
-    normals = Draped(points, triangles).normals(middles)
+    normals = ProjectionSurface(points, triangles).normals(middles)
     places = scene.camera.on_page(middles + _AWAY * float(np.ptp(points, axis=0).max()) * normals)
     fontsize = 8 if len(places) <= 20 else 6.5
     faint = normals @ scene.camera.toward < -0.05

@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
-from jeit.electrodes.electrode_shapes import Draped, shapes_of
+from jeit.electrodes.electrode_shapes import ProjectionSurface, shapes_of
 from jeit.layout import SurfaceLayout
 from jeit.mesh import measures
 from jeit.mesh.geodesic import Triangles
@@ -56,7 +56,7 @@ def plot_curved_skin(
         fitted = scale.of(image, "S")
         colours = colours_of(fitted, image if len(image) == len(cells) else image[cells].mean(axis=1))
     scene.add_triangles(points, cells, colours, smooth=True)
-    surface = Draped(points, cells)
+    surface = ProjectionSurface(points, cells)
     # Pieces are sorted by the depth of their centres, so discs are moved in front of the triangles on which they lie.
     before = float(np.sqrt(np.asarray(measures(mesh)).max()))
     for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
