@@ -255,7 +255,7 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
     assert include_deviation(own, None, np.nan) == own
     (doubt,) = ImagedDifference.doubts.fget(image)  # pyright: ignore
     assert "x 12 mm, y -25 mm may as well be no column but an ellipsoid, of 6 times the background and 30 cm³" in doubt
-    told = image_report._shapes(image)["bodies"]  # pyright: ignore
+    told = image_report._shapes_report(image)["bodies"]  # pyright: ignore
     assert told[0]["form"] == "column"
     assert told[0]["or"]["form"] == "ellipsoid"
     np.testing.assert_allclose(told[0]["or"]["conductivity_over_background"], 6)
