@@ -192,8 +192,8 @@ def _pair_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         nodes = np.sort(edges[crowded[0]]).tolist()
         raise ValueError(
             f"cells: the edge of nodes {nodes} belongs to more than two triangles (among them "
-            f"{sorted((crowded // 3).tolist())}), so the surface is not a manifold there. Remove the "
-            "triangles that are not of the skin, such as inner walls."
+            f"{sorted((crowded // 3).tolist())}), so the surface is not manifold there, as where walls "
+            "meet in a T. Remove the triangles that are not of the skin, such as inner walls."
         )
     return first, second
 

@@ -136,5 +136,6 @@ def _refusal_message(owner: dict, lock_path: Path, store_path: Path, contents: s
     where = "this machine" if _is_on_this_machine(owner) else describe(owner.get("host"))
     return (
         f"{store_path} is being written by {owner_text} on {where}{since}, or was when that was killed: from here "
-        f"this cannot be seen. Where it still runs, wait; where it does not, delete {lock_path} and resume the {contents}."
+        f"this cannot be seen. Where it still runs, wait; where it "
+        f"does not, delete {lock_path} and resume the {contents}."
     )
