@@ -60,7 +60,7 @@ def compose_transforms(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
 
 
 def transform_points(points, matrix: np.ndarray) -> np.ndarray:
-    """Apply the transform with matrix `matrix` (2, 3) to points (k, 2)."""
+    """Apply the transform with the given `matrix` (2, 3) to points (k, 2)."""
     return np.asarray(points, float).reshape(-1, 2) @ matrix[:, :2].T + matrix[:, 2]
 
 

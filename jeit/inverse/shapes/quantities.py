@@ -72,18 +72,18 @@ def with_quantities(
     return [quantify(problem, fit, int(k), float(unmodelled[k]), accuracy) for k in order]
 
 
-def include_deviation(distribution: Quantities, other: Ellipsoid | None, deviation: float) -> Quantities:
+def include_deviation(quantities: Quantities, other: Ellipsoid | None, deviation: float) -> Quantities:
     """Widen the intervals of the `quantities` so that they include those of the `other` description of the body, if
     there is one, whose contrast has this standard deviation."""
     if other is None:
-        return distribution
+        return quantities
     changes = np.expm1(other.sign * (other.contrast + deviation * np.array([-1, 1]))).tolist()
     strength = float(other.volume * polarisation(other.sign * other.contrast, other.bounded_axes))
     return replace(
-        distribution,
-        change_interval=_interval_hull(distribution.change_interval, changes),
-        measure_interval=_interval_hull(distribution.measure_interval, [other.volume]),
-        strength_interval=_interval_hull(distribution.strength_interval, [strength]),
+        quantities,
+        change_interval=_interval_hull(quantities.change_interval, changes),
+        measure_interval=_interval_hull(quantities.measure_interval, [other.volume]),
+        strength_interval=_interval_hull(quantities.strength_interval, [strength]),
     )
 
 
