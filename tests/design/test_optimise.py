@@ -307,7 +307,7 @@ def test_starts_that_end_outside_the_constraints_are_reported(monkeypatch):
     def descent(variables, constraints, values):
         return jnp.broadcast_to(variables.start, values.shape)
 
-    monkeypatch.setattr("jeit.design.optimisation.optimise._feasible", descent)
+    monkeypatch.setattr("jeit.design.optimisation.optimise._make_feasible", descent)
     crowded = Layout(0.4 * START.centres, 8e-3, outline=SKIN, name="low")  # for the program of the others
     found = optimise_from_three(layout=crowded, steps=1)
     assert (found.status, found.best) == ("infeasible", None)

@@ -57,7 +57,7 @@ def test_variance_is_even_up_to_the_wall():
 def test_estimated_variances_are_near_the_exact_ones(monkeypatch):
     mesh = disk(1.0, num_points=600)
     exact = Matern(0.25)._field(mesh, 0.0)
-    monkeypatch.setattr("jeit.inverse.prior.matern._FEW", 10)
+    monkeypatch.setattr("jeit.inverse.prior.matern._MAX_EXACT_NODES", 10)
     assert np.asarray(Matern(0.25)._field(mesh, 0.0).scale) == pytest.approx(exact.scale, rel=0.15)
 
 
