@@ -14,7 +14,7 @@ from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
 from jeit.acoustic.localisation.pixels import brightness, fade
 from jeit.acoustic.tracking import Track
-from jeit.report.folder import plain, results, version_of, write_json, write_rows
+from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
 
 
 def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
@@ -97,7 +97,7 @@ def report_track(found: LocatedTouches) -> dict[str, Any]:
     for number, (fault, used) in enumerate(zip(locations.faults, locations.used.T, strict=True)):
         share = float(used.mean())
         microphones.append({"microphone": number, "used_share": share, "fault": fault or None})
-    return plain(
+    return as_plain_values(
         {
             "recording": locations.name,
             "calibration": calibration.name,

@@ -82,7 +82,7 @@ def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
 
 # A position is a blind spot if its sensitivity is below the minimum of the other layout by more than this relative
 # margin, so that rounding errors of coordinates do not produce blind spots.
-_ROUNDING = 1e-6
+_BLIND_SPOT_MARGIN = 1e-6
 
 
 class LayoutComparison(eqx.Module):
@@ -101,8 +101,8 @@ class LayoutComparison(eqx.Module):
 
     @property
     def figures(self) -> list[dict]:
-        """Scores of each layout, as returned by `comparison`."""
-        return comparison(*self.responses)
+        """Scores of each layout, as returned by `comparison_figures`."""
+        return comparison_figures(*self.responses)
 
 
 def compare_layouts(
@@ -155,7 +155,7 @@ def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLa
     """Raise `ValueError` unless both layouts are on skins of the same size: for flat skins, the bounding boxes of the
     outlines, up to a shift, and their areas must agree; for curved skins, the areas of the surfaces."""
     if isinstance(first, SurfaceLayout) or isinstance(second, SurfaceLayout):
-        areas = [_area(layout) for layout in (first, second)]
+        areas = [_layout_area(layout) for layout in (first, second)]
         if type(first) is not type(second) or abs(areas[0] - areas[1]) > 1e-2 * areas[0]:
             raise ValueError(
                 f"the layouts are on different skins, '{first.name}' of {1e4 * areas[0]:.4g} and '{second.name}' of "
@@ -176,13 +176,13 @@ def check_same_outline(first: Layout | SurfaceLayout, second: Layout | SurfaceLa
         )
 
 
-def _area(layout: Layout | SurfaceLayout) -> float:
+def _layout_area(layout: Layout | SurfaceLayout) -> float:
     if isinstance(layout, SurfaceLayout):
         return float(Triangles.of(layout.surface).areas.sum())
     return float(layout.known_outline.area)
 
 
-def comparison(one: SkinResponse, other: SkinResponse) -> list[dict]:
+def comparison_figures(first: SkinResponse, second: SkinResponse) -> list[dict]:
     """Scores of each of two layouts, as plain numbers.
 
     - `sensitivity_…_V`: minimum and mean sensitivity, volts; `sensitivity_uniformity`: mean divided by root mean
@@ -192,10 +192,10 @@ def comparison(one: SkinResponse, other: SkinResponse) -> list[dict]:
     - `taxel_count`: number of taxels with an area above zero; `taxel_area_cm2`: mean, standard deviation and maximum.
     - `taxel_overlap`: mean number of taxels that cover a position; `two_point_mm`: mean diameter of the taxels.
     """
-    return [_figures(*pair) for pair in ((one, other), (other, one))]
+    return [_score_figures(*pair) for pair in ((first, second), (second, first))]
 
 
-def _figures(response: SkinResponse, other: SkinResponse) -> dict:
+def _score_figures(response: SkinResponse, other: SkinResponse) -> dict:
     theta, taxels = response.sensitivity, response.taxels
     areas = 1e4 * np.asarray(taxels.areas)
     return {
@@ -205,7 +205,7 @@ def _figures(response: SkinResponse, other: SkinResponse) -> dict:
         "sensitivity_min_V": float(theta.minimum),
         "sensitivity_mean_V": float(theta.mean),
         "sensitivity_uniformity": float(theta.uniformity),
-        "blind_spot_fraction": float(theta.blind_spot((1 - _ROUNDING) * other.sensitivity.minimum)),
+        "blind_spot_fraction": float(theta.blind_spot((1 - _BLIND_SPOT_MARGIN) * other.sensitivity.minimum)),
         "taxel_count": int((areas > 0).sum()),
         "taxel_area_cm2": {"mean": float(areas.mean()), "std": float(areas.std()), "max": float(areas.max())},
         "taxel_overlap": float(taxels.overlap),

@@ -23,7 +23,7 @@ from jeit.protocol import two_terminal
 
 # Ratio of the number of nodes of the mesh for the final scores to that of the mesh used in the optimisation; number of
 # touched positions along a side in the optimisation, and for the final scores.
-_FINER, _PLACES, _MORE_PLACES = 4, 16, 24
+_REFINEMENT_RATIO, _OPTIMISED_PLACES, _SCORED_PLACES = 4, 16, 24
 
 
 class ImprovedLayout(eqx.Module):
@@ -86,20 +86,22 @@ def improve_layout(
     report = progress or (lambda step: None)
     space = DesignSpace(minimum_spacing=MINIMUM_SPACING) if space is None else space
     report("mesh")
-    sheet, objective = _setting(layout, num_points, _PLACES, noise, material)
+    sheet, objective = _skin_and_objective(layout, num_points, _OPTIMISED_PLACES, noise, material)
     report("optimise")
     key = jax.random.key(seed)
     found = optimise_layout(sheet, objective, space, steps=steps, starts=starts, key=key, callback=callback)
     if found.status == "infeasible":
         raise ValueError(f"no layout found: {found.reason}")
     report("confirm")
-    finer, objective = _setting(layout, _FINER * num_points, _MORE_PLACES, noise, material)
+    finer, objective = _skin_and_objective(layout, _REFINEMENT_RATIO * num_points, _SCORED_PLACES, noise, material)
     moved = finer.with_layout(found.layout, material.get("contact_impedance"))
     before, after = objective.scores(finer), objective.scores(moved)
     return ImprovedLayout(layout, sheet, found, before, after, space, noise, seed, num_points)
 
 
-def _setting(layout: Layout, num_points: int, places: int, noise: float, options: dict) -> tuple[Skin, Objective]:
+def _skin_and_objective(
+    layout: Layout, num_points: int, places: int, noise: float, options: dict
+) -> tuple[Skin, Objective]:
     pairs = two_terminal(layout.num_electrodes)
     skin = Skin.create(layout, num_layers=0, num_points=num_points, protocol=pairs, **options)
     return skin, Objective.create(skin, touch_grid(skin.outline, places, places).places, noise=noise)

@@ -43,10 +43,12 @@ class Candidates(eqx.Module):
         `vmap`. Raises `ValueError` for incompatible shapes, values that are not finite, noise that is not positive, and
         negative weights.
         """
-        jacobian, product, noise, weights = _check(jacobian, product, noise, weights, ("cells", "measurements"))
+        jacobian, product, noise, weights = _check_candidates(
+            jacobian, product, noise, weights, ("cells", "measurements")
+        )
         if product.shape != jacobian.shape[::-1]:
             raise ValueError(f"product has shape {product.shape}; ΓJᵀ has one column for each of {len(jacobian)} rows.")
-        return _from_product(jacobian, product, noise, weights)
+        return _candidates_from_product(jacobian, product, noise, weights)
 
     @classmethod
     def from_factor(
@@ -59,7 +61,9 @@ class Candidates(eqx.Module):
         (as the `basis` of a prior does), the information of precise measurements on these parts is omitted too, and the
         `share` of a few measurements is overestimated. Raises `ValueError` as `create` does.
         """
-        jacobian, factor, noise, weights = _check(jacobian, factor, noise, weights, ("cells", "coefficients"))
+        jacobian, factor, noise, weights = _check_candidates(
+            jacobian, factor, noise, weights, ("cells", "coefficients")
+        )
         return cls(jacobian @ factor / noise[:, None], factor.T @ (weights[:, None] * factor))
 
     @property
@@ -68,7 +72,7 @@ class Candidates(eqx.Module):
         return self.rows.shape[0]
 
 
-def _check(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Array, Array, Array, Array]:
+def _check_candidates(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Array, Array, Array, Array]:
     """Check the arguments of `Candidates` and return them as arrays of matching shapes. `shape`: names of the axes of
     `prior`, for error messages."""
     jacobian, prior = jnp.asarray(jacobian, float), jnp.asarray(prior, float)
@@ -97,7 +101,7 @@ def _check(jacobian, prior, noise, weights, shape: tuple[str, str]) -> tuple[Arr
 
 
 @jax.jit
-def _from_product(jacobian, product, noise, weights) -> Candidates:
+def _candidates_from_product(jacobian, product, noise, weights) -> Candidates:
     """Compute the candidates from ΓJᵀ, with the factor S = ΓJᵀ N^-½ U Λ^-½ of the prior, where N^-½ JΓJᵀ N^-½ = UΛUᵀ
     and N is the covariance of the noise.
 
@@ -113,7 +117,7 @@ def _from_product(jacobian, product, noise, weights) -> Candidates:
 
 Criterion = Literal["D", "A"]
 # Minimum relative gain of information by a swap; below it rounding errors could cause endless swaps.
-_WORTH = 1e-9
+_MIN_GAIN = 1e-9
 
 
 class Selection(eqx.Module):
@@ -164,7 +168,7 @@ def select_measurements(
     limit = 0 if not exchange else number if max_swaps is None else max_swaps
     if not isinstance(limit, int) or limit < 0:
         raise ValueError(f"max_swaps must be a whole number from 0; it is {max_swaps!r}.")
-    return _select(candidates, number, criterion, limit)
+    return _select_with_swaps(candidates, number, criterion, limit)
 
 
 def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -> Float[Array, "..."]:
@@ -178,7 +182,7 @@ def information(candidates: Candidates, chosen, *, criterion: Criterion = "D") -
     _check_number(candidates, chosen.shape[-1], criterion)
     if has_values(chosen) and not ((chosen >= 0) & (chosen < candidates.num_candidates)).all():
         raise ValueError(f"chosen must be from 0 to {candidates.num_candidates - 1}.")
-    return _of_sets(candidates, chosen.reshape(-1, chosen.shape[-1]), criterion).reshape(chosen.shape[:-1])
+    return _information_of_sets(candidates, chosen.reshape(-1, chosen.shape[-1]), criterion).reshape(chosen.shape[:-1])
 
 
 def information_bound(
@@ -196,7 +200,7 @@ def information_bound(
     number of candidates, and for an unknown criterion.
     """
     _check_number(candidates, number, criterion)
-    return _bound(candidates, number, criterion, iterations)
+    return _relaxed_bound(candidates, number, criterion, iterations)
 
 
 def random_selections(key: Array, num_candidates: int, number: int, count: int) -> Int[Array, "count N"]:
@@ -219,7 +223,7 @@ def nearest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"
     to it. Among pairs of equal length the first ones are taken. Raises `ValueError` if `number` is not from 1 to
     L(L - 1)/2.
     """
-    return _by_length(centres, number, 1, lengths)
+    return _pairs_by_length(centres, number, 1, lengths)
 
 
 def farthest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N"]:
@@ -227,10 +231,10 @@ def farthest_pairs(centres, number: int, *, lengths=None) -> Int[np.ndarray, " N
 
     Arguments as in `nearest_pairs`. Raises `ValueError` if `number` is not from 1 to L(L - 1)/2.
     """
-    return _by_length(centres, number, -1, lengths)
+    return _pairs_by_length(centres, number, -1, lengths)
 
 
-def _by_length(centres, number: int, sign: int, lengths) -> np.ndarray:
+def _pairs_by_length(centres, number: int, sign: int, lengths) -> np.ndarray:
     centres = np.asarray(centres, float)
     first, second = np.triu_indices(len(centres), 1)
     if not 1 <= number <= len(first):
@@ -256,9 +260,9 @@ def _check_number(candidates: Candidates, number: int, criterion: Criterion) -> 
 
 
 @partial(jax.jit, static_argnames=("number", "criterion", "limit"))
-def _select(candidates: Candidates, number: int, criterion: Criterion, limit: int) -> Selection:
-    chosen, gains = _greedy(candidates, number, criterion)
-    total, _ = _tangent(candidates, jnp.ones(candidates.num_candidates), criterion)
+def _select_with_swaps(candidates: Candidates, number: int, criterion: Criterion, limit: int) -> Selection:
+    chosen, gains = _greedy_selection(candidates, number, criterion)
+    total, _ = _information_and_slope(candidates, jnp.ones(candidates.num_candidates), criterion)
 
     def helps(state):
         _, swaps, settled = state
@@ -268,15 +272,15 @@ def _select(candidates: Candidates, number: int, criterion: Criterion, limit: in
         chosen, swaps, _ = state
         gain = _swap_gains(candidates, chosen, criterion)
         leaves, enters = jnp.unravel_index(jnp.argmax(gain), gain.shape)
-        worth = gain[leaves, enters] > _WORTH * total
+        worth = gain[leaves, enters] > _MIN_GAIN * total
         return jnp.where(worth, chosen.at[leaves].set(enters), chosen), swaps + worth, ~worth
 
     chosen, swaps, settled = jax.lax.while_loop(helps, swap, (chosen, jnp.array(0), jnp.array(False)))
-    kept = _of_sets(candidates, chosen[None], criterion)[0]
+    kept = _information_of_sets(candidates, chosen[None], criterion)[0]
     return Selection(chosen, gains, kept, total, swaps, settled)
 
 
-def _greedy(candidates: Candidates, number: int, criterion: Criterion):
+def _greedy_selection(candidates: Candidates, number: int, criterion: Criterion):
     """Indices (N,) of the greedy choice and the gain of each. The choice is a Cholesky factorisation of I + FFᵀ, where
     F are the rows f_i, with the best candidate as the next pivot.
 
@@ -338,7 +342,7 @@ def _swap_gains(candidates: Candidates, chosen, criterion: Criterion) -> Float[A
     return gain.at[:, chosen].set(-jnp.inf)
 
 
-def _of_set(candidates: Candidates, weighted: Float[Array, "M r"], chosen, criterion: Criterion):
+def _information_of_set(candidates: Candidates, weighted: Float[Array, "M r"], chosen, criterion: Criterion):
     """Information of one set, from the N × N matrix I + F_T F_Tᵀ, where F_T are the rows of the set; `weighted`: the
     rows of all candidates times V."""
     picked = candidates.rows[chosen]
@@ -349,12 +353,12 @@ def _of_set(candidates: Candidates, weighted: Float[Array, "M r"], chosen, crite
 
 
 @partial(jax.jit, static_argnames="criterion")
-def _of_sets(candidates: Candidates, sets, criterion: Criterion):
+def _information_of_sets(candidates: Candidates, sets, criterion: Criterion):
     weighted = candidates.rows @ candidates.weight
-    return jax.lax.map(lambda chosen: _of_set(candidates, weighted, chosen, criterion), sets, batch_size=64)
+    return jax.lax.map(lambda chosen: _information_of_set(candidates, weighted, chosen, criterion), sets, batch_size=64)
 
 
-def _tangent(candidates: Candidates, parts: Float[Array, " M"], criterion: Criterion):
+def _information_and_slope(candidates: Candidates, parts: Float[Array, " M"], criterion: Criterion):
     """Information if candidate i is measured with weight `parts[i]`, and its derivative (M,) with respect to the
     weights, from the r × r matrix C⁻¹."""
     rows, weight = candidates.rows, candidates.weight
@@ -374,10 +378,10 @@ def _inverse_root(matrix: Float[Array, "s s"]) -> Float[Array, "s s"]:
 
 
 @partial(jax.jit, static_argnames=("number", "criterion", "iterations"))
-def _bound(candidates: Candidates, number: int, criterion: Criterion, iterations: int):
+def _relaxed_bound(candidates: Candidates, number: int, criterion: Criterion, iterations: int):
     def step(turn, state):
         parts, bound = state
-        value, slope = _tangent(candidates, parts, criterion)
+        value, slope = _information_and_slope(candidates, parts, criterion)
         _, best = jax.lax.top_k(slope, number)
         target = jnp.zeros_like(parts).at[best].set(1.0)
         bound = jnp.minimum(bound, value + slope @ (target - parts))

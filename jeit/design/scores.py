@@ -36,7 +36,7 @@ from jeit_solvers.engines import as_array, either_engine, has_values, namespace,
 
 # Number k of matrix squarings: the largest eigenvalue of an r × r matrix has a relative error of at most ln(r) / 2^k,
 # however close the second largest is.
-_SQUARINGS = 10
+_NUM_SQUARINGS = 10
 
 
 class TouchPrior(eqx.Module):
@@ -148,12 +148,12 @@ def layout_scores(
     if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):
         raise ValueError("conductivity: scores need a real, scalar one.")
     noise = as_array(noise, float)
-    _check(model, touches, prior, noise, temperature)
+    _check_arguments(model, touches, prior, noise, temperature)
     conductivity = cell_conductivity(model.mesh, conductivity)
-    return _scores(model.jacobian(conductivity), conductivity, touches, prior, noise, temperature)
+    return _compute_scores(model.jacobian(conductivity), conductivity, touches, prior, noise, temperature)
 
 
-def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> None:
+def _check_arguments(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> None:
     channels = model.protocol.num_measurements
     if model.mesh.dimension != 2:
         raise ValueError(f"model is of a {model.mesh.dimension}-D body; scores are of the equivalent sheet.")
@@ -171,7 +171,7 @@ def _check(model: ForwardModel, touches: SheetTouches, prior: TouchPrior, noise,
 
 
 @either_engine
-def _scores(jacobian, conductivity, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> Scores:
+def _compute_scores(jacobian, conductivity, touches: SheetTouches, prior: TouchPrior, noise, temperature) -> Scores:
     """Compute the scores from the Jacobian (M, m) of the voltages."""
     xp = namespace(jacobian)
     weights, slopes = touches.weights(conductivity)
@@ -201,20 +201,22 @@ def _largest_eigenvalue(matrix: Float[Array, "r r"]) -> Float[Array, ""]:
     The derivative of a simple eigenvalue is that of vᵀ(matrix)v at a fixed eigenvector v.
     """
     power = undifferentiated(matrix)
-    for _ in range(_SQUARINGS):
+    for _ in range(_NUM_SQUARINGS):
         power = power @ power
         power = power / abs(power).max()
     vector = power[:, namespace(power).diagonal(power).argmax()]
     return vector @ matrix @ vector / (vector @ vector)
 
 
-def _localisation_error(along_a: Float[Array, "n M"], along: Float[Array, "2 n M"]) -> Float[Array, " n"]:
+def _localisation_error(
+    amplitude_slope: Float[Array, "n M"], position_slopes: Float[Array, "2 n M"]
+) -> Float[Array, " n"]:
     """Cramér-Rao bound of the position: square root of the trace of the (x, y) block of the inverse information, from
-    its Schur complement; infinite if it is singular. `along_a`, `along`: derivatives of the whitened voltages with
-    respect to the amplitude, and to x and y."""
-    xp, size = namespace(along_a), (along_a**2).sum(axis=1)
+    its Schur complement; infinite if it is singular. `amplitude_slope`, `position_slopes`: derivatives of the whitened
+    voltages with respect to the amplitude, and to x and y."""
+    xp, size = namespace(amplitude_slope), (amplitude_slope**2).sum(axis=1)
     # Part of the derivatives orthogonal to that of the amplitude, computed before squaring since it may be small.
-    x, y = along - ((along * along_a).sum(axis=2) / size)[..., None] * along_a
+    x, y = position_slopes - ((position_slopes * amplitude_slope).sum(axis=2) / size)[..., None] * amplitude_slope
     xx, yy, xy = (x * x).sum(axis=1), (y * y).sum(axis=1), (x * y).sum(axis=1)
     determinant = xx * yy - xy**2
     known = determinant > 1e-12 * xx * yy

@@ -149,27 +149,27 @@ def find_taxels(
     units do not fit together.
     """
     check_key(key)
-    _check(changes, places, cell_area, num_taxels, threshold)
+    _check_arguments(changes, places, cell_area, num_taxels, threshold)
     change, place = jnp.asarray(changes, float), jnp.asarray(places, float)
-    unit = _unit(change)
+    unit = _normalise(change)
     clusters = kmeans(unit if directions else change, num_taxels, key, restarts=restarts)
     area = as_array(namespace(cell_area).broadcast_to(cell_area, place.shape[:1]), float)
-    return Taxels(place, area, clusters, _cosines(clusters.centres, unit), float(threshold))
+    return Taxels(place, area, clusters, _cosine_similarities(clusters.centres, unit), float(threshold))
 
 
 @either_engine
-def _cosines(vectors: Float[Array, "k m"], unit: Float[Array, "n m"]) -> Float[Array, "k n"]:
-    return _unit(vectors) @ unit.T
+def _cosine_similarities(vectors: Float[Array, "k m"], unit: Float[Array, "n m"]) -> Float[Array, "k n"]:
+    return _normalise(vectors) @ unit.T
 
 
 @either_engine
-def _unit(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
+def _normalise(vectors: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """Scale vectors to length 1; zero vectors remain zero and have a derivative of zero."""
     xp, square = namespace(vectors), (vectors**2).sum(axis=1, keepdims=True)
     return xp.where(square > 0, vectors / xp.sqrt(xp.where(square > 0, square, 1)), 0)
 
 
-def _check(changes, places, cell_area, num_taxels, threshold) -> None:
+def _check_arguments(changes, places, cell_area, num_taxels, threshold) -> None:
     """Raise `ValueError` for invalid arguments; of traced arrays, only the shape is checked."""
     shape = np.shape(changes)
     in_space = np.shape(places) == (*shape[:1], 3) and not (has_values(places) and not np.ptp(places, axis=0).any())

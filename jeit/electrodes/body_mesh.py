@@ -30,14 +30,15 @@ from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undif
 
 # Distance from a face, relative to the size of the body, within which a position lies on the face; also used in checks
 # of electrodes.
-_ON = 1e-3
+_FACE_TOLERANCE = 1e-3
 # Number of points on the rim of a patch on a horizontal face.
-_ROUND = 16
+_NUM_RIM_POINTS = 16
 
 
 @size_checked()
 def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None = None) -> Mesh:
-    """Mesh a body with about `num_points` nodes, refined at the electrodes.
+    """Mesh a body with about `num_points` nodes, with smaller cells at the electrodes: as their `refinement` says or,
+    for rectangular electrodes on solids, as `jeit.mesh.refined_at_electrodes` does.
 
     The edges of rectangular electrodes on a box, and their upper and lower edges on the wall of another solid, coincide
     with cell faces. A body that is given as a mesh is not remeshed. Raises `ValueError` if `num_points` is missing, or
@@ -56,7 +57,7 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
         )
     if not isinstance(body, Solid):
         return body.mesh(num_points=num_points, refine=electrodes.refinement(body) or None)
-    from jeit.mesh.graded import graded_box, graded_layers
+    from jeit.mesh.refined_at_electrodes import graded_box, graded_layers
 
     if not isinstance(electrodes, FacePatches):
         return body.mesh(num_points=num_points, refine=electrodes.refinement(body) or None)
@@ -64,27 +65,32 @@ def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None
     place = np.asarray(electrodes.position)
     half = np.stack([np.asarray(electrodes.width), np.asarray(electrodes.height)], axis=1) / 2
     x_min, x_max, y_min, y_max = outline.extent
-    near = _ON * max(x_max - x_min, y_max - y_min, height)
+    near = _FACE_TOLERANCE * max(x_max - x_min, y_max - y_min, height)
     flat = (np.abs(place[:, 2]) < near) | (np.abs(place[:, 2] - height) < near)
     upright = place[~flat, 2, None] + half[~flat, 1:] * np.array([-1.0, 1.0])
     if isinstance(outline, Rectangle):
         across = (np.abs(place[:, 0] - x_min) < near) | (np.abs(place[:, 0] - x_max) < near)
-        ends_x = _ends(place[:, 0], half[:, 0], flat | ~across)
-        ends_y = np.concatenate([_ends(place[:, 1], half[:, 1], flat), _ends(place[:, 1], half[:, 0], across & ~flat)])
+        ends_x = _electrode_ends(place[:, 0], half[:, 0], flat | ~across)
+        ends_y = np.concatenate(
+            [_electrode_ends(place[:, 1], half[:, 1], flat), _electrode_ends(place[:, 1], half[:, 0], across & ~flat)]
+        )
         return graded_box(outline, height, (ends_x, ends_y, upright.ravel()), num_points)
-    rims = [np.zeros((0, 2)), *(_rim(outline, *one) for one in zip(place, half, flat, strict=True))]
+    rims = [np.zeros((0, 2)), *(_rim_points(outline, *one) for one in zip(place, half, flat, strict=True))]
     return graded_layers(outline, height, upright.ravel(), np.concatenate(rims), num_points)
 
 
-def _ends(place: Float[np.ndarray, " L"], half: Float[np.ndarray, " L"], some) -> Float[np.ndarray, " e"]:
-    """Positions along an axis where the selected electrodes begin and end."""
-    return np.concatenate([(place - half)[some], (place + half)[some]])
+def _electrode_ends(
+    centre: Float[np.ndarray, " L"], half_size: Float[np.ndarray, " L"], selected
+) -> Float[np.ndarray, " e"]:
+    """Positions along an axis where the selected electrodes begin and end, from their `centre` and `half_size` along
+    it."""
+    return np.concatenate([(centre - half_size)[selected], (centre + half_size)[selected]])
 
 
-def _rim(outline, place, half, flat: bool) -> Float[np.ndarray, "p 2"]:
+def _rim_points(outline, place, half, flat: bool) -> Float[np.ndarray, "p 2"]:
     """Points on the rim of an electrode, seen from above: around it on a horizontal face, its two ends on a wall."""
     if flat:
-        angle = 2 * np.pi * np.arange(_ROUND) / _ROUND
+        angle = 2 * np.pi * np.arange(_NUM_RIM_POINTS) / _NUM_RIM_POINTS
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
         # For a rectangle, the points where rays from its centre meet its sides.
         return place[:2] + circle * half / np.abs(circle).max(axis=1, keepdims=True)
@@ -97,38 +103,40 @@ def _rim(outline, place, half, flat: bool) -> Float[np.ndarray, "p 2"]:
 
 
 # Distance between two electrodes, divided by the smaller size, below which they are at the same position.
-_SAME = 1e-3
+_MIN_SEPARATION = 1e-3
 
 Distance = Callable[[Float[np.ndarray, "L 3"]], Float[np.ndarray, " L"]]
 
 
-def check_on_surface(position: Float[np.ndarray, "L 3"], allowed: Float[np.ndarray, " L"], off: Distance) -> None:
-    """Raise `ValueError` for the first electrode whose distance from the surface of the body exceeds `allowed` metres;
-    `off` computes these distances."""
-    far = off(position)
-    for number in np.flatnonzero(far > allowed)[:1]:
+def check_on_surface(
+    position: Float[np.ndarray, "L 3"], allowed: Float[np.ndarray, " L"], distance_from_surface: Distance
+) -> None:
+    """Raise `ValueError` for the first electrode whose distance from the surface of the body exceeds `allowed` metres.
+    `distance_from_surface`: function that returns the distances (L,) of positions (L, 3), metres."""
+    distances = distance_from_surface(position)
+    for number in np.flatnonzero(distances > allowed)[:1]:
         hint = "give a place on it."
-        if _all_on(position / 1000, allowed, off):
+        if _all_on_surface(position / 1000, allowed, distance_from_surface):
             hint = IN_MILLIMETRES
-        elif _all_on(position * 1000, 1000 * allowed, off):
+        elif _all_on_surface(position * 1000, 1000 * allowed, distance_from_surface):
             hint = "is the mesh in millimetres? Read it with scale = 1e-3."
         raise ValueError(
             f"position: electrode {number + 1} at {np.round(position[number], 6).tolist()} m lies "
-            f"{_length_text(float(far[number]))} off the body's surface; {hint}"
+            f"{_length_text(float(distances[number]))} off the body's surface; {hint}"
         )
 
 
-def _all_on(position, allowed, off: Distance) -> bool:
+def _all_on_surface(position, allowed, distance_from_surface: Distance) -> bool:
     """Whether all positions lie on the surface and are spread over it. Positions that nearly coincide do not count,
     since they may lie on the surface by chance."""
-    return bool((np.ptp(position, axis=0).max() > allowed).all() and (off(position) <= allowed).all())
+    return bool((np.ptp(position, axis=0).max() > allowed).all() and (distance_from_surface(position) <= allowed).all())
 
 
 def check_apart(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"]) -> None:
     """Raise `ValueError` for the first two electrodes at the same position. `size`: smaller dimension of each
     electrode, metres."""
     apart = np.linalg.norm(position[:, None] - position, axis=-1)
-    same = np.argwhere(np.triu(apart < _SAME * np.minimum(size[:, None], size), 1))
+    same = np.argwhere(np.triu(apart < _MIN_SEPARATION * np.minimum(size[:, None], size), 1))
     for first, second in same[:1]:
         raise ValueError(
             f"position: electrodes {first + 1} and {second + 1} are at the same place, "
@@ -136,14 +144,15 @@ def check_apart(position: Float[np.ndarray, "L 3"], size: Float[np.ndarray, " L"
         )
 
 
-def check_size(name: str, sizes: Float[np.ndarray, " L"], most: float, of: str) -> None:
-    """Raise `ValueError` with the argument's `name` for the first electrode larger than `most` metres, the size of the
-    object that it lies on; `of` names that object."""
-    for number in np.flatnonzero(sizes > (1 + _SAME) * most)[:1]:
+def check_size(name: str, sizes: Float[np.ndarray, " L"], max_size: float, object_name: str) -> None:
+    """Raise `ValueError` with the argument's `name` for the first electrode larger than `max_size` metres, the size of
+    the object that it lies on; `object_name` names that object."""
+    for number in np.flatnonzero(sizes > (1 + _MIN_SEPARATION) * max_size)[:1]:
         size = float(sizes[number])
-        hint = IN_MILLIMETRES if 10 * most < size <= 1000 * most else "give the size of what lies on it."
+        hint = IN_MILLIMETRES if 10 * max_size < size <= 1000 * max_size else "give the size of what lies on it."
         raise ValueError(
-            f"{name}: electrode {number + 1}'s is {_length_text(size)}, larger than {of}, {_length_text(most)}; {hint}"
+            f"{name}: electrode {number + 1}'s is {_length_text(size)}, larger than {object_name}, "
+            f"{_length_text(max_size)}; {hint}"
         )
 
 
@@ -166,9 +175,9 @@ def _length_text(metres: float) -> str:
 
 
 # Maximum number of non-overlapping patches that can reach a triangle no larger than they are.
-_MOST_AT_ONCE = 8
+_MAX_PATCHES_PER_TRIANGLE = 8
 # Triangle that replaces those that a patch does not reach.
-_UNIT = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+_UNIT_TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
 
 class FacePatches(AbstractMovableElectrodes):
@@ -238,7 +247,7 @@ class FacePatches(AbstractMovableElectrodes):
         offset = corners[some][:, None] - self.position[near][:, :, None]  # (q, k, 3, 3)
         place = xp.stack([(offset * axis[near][:, :, None]).sum(axis=-1) for axis in (across, up)], axis=-1)
         # A triangle perpendicular to the patch has no projected area; replace it to avoid a division by zero.
-        place = xp.where(reached[..., None, None], place, _UNIT)
+        place = xp.where(reached[..., None, None], place, _UNIT_TRIANGLE)
         once, twice = covered_moments(place, half_size[near])
         current = xp.where(reached, area[some][:, None] / self.contact_impedance[near], 0)
         mass = (current[..., None, None] * twice).sum(axis=1)
@@ -291,7 +300,7 @@ def _reaching_patches(mesh: Mesh, position, half_size, frames):
     facing = (facet_normals(mesh) @ frames[0].T > 0.5) & (abs(away[0]) < half_size.max(axis=1))
     distance = undifferentiated(xp.where(facing, beyond[0] ** 2 + beyond[1] ** 2, xp.inf))
     reaches = distance <= undifferentiated(radius**2)[:, None]
-    count = min(_MOST_AT_ONCE, len(position))
+    count = min(_MAX_PATCHES_PER_TRIANGLE, len(position))
     if xp is np:
         count = max(1, min(count, int(reaches.sum(axis=1).max(initial=0))))
         near = np.argsort(distance, axis=1, kind="stable")[:, :count]

@@ -61,7 +61,7 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Draw the arcs of the boundary of `mesh` that the electrodes cover."""
         for place, width in zip(np.asarray(self.position), np.asarray(self.width), strict=True):
-            pen.lines([_arc(mesh, place, width)], place)
+            pen.lines([_arc_points(mesh, place, width)], place)
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Refine cells to a quarter of their size at the ends of the electrodes, where the current density is largest
@@ -159,7 +159,7 @@ def overlapping_pairs(start: np.ndarray, end: np.ndarray) -> list[tuple[int, int
     return pairs
 
 
-def _arc(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
+def _arc_points(mesh: Mesh, centre: np.ndarray, width: float) -> np.ndarray:
     """Points (k, 2) of the arc of the boundary with length `width` in metres around the point nearest to `centre`."""
     points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
     ends = points[facets]
@@ -193,35 +193,35 @@ def _project(position, mesh: Mesh):
     corners = mesh.points[mesh.facets]
     along = corners[:, 1] - corners[:, 0]
     offset = position[:, None, :] - corners[:, 0]  # (L, b, 2)
-    clipped = xp.clip(_dot(offset, along) / _dot(along, along), 0, 1)
+    clipped = xp.clip(_dot_products(offset, along) / _dot_products(along, along), 0, 1)
     beside = offset - clipped[..., None] * along
-    squared = undifferentiated(_dot(beside, beside))
+    squared = undifferentiated(_dot_products(beside, beside))
     facet = xp.argmin(squared, axis=1)
     tail, head = mesh.facets[facet].T
     before = xp.argmax(mesh.facets[:, 1] == tail[:, None], axis=1)
     after = xp.argmax(mesh.facets[:, 0] == head[:, None], axis=1)
     along = along[facet]
-    length = xp.sqrt(_dot(along, along))
+    length = xp.sqrt(_dot_products(along, along))
     before, middle, after = (_normalised(corners[:, 1] - corners[:, 0])[index] for index in (before, facet, after))
     first, second = _normalised(before + middle), _normalised(middle + after)
     offset = position - corners[facet, 0]
     # (offset - t along)·τ(t) = 0 reads constant + linear t + quadratic t² = 0; take the root that is regular as
     # quadratic → 0.
-    constant = _dot(offset, first)
-    linear = _dot(offset, second - first) - _dot(along, first)
-    quadratic = -_dot(along, second - first)
+    constant = _dot_products(offset, first)
+    linear = _dot_products(offset, second - first) - _dot_products(along, first)
+    quadratic = -_dot_products(along, second - first)
     fraction = 2 * constant / (xp.sqrt(xp.maximum(linear**2 - 4 * quadratic * constant, 0)) - linear)
     return facet, fraction * length, xp.sqrt(squared.min(axis=1))
 
 
-def _dot(first, second):
+def _dot_products(first, second):
     """Dot products of plane vectors, as an explicit sum, because XLA converts a sum over such a short axis into a slow
     matrix product."""
     return first[..., 0] * second[..., 0] + first[..., 1] * second[..., 1]
 
 
 def _normalised(vectors):
-    return vectors / namespace(vectors).sqrt(_dot(vectors, vectors))[..., None]
+    return vectors / namespace(vectors).sqrt(_dot_products(vectors, vectors))[..., None]
 
 
 @either_engine

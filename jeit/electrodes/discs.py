@@ -24,8 +24,8 @@ from jeit_solvers.engines import has_values, host, namespace, on_host, sum_into,
 
 # Half-width of the smooth edge of a disc's window, relative to the local cell size. Smaller values approximate the
 # sharp electrode better, until the edge falls between quadrature points; see tests/electrodes for the convergence.
-EDGE = 0.5
-_MOST_AT_ONCE = 8
+EDGE_WIDTH = 0.5
+_MAX_DISCS_PER_TRIANGLE = 8
 
 
 def triangle_quadrature(order: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +59,7 @@ def nearest_electrodes(middles, position, radius) -> Int[Array, "q k"]:
     xp = namespace(middles, position, radius)
     distance = xp.sum((middles[:, None] - position) ** 2, axis=-1) - radius**2
     distance = undifferentiated(distance).astype(np.float32)  # the order of distant ones does not matter
-    number = min(_MOST_AT_ONCE, len(radius))
+    number = min(_MAX_DISCS_PER_TRIANGLE, len(radius))
     if xp is np:
         return host.argsort(distance, axis=1, kind="stable")[:, :number]
     return jax.lax.top_k(-distance, number)[1]
@@ -143,7 +143,7 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
         area = measures(mesh)
         barycentric, _ = triangle_quadrature()
         points = xp.einsum("pi,mid->mpd", barycentric, mesh.points[mesh.cells])
-        edge = EDGE * xp.sqrt(area)
+        edge = EDGE_WIDTH * xp.sqrt(area)
         near = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
         window = disc_window(points, self.position[near], self.radius[near], edge)
         return window_contact(mesh.cells, area, window, near, self.contact_impedance, mesh.num_points)
@@ -193,7 +193,7 @@ class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
         area = facet_measures(mesh)
         barycentric, _ = triangle_quadrature()
         points = xp.einsum("pi,bid->bpd", barycentric, mesh.points[mesh.facets])
-        edge = EDGE * xp.sqrt(area)
+        edge = EDGE_WIDTH * xp.sqrt(area)
         near = nearest_electrodes(points.mean(axis=1), self.position, self.radius)
         window = disc_window(points, self.position[near], self.radius[near], edge)
         reached = xp.take_along_axis(same_face(mesh, self.position, self.radius), near, axis=1)
@@ -267,15 +267,15 @@ def same_face(mesh: Mesh, position: Float[Array, "L 3"], radius: Float[Array, " 
 
 
 def nearest_facets(
-    mesh: Mesh, position: Float[Array, "L 3"], handicap: Float[Array, "L b"] | float = 0.0
+    mesh: Mesh, position: Float[Array, "L 3"], added_distance: Float[Array, "L b"] | float = 0.0
 ) -> Int[Array, " L"]:
     """Boundary triangle with the nearest centroid to each position; among equally near triangles, the first.
 
-    `handicap` (L, b): m², added to the squared distances.
+    `added_distance` (L, b): m², added to the squared distances to disfavour some triangles.
     """
     xp = namespace(mesh, position)
     centres = mesh.points[mesh.facets].mean(axis=1)
-    apart = xp.sum((position[:, None] - centres) ** 2, axis=-1) + handicap
+    apart = xp.sum((position[:, None] - centres) ** 2, axis=-1) + added_distance
     # A tolerance for ties, so that the result does not depend on rounding in the unit of length.
     return xp.argmax(apart <= (1 + 1e-9) * apart.min(axis=1, keepdims=True), axis=1)
 
@@ -325,7 +325,7 @@ def check_discs(electrodes: AbstractDiscs, mesh: Mesh, area) -> None:
 
 # Minimum cosine of the angle between normals within a disc: the normal turns by one radian along a radius equal to the
 # radius of curvature.
-_FACING = float(np.cos(1.0))
+_MIN_NORMAL_COSINE = float(np.cos(1.0))
 
 
 class SurfaceDiscs(AbstractDiscs):
@@ -367,7 +367,7 @@ class SurfaceDiscs(AbstractDiscs):
         barycentric, _ = triangle_quadrature()
         corners = mesh.points[mesh.cells]
         points = xp.einsum("pi,mid->mpd", barycentric, corners)
-        edge = EDGE * xp.sqrt(area)
+        edge = EDGE_WIDTH * xp.sqrt(area)
         middle = points.mean(axis=1)
         near = nearest_electrodes(middle, self.position, self.radius)
         longest = xp.sqrt(((corners - xp.roll(corners, 1, axis=1)) ** 2).sum(axis=-1).max(axis=1))
@@ -386,7 +386,9 @@ class SurfaceDiscs(AbstractDiscs):
         """Raise `ValueError` for discs that lie off the surface, extend over its border, are as large as its radius of
         curvature, overlap, or are too small for the mesh."""
         if not mesh.is_surface:
-            raise ValueError("SurfaceDiscs live on a surface in space, and this mesh is none; see jeit.mesh.tube.")
+            raise ValueError(
+                "SurfaceDiscs need a mesh that is a surface in space, such as jeit.mesh.tube makes; this one is not."
+            )
         if not has_values(self, mesh):
             return
         discs, mesh = on_host((self, mesh))
@@ -415,7 +417,7 @@ def check_on_surface(position, radius, surface: Triangles) -> None:
             )
         within = np.linalg.norm(middles - at.points[number], axis=1) < size
         turned = normal[within] @ normal[at.triangle[number]]
-        if (np.abs(turned) < _FACING).any():
+        if (np.abs(turned) < _MIN_NORMAL_COSINE).any():
             raise ValueError(
                 f"radius: {where} is larger than the surface's radius of curvature there; a disc so large is no disc, "
                 "give less."

@@ -88,9 +88,9 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
             part.check(mesh)
 
 
-_ROUND, _SIDE = 32, 8
+_CIRCLE_CORNERS, _SIDE_CORNERS = 32, 8
 # Number of triangles near a point, by nearest centroids, that are searched when it is projected onto the surface.
-_NEAR = 24
+_NUM_CANDIDATES = 24
 
 
 @dataclass(frozen=True)
@@ -152,15 +152,15 @@ def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.nd
         load = np.asarray(electrodes.contact(mesh).load)
         return [[one[None]] for one in (load / load.sum(axis=0)).T @ points]
     places = said["position"]
-    surface = Draped(points, triangles)
+    surface = ProjectionSurface(points, triangles)
     frames = surface.frames(places)
     if "radius" in said:
-        angle = 2 * np.pi * np.arange(_ROUND) / _ROUND
+        angle = 2 * np.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
         sizes = np.broadcast_to(said["radius"], len(places))
         flat = [size * np.stack([np.cos(angle), np.sin(angle)], axis=1) for size in sizes]
     elif "width" in said and "height" in said:
-        side = np.arange(_SIDE) / _SIDE * 2 - 1
-        one = np.ones(_SIDE)
+        side = np.arange(_SIDE_CORNERS) / _SIDE_CORNERS * 2 - 1
+        one = np.ones(_SIDE_CORNERS)
         square = np.concatenate(
             [np.stack(pair, axis=1) for pair in ((side, -one), (one, side), (-side, one), (-one, -side))]
         )
@@ -169,7 +169,7 @@ def _all_polygons(mesh: Mesh, electrodes: AbstractElectrodes) -> list[list[np.nd
     else:
         return [[place[None]] for place in places]
     return [
-        [surface.laid_on(place + shape @ frame[1:], frame[0])]
+        [surface.project(place + shape @ frame[1:], frame[0])]
         for place, shape, frame in zip(places, flat, frames, strict=True)
     ]
 
@@ -179,7 +179,7 @@ def surface_triangles(mesh: Mesh) -> Int[np.ndarray, "m 3"]:
     return np.asarray(mesh.facets if mesh.cells.shape[1] == 4 else mesh.cells)
 
 
-class Draped:
+class ProjectionSurface:
     """A surface of triangles onto which flat shapes are projected: `points` (n, 3), `triangles` (m, 3)."""
 
     def __init__(self, points: Float[np.ndarray, "n 3"], triangles: Int[np.ndarray, "m 3"]):
@@ -200,10 +200,10 @@ class Draped:
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         return np.stack([normal, across, np.cross(normal, across)], axis=1)
 
-    def laid_on(self, places: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
+    def project(self, places: Float[np.ndarray, "k 3"], normal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "k 3"]:
         """Project points along the normal onto the nearest triangle in that direction; points that meet no triangle are
         returned unchanged."""
-        near = self._tree.query(places, k=min(_NEAR, len(self._corners)))[1].reshape(len(places), -1)
+        near = self._tree.query(places, k=min(_NUM_CANDIDATES, len(self._corners)))[1].reshape(len(places), -1)
         corners = self._corners[near]
         edge, other = corners[:, :, 1] - corners[:, :, 0], corners[:, :, 2] - corners[:, :, 0]
         # Möller and Trumbore: place + t normal = corner + a edge + b other.
@@ -234,7 +234,7 @@ class _PlanePen:
         self.drawn.append([one[k : k + 2] for one in ends for k in range(len(one) - 1)])
 
     def disc(self, middle: np.ndarray, radius: float) -> None:
-        angle = 2 * np.pi * np.arange(_ROUND) / _ROUND
+        angle = 2 * np.pi * np.arange(_CIRCLE_CORNERS) / _CIRCLE_CORNERS
         self.drawn.append([middle[:2] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
 
     def rectangle(self, middle: np.ndarray, width: float, height: float) -> None:

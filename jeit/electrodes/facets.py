@@ -31,7 +31,7 @@ from jeit_solvers.engines import has_values, namespace, sum_into, undifferentiat
 
 # Covered fraction of a triangle below which it counts as zero: it has few correct digits, which would matter for small
 # contact impedances.
-_TOUCHED = 1e-12
+_MIN_COVERED_FRACTION = 1e-12
 
 
 def covered_moments(
@@ -66,7 +66,9 @@ def covered_moments(
     # For triangles that are barely touched, only rounding errors remain, which small contact impedances would amplify:
     # set the value to zero, but keep its derivative. The load is computed as the sum of the mass, since for small
     # contact impedances any difference between them would drive currents.
-    twice = twice - undifferentiated(xp.where(twice.sum(axis=(-1, -2), keepdims=True) > _TOUCHED, 0, twice))
+    twice = twice - undifferentiated(
+        xp.where(twice.sum(axis=(-1, -2), keepdims=True) > _MIN_COVERED_FRACTION, 0, twice)
+    )
     twice = (twice + xp.swapaxes(twice, -1, -2)) / 2
     return twice.sum(axis=-1), twice
 

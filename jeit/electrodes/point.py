@@ -198,7 +198,10 @@ class IntegratedElectrodes(AbstractElectrodes):
     @property
     def contact_impedance(self) -> Float[Array, " L"]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Raises `AttributeError`: the contact impedance is part of the integrals."""
-        raise AttributeError("IntegratedElectrodes hold integrals only; ask the electrodes that they were made of.")
+        raise AttributeError(
+            "IntegratedElectrodes hold contact integrals only; take the contact impedance of the "
+            "electrodes from which they were computed."
+        )
 
     def with_contact_impedance(self, contact_impedance: ArrayLike) -> AbstractElectrodes:
         """Raises `ValueError`: the contact impedance is part of the integrals."""
@@ -210,7 +213,7 @@ class IntegratedElectrodes(AbstractElectrodes):
 
     def draw(self, mesh: Mesh, pen: ElectrodePen) -> None:
         """Raises `ValueError`: positions are not stored."""
-        raise ValueError("IntegratedElectrodes do not say where they are; draw the electrodes that they were made of.")
+        raise ValueError("IntegratedElectrodes hold no positions; draw the electrodes from which they were computed.")
 
     def refinement(self, body: Body) -> tuple[Refine, ...]:
         """Empty, because the electrodes belong to an existing mesh."""

@@ -27,10 +27,10 @@ from jeit.protocol import Protocol
 from jeit_solvers.engines import as_array, on_host
 
 # Number of cells processed at a time, so that their products of gradients stay in the cache.
-_CELLS = 256
+_CELLS_AT_ONCE = 256
 
 
-class Change(NamedTuple):
+class ConductivityChange(NamedTuple):
     """Linear change of conductivity by q coefficients. **Fields**: `cells`: (k,) the cells that change, or None for all
     cells; `slope`: (k, q) change of each cell per unit coefficient, in S/m (2-D: S)."""
 
@@ -52,7 +52,7 @@ class SolvedFields(NamedTuple):
         """Voltages (M,) of the channels."""
         return channel_voltages(self.protocol, self.impedance)  # pyright: ignore[reportReturnType]
 
-    def derivatives(self, changes: Sequence[Change]) -> Float[np.ndarray, "M n"]:
+    def derivatives(self, changes: Sequence[ConductivityChange]) -> Float[np.ndarray, "M n"]:
         """Derivatives of the voltages with respect to the coefficients of all `changes`: -∫ dσ ∇u_drive · ∇u_measure,
         computed from the values for pairs of electrodes."""
         energy = np.concatenate([self._energy(*change) for change in changes])
@@ -68,7 +68,7 @@ class SolvedFields(NamedTuple):
         nodes, corners = np.unique(there, return_inverse=True)
         points = np.asarray(self.mesh.points)[nodes]
         part = replace(self.mesh, points=points, cells=corners.reshape(there.shape), tags={})
-        return _energy(field_gradients(part, fields[nodes]), slope)
+        return _field_energies(field_gradients(part, fields[nodes]), slope)
 
     def _energy_everywhere(self, change: Float[np.ndarray, " m"]) -> Float[np.ndarray, "L L"]:
         cells, size = np.asarray(self.mesh.cells), self.mesh.num_points
@@ -87,34 +87,34 @@ def solved_fields(model: ForwardModel, conductivity: Float[np.ndarray, " m"]) ->
     return SolvedFields(*on_host((model.mesh, model.protocol, fields, impedance)))
 
 
-def _energy(gradient, slope) -> Float[np.ndarray, "q L L"]:
+def _field_energies(gradient, slope) -> Float[np.ndarray, "q L L"]:
     """Matrices ∫ dσ ∇F_k · ∇F_l (q, L, L), one per coefficient."""
     number = gradient.shape[-1]
     energy = np.zeros((slope.shape[1], number**2), np.result_type(gradient, slope))
-    for start in range(0, len(slope), _CELLS):
-        some = slice(start, start + _CELLS)
+    for start in range(0, len(slope), _CELLS_AT_ONCE):
+        some = slice(start, start + _CELLS_AT_ONCE)
         local = np.ascontiguousarray(np.moveaxis(gradient[:, some], 0, -1))
         energy += slope[some].T @ (local @ local.transpose(0, 2, 1)).reshape(len(local), -1)
     return energy.reshape(-1, number, number)
 
 
 # Contact impedance in ohm·m² beyond which an electrode carries no current, compared with one of unit impedance.
-_OPEN = 1e30
+_OPEN_CONTACT = 1e30
 
 
-class _Piece(NamedTuple):
+class _ContactMass(NamedTuple):
     nodes: Int[np.ndarray, "q k"]
     mass: Float[np.ndarray, "q k k"]
 
 
-def _pieces_alone(mesh: Mesh, electrodes: AbstractElectrodes, electrode: int) -> list[_Piece]:
+def _contact_masses_of(mesh: Mesh, electrodes: AbstractElectrodes, electrode: int) -> list[_ContactMass]:
     """Contact mass of one electrode, for unit contact impedance, where electrodes share facets or cells."""
-    alone = np.where(np.arange(electrodes.num_electrodes) == electrode, 1.0, _OPEN)
+    alone = np.where(np.arange(electrodes.num_electrodes) == electrode, 1.0, _OPEN_CONTACT)
     contact = on_host(electrodes.with_contact_impedance(alone)).contact(mesh)
     pieces = []
     for nodes, mass in zip(contact.nodes, contact.mass, strict=True):
-        touched = np.abs(mass).max(axis=(1, 2)) > 2 / _OPEN * np.abs(mass).max()
-        pieces.append(_Piece(np.asarray(nodes)[touched], np.asarray(mass)[touched]))
+        touched = np.abs(mass).max(axis=(1, 2)) > 2 / _OPEN_CONTACT * np.abs(mass).max()
+        pieces.append(_ContactMass(np.asarray(nodes)[touched], np.asarray(mass)[touched]))
     return pieces
 
 
@@ -126,18 +126,18 @@ class ContactSensitivity:
         mesh, number = on_host(mesh), electrodes.num_electrodes
         whole = on_host(electrodes.with_contact_impedance(np.ones(number))).contact(mesh)
         self._loads: list[Float[np.ndarray, " n"]] = list(np.asarray(whole.load).T)
-        self._pieces: list[list[_Piece]] = [[] for _ in range(number)]
+        self._pieces: list[list[_ContactMass]] = [[] for _ in range(number)]
         for nodes, mass in zip(whole.nodes, whole.mass, strict=True):
             nodes, mass = np.asarray(nodes), np.asarray(mass)
             held = np.flatnonzero(np.abs(mass).max(axis=(1, 2)) > 0)
-            # An electrode that touches a facet or cell has a load at all of its nodes.
+            # If an electrode covers a part of a facet or cell, all nodes of this facet or cell have a load.
             touches = (np.asarray(whole.load)[nodes[held]] != 0).all(axis=1)
             if (touches.sum(axis=1) > 1).any():
-                self._pieces = [_pieces_alone(mesh, electrodes, one) for one in range(number)]
+                self._pieces = [_contact_masses_of(mesh, electrodes, one) for one in range(number)]
                 return
             for electrode, pieces in enumerate(self._pieces):
                 own = held[touches[:, electrode]]
-                pieces.append(_Piece(nodes[own], mass[own]))
+                pieces.append(_ContactMass(nodes[own], mass[own]))
 
     def __call__(
         self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"], contact_impedance
@@ -159,29 +159,30 @@ class ContactSensitivity:
 
 
 # Fraction of the mesh's width by which electrodes are shifted for derivatives.
-_SHIFTED = 1e-4
+_DIFFERENCE_SHIFT = 1e-4
 
 
 class PlacementSensitivity:
-    """∂Z of every shift of the electrodes along the directions in which they can move, by central differences of the
-    contact energy at fixed fields, and of every log z. `electrodes` must be movable; their places and sizes hold."""
+    """Derivatives of the transfer impedance Z with respect to shifts of the electrodes, along the directions in which
+    they can move, and to the logarithm of each contact impedance z. They are computed by central differences of the
+    contact energy at fixed fields. `electrodes` must be movable."""
 
     def __init__(self, mesh: Mesh, electrodes: AbstractMovableElectrodes):
         mesh = on_host(mesh)
         self.directions = np.asarray(electrodes.directions(mesh))
         self._contact_impedance = np.asarray(electrodes.contact_impedance)
-        self._step = _SHIFTED * float(np.ptp(np.asarray(mesh.points), axis=0).max())
+        self._step = _DIFFERENCE_SHIFT * float(np.ptp(np.asarray(mesh.points), axis=0).max())
         self._here = ContactSensitivity(mesh, electrodes)
         self._ends = []
         for way in range(self.directions.shape[1]):
             shift = np.zeros(self.directions.shape[:2])
             shift[:, way] = self._step
-            ends = [shifted(electrodes, self.directions, one) for one in (shift, -shift)]
+            ends = [shift_electrodes(electrodes, self.directions, one) for one in (shift, -shift)]
             self._ends.append([ContactSensitivity(mesh, one) for one in ends])
 
     def __call__(self, fields: Float[np.ndarray, "n L"], impedance: Float[np.ndarray, "L L"]):
-        """∂Z (p, L, L), ohms per metre for the L · a shifts, electrode by electrode, then ohms for the L log z; from F
-        and Z with these electrodes."""
+        """Derivatives (p, L, L) of Z: for the L · a shifts, electrode by electrode, in ohms per metre, then for the L
+        values log z, in ohms. `fields`: F (n, L), and `impedance`: Z (L, L), both in ohms, with these electrodes."""
         contact = self._contact_impedance
         by_shift = []
         for up, down in self._ends:
@@ -191,9 +192,10 @@ class PlacementSensitivity:
         return np.concatenate([by_shift, self._here(fields, impedance, contact)])
 
 
-def shifted(
+def shift_electrodes(
     electrodes: AbstractMovableElectrodes, directions: Float[np.ndarray, "L a d"], shift: Float[np.ndarray, "L a"]
 ) -> AbstractMovableElectrodes:
-    """The electrodes with each position shifted along its `directions`, metres."""
+    """Copy electrodes, with each position displaced by `shift` (L, a), metres, along its unit vectors `directions` (L,
+    a, d)."""
     place = np.asarray(electrodes.position) + np.einsum("la,lad->ld", shift, directions)
     return eqx.tree_at(lambda one: one.position, electrodes, as_array(place))

@@ -36,21 +36,22 @@ from jeit_solvers.engines import (
 )
 
 # Maximum number of entries of a block of the Jacobian, so that the block fits in the cache of a core.
-_BLOCK = 250_000
+_BLOCK_ENTRIES = 250_000
 # Number of blocks from which they are distributed over the cores.
-_WORTH_A_THREAD = 20
+_MIN_PARALLEL_BLOCKS = 20
 # Number of cells processed at a time, so that their fields fit in the cache of a core.
-_CELLS = 4000
+_CELLS_AT_ONCE = 4000
 
 
-class _Bound(eqx.Module):
-    """A method of a model that `jax.jit` accepts: hashed by the identity of its model, as no array can be hashed."""
+class _BoundMethod(eqx.Module):
+    """Bound method of a model that `jax.jit` accepts. JAX needs a hash of the function that it compiles; arrays have
+    none, so the hash is that of the identity of the model."""
 
     __func__: Callable[..., Any] = eqx.field(static=True)
     __self__: eqx.Module
 
-    def __call__(self, *given: Any, **named: Any) -> Any:
-        return self.__func__(self.__self__, *given, **named)
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        return self.__func__(self.__self__, *arguments, **keywords)
 
     @property
     def __wrapped__(self) -> Any:  # what `help` and signatures show
@@ -60,24 +61,25 @@ class _Bound(eqx.Module):
         return hash((self.__func__, id(self.__self__)))
 
     def __eq__(self, other: object) -> Any:
-        return isinstance(other, _Bound) and self.__func__ is other.__func__ and self.__self__ is other.__self__
+        return isinstance(other, _BoundMethod) and self.__func__ is other.__func__ and self.__self__ is other.__self__
 
 
-class _Method:
+class _CompilableMethod:
     def __init__(self, function: Callable[..., Any]):
         self.function = function
         self.__doc__ = function.__doc__
 
     def __get__(self, model: eqx.Module | None, owner: type | None = None) -> Any:
-        return self.function if model is None else _Bound(self.function, model)
+        return self.function if model is None else _BoundMethod(self.function, model)
 
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compilable(function: Function) -> Function:
-    """Make a method of a model one that `jax.jit(model.method)` compiles; the model's arrays are constants then."""
-    return cast(Function, _Method(function))
+    """Decorate a method of a model so that `jax.jit(model.method)` works; the arrays of the model are then constants of
+    the compiled program."""
+    return cast(Function, _CompilableMethod(function))
 
 
 class ForwardModel(eqx.Module):
@@ -111,7 +113,7 @@ class ForwardModel(eqx.Module):
         """`solver`: "auto" (chosen by size; `model.system.solver` states which solver and why), "cholesky", "cg", or
         any lineax solver. With any value but "auto" and `jeit_solvers.Multigrid` the methods are always compiled.
         Raises `ValueError` if electrodes, mesh and protocol do not fit together."""
-        _check(mesh, electrodes, protocol)
+        _check_model_parts(mesh, electrodes, protocol)
         self.mesh = mesh
         self.electrodes = electrodes
         self.protocol = protocol
@@ -136,12 +138,12 @@ class ForwardModel(eqx.Module):
                 f"with_electrodes needs {type(self.electrodes).__name__}, not {type(electrodes).__name__}; make a new "
                 "ForwardModel for another kind of electrode."
             )
-        _check(self.mesh, electrodes, self.protocol)
+        _check_model_parts(self.mesh, electrodes, self.protocol)
         return eqx.tree_at(lambda model: model.electrodes, self, electrodes)
 
     def with_protocol(self, protocol: Protocol) -> "ForwardModel":
         """The same model with another protocol. Raises `ValueError` unless it has the same number of electrodes."""
-        _check(self.mesh, self.electrodes, protocol)
+        _check_model_parts(self.mesh, self.electrodes, protocol)
         return eqx.tree_at(lambda model: model.protocol, self, protocol)
 
     @compilable
@@ -207,10 +209,10 @@ def evaluate(model: ForwardModel, quantity: Callable[..., Any], conductivity) ->
     `conductivity`: an array in S/m (2-D: S). It is not checked: values that are not positive or not finite yield NaN.
     """
     if not has_values(model):
-        return _COMPILED[quantity](model, conductivity)
+        return _COMPILED_QUANTITIES[quantity](model, conductivity)
     parts = model.mesh, model.electrodes, model.protocol, model.system
     if not (model.at_once and has_values(conductivity)):
-        found = _COMPILED[quantity](integrated_model(*parts), conductivity)
+        found = _COMPILED_QUANTITIES[quantity](integrated_model(*parts), conductivity)
         return on_host(found) if namespace(parts[:3], conductivity) is np else found
     with np.errstate(all="ignore"):
         found = quantity(host_model(*parts), on_host(conductivity))
@@ -222,7 +224,7 @@ def check_model(model: ForwardModel) -> None:
     check_kind("model", model, ForwardModel, "a ForwardModel(mesh, electrodes, protocol)")
 
 
-def _check(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol) -> None:
+def _check_model_parts(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol) -> None:
     if not isinstance(mesh, Mesh):
         raise ValueError(f"mesh must be a Mesh, not {type(mesh).__name__}; see jeit.mesh.disk and jeit.mesh.read.")
     if not isinstance(electrodes, AbstractElectrodes):
@@ -303,7 +305,7 @@ def voltages_and_jacobian_of(model: ForwardModel | IntegratedModel, conductivity
     if namespace(conductivity, mesh) is np:
         jacobian: Any = _whole_jacobian(mesh, protocol, fields)
     else:
-        jacobian = _of_cells(protocol, field_gradients(mesh, fields))
+        jacobian = _jacobian_of_cells(protocol, field_gradients(mesh, fields))
     if conductivity.ndim == 1 and conductivity.shape[0] != mesh.num_cells:
         per_corner = jacobian.T / mesh.cells.shape[1]
         shape = mesh.num_points, protocol.num_measurements
@@ -316,20 +318,20 @@ def _whole_jacobian(mesh: Mesh, protocol: Protocol, fields: Inexact[Array, "n L"
     gradient = field_gradients(mesh, fields)
     jacobian = empty_for_jax((protocol.num_measurements, mesh.num_cells), np.dtype(fields.dtype))
 
-    def fill(cells: slice) -> None:
-        jacobian[:, cells] = _of_cells(protocol, gradient[:, cells])
+    def fill_block(cells: slice) -> None:
+        jacobian[:, cells] = _jacobian_of_cells(protocol, gradient[:, cells])
 
     blocks = _blocks_of_cells(mesh, protocol)
-    if len(blocks) < _WORTH_A_THREAD:
+    if len(blocks) < _MIN_PARALLEL_BLOCKS:
         for cells in blocks:
-            fill(cells)
+            fill_block(cells)
     else:
-        on_cores(fill, blocks)
+        on_cores(fill_block, blocks)
     return jacobian
 
 
 def _blocks_of_cells(mesh: Mesh, protocol: Protocol) -> list[slice]:
-    size = max(1, _BLOCK // protocol.num_measurements)
+    size = max(1, _BLOCK_ENTRIES // protocol.num_measurements)
     return [slice(start, min(start + size, mesh.num_cells)) for start in range(0, mesh.num_cells, size)]
 
 
@@ -341,7 +343,7 @@ def jacobian_blocks(
     in ohms."""
     gradient = field_gradients(mesh, fields)
     for cells in _blocks_of_cells(mesh, protocol):
-        yield cells, _of_cells(protocol, gradient[:, cells])
+        yield cells, _jacobian_of_cells(protocol, gradient[:, cells])
 
 
 def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[slice, Inexact[np.ndarray, "f b"]]]:
@@ -351,8 +353,8 @@ def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[
     gradient: Any = field_gradients(mesh, fields)
     count = gradient.shape[-1]
     starts = np.cumsum([0, *range(count, 0, -1)])
-    for start in range(0, mesh.num_cells, _CELLS):
-        cells = slice(start, min(start + _CELLS, mesh.num_cells))
+    for start in range(0, mesh.num_cells, _CELLS_AT_ONCE):
+        cells = slice(start, min(start + _CELLS_AT_ONCE, mesh.num_cells))
         along = np.ascontiguousarray(np.swapaxes(gradient[:, cells], 1, 2))
         products = np.zeros((starts[-1], along.shape[-1]), along.dtype)
         for field in range(count):
@@ -362,7 +364,7 @@ def field_products(mesh: Mesh, fields: Inexact[Array, "n L"]) -> Iterator[tuple[
         yield cells, products
 
 
-def _of_cells(protocol: Protocol, gradient: Inexact[Array, "d b L"]) -> Inexact[Array, "M b"]:
+def _jacobian_of_cells(protocol: Protocol, gradient: Inexact[Array, "d b L"]) -> Inexact[Array, "M b"]:
     """Jacobian ∂v/∂σ_e = -∫_e ∇u_drive · ∇u_measure, summed axis by axis from the gradients of the fields in cells."""
     xp, jacobian = namespace(gradient), host.zeros(())
     # A single product for all patterns and axes also keeps XLA from recomputing the gradients for every channel.
@@ -375,7 +377,7 @@ def _of_cells(protocol: Protocol, gradient: Inexact[Array, "d b L"]) -> Inexact[
     return jacobian
 
 
-_COMPILED = {
+_COMPILED_QUANTITIES = {
     transfer_impedance_of: jax.jit(transfer_impedance_of),
     voltages_of: jax.jit(voltages_of),
     fields_of: jax.jit(fields_of),
@@ -395,18 +397,22 @@ class IntegratedModel(NamedTuple):
     system: System
 
 
-def _integrated(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol, system: System) -> IntegratedModel:
+def _integrate_electrodes(
+    mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol, system: System
+) -> IntegratedModel:
     with jax.ensure_compile_time_eval():  # otherwise the cached arrays would belong to the program being traced
         return IntegratedModel(mesh, IntegratedElectrodes(electrodes, mesh), protocol, system)
 
 
-def _on_host(mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol, system: System) -> IntegratedModel:
+def _integrate_on_host(
+    mesh: Mesh, electrodes: AbstractElectrodes, protocol: Protocol, system: System
+) -> IntegratedModel:
     # Electrodes defined by a user may compute their integrals in JAX.
-    return on_host(_integrated(*on_host((mesh, electrodes, protocol, system))))
+    return on_host(_integrate_electrodes(*on_host((mesh, electrodes, protocol, system))))
 
 
 # A model is usually evaluated many times, and its electrodes may change while its mesh stays the same.
-integrated_model = Recent(_integrated)
+integrated_model = Recent(_integrate_electrodes)
 """The `IntegratedModel` of a mesh, electrodes, a protocol and a system whose values are all known."""
-host_model = Recent(_on_host)
+host_model = Recent(_integrate_on_host)
 """The same in NumPy, for calls outside compiled code, which then do not wait for a compiler."""

@@ -57,7 +57,7 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     """
     conductivity = np.asarray(conductivity) if has_values(conductivity) else jnp.asarray(conductivity)
     # A single type and shape for all equivalent inputs, because JAX compiles again for Python's "weakly typed" numbers.
-    conductivity = namespace(conductivity).asarray(conductivity, dtype=_floating(conductivity.dtype))
+    conductivity = namespace(conductivity).asarray(conductivity, dtype=_floating_type(conductivity.dtype))
     m, n, d = mesh.num_cells, mesh.num_points, mesh.space_dimension
     if conductivity.shape not in [(), (m,), (n,), (m, d, d)]:
         raise ValueError(
@@ -69,13 +69,13 @@ def check_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "..."]:
     return namespace(conductivity).broadcast_to(conductivity, conductivity.shape or (m,))
 
 
-def _floating(kind: Any) -> Any:
+def _floating_type(dtype: Any) -> Any:
     """Floating-point type for values of the given type. Raises `ValueError` for a type that is not numeric."""
-    if kind.kind in "OSUmM":
-        raise ValueError(f"conductivity is {kind}; give real or complex numbers, S/m (2-D: S).")
-    if kind.kind in "biu" or kind.itemsize > 16 or (kind.kind == "f" and kind.itemsize > 8):
-        return jnp.result_type(complex if kind.kind == "c" else float)
-    return jax.dtypes.canonicalize_dtype(kind.newbyteorder("="))
+    if dtype.kind in "OSUmM":
+        raise ValueError(f"conductivity is {dtype}; give real or complex numbers, S/m (2-D: S).")
+    if dtype.kind in "biu" or dtype.itemsize > 16 or (dtype.kind == "f" and dtype.itemsize > 8):
+        return jnp.result_type(complex if dtype.kind == "c" else float)
+    return jax.dtypes.canonicalize_dtype(dtype.newbyteorder("="))
 
 
 def _check_values(conductivity: Any, normal: Any) -> None:
@@ -99,7 +99,7 @@ def _check_values(conductivity: Any, normal: Any) -> None:
         )
 
 
-def _geometry(mesh: Mesh) -> tuple[Inexact[Array, "m k s"], Inexact[Array, " m"]]:
+def _cached_geometry(mesh: Mesh) -> tuple[Inexact[Array, "m k s"], Inexact[Array, " m"]]:
     """Gradients (m, d + 1, s) of the basis functions, and measures (m,) of the cells. In NumPy, those of the mesh that
     was used last are kept."""
     return _last_geometry(mesh) if namespace(mesh) is np else _gradients_and_measures(mesh)
@@ -116,7 +116,7 @@ def stiffness(mesh: Mesh, conductivity: Inexact[Array, "m ..."]) -> Inexact[Arra
     """Element stiffness ∫ ∇φ_i·σ∇φ_j for a conductivity per cell in S/m (2-D: S): lower triangles (p, m) in siemens, p
     = (d+1)(d+2)/2."""
     xp = namespace(mesh, conductivity)
-    gradient, measure = _geometry(mesh)
+    gradient, measure = _cached_geometry(mesh)
     flux = gradient if conductivity.ndim == 1 else xp.einsum("mij,mkj->mki", conductivity, gradient)
     weight = measure * (conductivity if conductivity.ndim == 1 else 1)
     rows, columns = np.tril_indices(mesh.dimension + 1)
@@ -135,7 +135,7 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
     With this weight the product of two gradients is the integral ∫_e ∇u·∇w.
     """
     xp = namespace(mesh, fields)
-    gradient, measure = _geometry(mesh)
+    gradient, measure = _cached_geometry(mesh)
     weighted = gradient * xp.sqrt(measure)[:, None, None]
     corners = [gather(fields, mesh.cells[:, k]) for k in range(mesh.dimension + 1)]
     return xp.stack(
@@ -245,8 +245,9 @@ def ground_conductance(stiffness: Inexact[Array, " n"], load: Inexact[Array, "n 
     """A conductance (n,) to ground at one node under an electrode, of the order of the `stiffness` (n,) there.
 
     No current flows through it if the currents sum to zero, so it does not change the solution. It fixes the constant
-    part of the potential, which is undetermined for point electrodes, and nearly so for contacts that are almost open.
-    It is not differentiated.
+    part of the potential, which point electrodes leave undetermined, and complete electrodes with a very large contact
+    impedance nearly so. `load` (n, L): the right-hand sides, nonzero at the nodes under electrodes. It is not
+    differentiated.
     """
     xp = namespace(stiffness, load)
     stiffness = undifferentiated(abs(stiffness))

@@ -58,17 +58,17 @@ def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: Abstract
 
 def impedance_parts(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System) -> ElectrodeImpedance:
     """The transfer impedance as an `ElectrodeImpedance`, in two parts; `conductivity` in S/m (2-D: S)."""
-    formula = _quadratic if namespace(mesh, conductivity, electrodes) is np else _differentiable
+    formula = _impedance_by_quadratic_form if namespace(mesh, conductivity, electrodes) is np else _differentiable
     return formula(mesh, conductivity, electrodes, system)
 
 
-def _quadratic(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
+def _impedance_by_quadratic_form(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, system: System):
     contact = electrodes.contact(mesh)
     operator, load = system.grounded(mesh, cell_conductivity(mesh, conductivity), electrodes, contact)
     return electrode_impedance(system.quadratic_form(operator, load), contact_resistance(electrodes, contact))
 
 
-_differentiable = eqx.filter_custom_jvp(_quadratic)
+_differentiable = eqx.filter_custom_jvp(_impedance_by_quadratic_form)
 
 
 @_differentiable.def_jvp
@@ -145,15 +145,17 @@ def solved_system(mesh: Mesh, conductivity, electrodes: AbstractElectrodes, syst
 
 
 @eqx.filter_jit
-def fields_and_inverse(solved: SolvedSystem, strips: Strips, reach: int) -> tuple[Inexact[Array, "p L"], NearInverse]:
-    """F at the places of strips of the nodes, and K⁻¹ between places up to `reach` strips apart, in ohms.
+def fields_and_inverse(
+    solved: SolvedSystem, strips: Strips, max_distance: int
+) -> tuple[Inexact[Array, "p L"], NearInverse]:
+    """F at the places of strips of the nodes, and K⁻¹ between places up to `max_distance` strips apart, in ohms.
 
     K is the matrix of the electrode model with the ground and all electrodes but one floating; K⁻¹ is the potential at
     one node for a unit current into another. The choice of the electrode that is not floating does not affect the
     derivatives with respect to conductivity.
     """
     fields, solution = strips.spread(solved.fields()[0]), strips.spread(solved.solution)
-    inverse = near_inverse(strips, solved.operator, reach)
+    inverse = near_inverse(strips, solved.operator, max_distance)
     if solved.resistance is None:
         return fields, inverse
     # The current that enters at a node leaves through an electrode: with X = A⁻¹ load, K⁻¹ = A⁻¹ + X Z Xᵀ.
@@ -197,10 +199,12 @@ def terminal_impedance(product: Inexact[Array, "c c"]) -> Inexact[Array, "c c"]:
     scale = scale * scale[:, None]
     matrix = (xp.diag(xp.where(kept, diagonal, 1)) - pairs * others) * scale
     impedance = symmetric_inverse(matrix) * scale * pairs
-    return impedance + undifferentiated(_correction(others, impedance, xp.diag(kept)))
+    return impedance + undifferentiated(_mean_current_correction(others, impedance, xp.diag(kept)))
 
 
-def _correction(others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"], current: Inexact[Array, "c c"]):
+def _mean_current_correction(
+    others: Inexact[Array, "c c"], impedance: Inexact[Array, "c c"], current: Inexact[Array, "c c"]
+):
     """Correction of the impedance of terminals by one step of iterative refinement, for pairs of terminals that
     short-circuit each other.
 

@@ -108,10 +108,10 @@ class ImageSeries:
 
 Window = Literal["hann", "none"]
 # Resolution of each window in units of 1 / T; number of frequencies per resolution in the search for the strongest one.
-_WIDTH = {"hann": 2.0, "none": 1.0}
-_FINE = 8
+_WINDOW_RESOLUTION = {"hann": 2.0, "none": 1.0}
+_FREQUENCIES_PER_RESOLUTION = 8
 # Minimum number of periods in the measured time.
-_PERIODS = 1.0
+_MIN_PERIODS = 1.0
 
 
 @dataclass(frozen=True)
@@ -147,22 +147,22 @@ def oscillation(
     above half the frame rate, and invalid options.
     """
     kept, at = _finite_rows(values, times)
-    check_name("window", window, _WIDTH)
+    check_name("window", window, _WINDOW_RESOLUTION)
     spread = float(at[-1] - at[0])
-    resolution = _WIDTH[window] / spread
-    low, high = _band(frequency)
+    resolution = _WINDOW_RESOLUTION[window] / spread
+    low, high = _check_band(frequency)
     rate = (len(at) - 1) / spread
     if high >= rate / 2:
         raise ValueError(
             f"frequency: {high:g} Hz is not below half the frame rate of {rate:.4g} Hz, and would be another."
         )
-    if high * spread < _PERIODS:
+    if high * spread < _MIN_PERIODS:
         raise ValueError(f"frequency: {high:g} Hz has no whole period in the {spread:.3g} s measured; measure longer.")
-    low = max(low, _PERIODS / spread)
-    weight = _weight(at, window)
+    low = max(low, _MIN_PERIODS / spread)
+    weight = _window_weights(at, window)
     flat = kept.reshape(len(kept), -1)
-    found = low if low == high else _strongest(flat, at, weight, (low, high, resolution))
-    coefficients, left, spreads = _fit(flat, at, weight, found)
+    found = low if low == high else _strongest_frequency(flat, at, weight, (low, high, resolution))
+    coefficients, left, spreads = _fit_sinusoid(flat, at, weight, found)
     shape = kept.shape[1:]
     cosine, sine = coefficients[2], coefficients[3]
     noise = np.sqrt(left) * np.sqrt((spreads[2] + spreads[3]) / 2)
@@ -185,16 +185,16 @@ def amplitude_spectrum(
     The mean is subtracted first. Rows of NaN are left out. Raises `ValueError` as `oscillation` does.
     """
     kept, at = _finite_rows(values, times)
-    check_name("window", window, _WIDTH)
+    check_name("window", window, _WINDOW_RESOLUTION)
     spread = float(at[-1] - at[0])
-    frequencies = np.arange(1 / spread, (len(at) - 1) / spread / 2, _WIDTH[window] / spread / 2)
-    weight = _weight(at, window)
+    frequencies = np.arange(1 / spread, (len(at) - 1) / spread / 2, _WINDOW_RESOLUTION[window] / spread / 2)
+    weight = _window_weights(at, window)
     rest = kept - np.tensordot(weight, kept, 1) / weight.sum()
     turned = weight * np.exp(-2j * np.pi * frequencies[:, None] * (at - at[0]))
     return frequencies, 2 * np.abs(np.tensordot(turned, rest, 1)) / weight.sum()
 
 
-def _band(frequency) -> tuple[float, float]:
+def _check_band(frequency) -> tuple[float, float]:
     """The lowest and the highest frequency, equal if a single frequency is given."""
     band = (frequency, frequency) if is_number(frequency) else frequency
     if not (isinstance(band, tuple | list) and len(band) == 2 and all(is_number(one) and one > 0 for one in band)):
@@ -219,7 +219,7 @@ def _finite_rows(values, times) -> tuple[np.ndarray, np.ndarray]:
     return given[kept].astype(float), at[kept]
 
 
-def _weight(times: np.ndarray, window: Window) -> np.ndarray:
+def _window_weights(times: np.ndarray, window: Window) -> np.ndarray:
     """Weight of each time; Hann's window is shifted so that it is not zero at the first and last frames."""
     if window == "none":
         return np.ones(len(times))
@@ -227,7 +227,7 @@ def _weight(times: np.ndarray, window: Window) -> np.ndarray:
     return np.sin(np.pi * (times - times[0] + step / 2) / (times[-1] - times[0] + step)) ** 2
 
 
-def _fit(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: float):
+def _fit_sinusoid(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: float):
     """Coefficients (4, n), residual variance (n,), and the variance of each coefficient (4,) for noise of unit
     variance."""
     turn = 2 * np.pi * frequency * times
@@ -239,7 +239,9 @@ def _fit(values: np.ndarray, times: np.ndarray, weight: np.ndarray, frequency: f
     return coefficients, left, (inverse**2).sum(axis=1)
 
 
-def _strongest(values: np.ndarray, times: np.ndarray, weight: np.ndarray, band: tuple[float, float, float]) -> float:
+def _strongest_frequency(
+    values: np.ndarray, times: np.ndarray, weight: np.ndarray, band: tuple[float, float, float]
+) -> float:
     """The frequency in a band (lowest, highest, resolution) at which the power summed over all values is largest."""
     low, high, resolution = band
     # The first eight principal components, in place of all values.
@@ -249,10 +251,10 @@ def _strongest(values: np.ndarray, times: np.ndarray, weight: np.ndarray, band: 
     combined = left[:, :8] * size[:8]
 
     def power(frequency: float) -> float:
-        coefficients, _, _ = _fit(combined, times, weight, frequency)
+        coefficients, _, _ = _fit_sinusoid(combined, times, weight, frequency)
         return -float((coefficients[2:] ** 2).sum())
 
-    tried = np.linspace(low, high, max(int(np.ceil((high - low) / resolution * _FINE)), 2) + 1)
+    tried = np.linspace(low, high, max(int(np.ceil((high - low) / resolution * _FREQUENCIES_PER_RESOLUTION)), 2) + 1)
     best = int(np.argmin([power(one) for one in tried]))
     around = tried[max(best - 1, 0)], tried[min(best + 1, len(tried) - 1)]
     found: Any = scipy.optimize.minimize_scalar(power, bounds=around, method="bounded", options={"xatol": 1e-9})

@@ -15,7 +15,7 @@ from jeit.mesh import Mesh, centroids, measures
 if TYPE_CHECKING:
     from jeit.image.plane import TriangleSurface
 
-_ROUND, _UP = 48, 24
+_SURFACE_COLUMNS, _SURFACE_ROWS = 48, 24
 
 
 class SolidForm(eqx.Module):
@@ -33,18 +33,20 @@ class SolidForm(eqx.Module):
         """Closed surface of the shape, as triangles."""
         from jeit.image.plane import TriangleSurface
 
-        up = np.linspace(0, np.pi, _UP + 1)
+        up = np.linspace(0, np.pi, _SURFACE_ROWS + 1)
         radius, height = np.sin(up), -np.cos(up)
         if self.column:
             radius, height = np.array([0.0, 1.0, 1.0, 0.0]), np.array([-1.0, -1.0, 1.0, 1.0])
-        angle = 2 * np.pi * np.arange(_ROUND) / _ROUND
+        angle = 2 * np.pi * np.arange(_SURFACE_COLUMNS) / _SURFACE_COLUMNS
         level = radius[:, None, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        unit = np.concatenate([level, np.broadcast_to(height[:, None, None], (len(height), _ROUND, 1))], axis=2)
+        unit = np.concatenate(
+            [level, np.broadcast_to(height[:, None, None], (len(height), _SURFACE_COLUMNS, 1))], axis=2
+        )
         axes = np.array(self.axes)
         axes[0] *= np.sign(np.linalg.det(axes))  # so that all normals point outward
-        low = _ROUND * np.arange(len(height) - 1)[:, None] + np.arange(_ROUND)
+        low = _SURFACE_COLUMNS * np.arange(len(height) - 1)[:, None] + np.arange(_SURFACE_COLUMNS)
         low_next = np.roll(low, -1, axis=1)
-        high, high_next = low + _ROUND, low_next + _ROUND
+        high, high_next = low + _SURFACE_COLUMNS, low_next + _SURFACE_COLUMNS
         corners = [np.stack([low, low_next, high], axis=-1), np.stack([low_next, high_next, high], axis=-1)]
         return TriangleSurface(unit.reshape(-1, 3) @ axes + np.array(self.centre), np.stack(corners).reshape(-1, 3))
 

@@ -18,7 +18,7 @@ from jeit.arguments import brief, page, picture
 from jeit_solvers.engines import has_values
 
 # Pixels above this fraction of the maximum belong to the target.
-_LEVEL = 0.25
+_TARGET_LEVEL = 0.25
 
 
 class FiguresOfMerit(eqx.Module):
@@ -94,19 +94,19 @@ def figures_of_merit(
     if jnp.iscomplexobj(raster) or jnp.iscomplexobj(change):
         raise ValueError("raster and change must be real; judge the real and the imaginary part of an image apart.")
     raster, position, area, change = (jnp.asarray(values, float) for values in (raster, position, area, change))
-    _check(raster, extent, position, area, change)
+    _check_arguments(raster, extent, position, area, change)
     return _figures_of_merit(raster, jnp.asarray(extent, float), position, area, change)
 
 
 @jax.jit
 def _figures_of_merit(raster, extent, position, area, change):
     if raster.ndim == 2:
-        return _of_one(raster, extent, position, area, change)
+        return _figures_of_one_image(raster, extent, position, area, change)
     area, change = jnp.broadcast_to(area, len(raster)), jnp.broadcast_to(change, len(raster))
-    return jax.vmap(_of_one, in_axes=(0, None, 0, 0, 0))(raster, extent, position, area, change)
+    return jax.vmap(_figures_of_one_image, in_axes=(0, None, 0, 0, 0))(raster, extent, position, area, change)
 
 
-def _of_one(raster, extent, position, area, change):
+def _figures_of_one_image(raster, extent, position, area, change):
     rows, columns = raster.shape
     x_min, x_max, y_min, y_max = extent
     x = x_min + (jnp.arange(columns) + 0.5) * (x_max - x_min) / columns
@@ -115,9 +115,9 @@ def _of_one(raster, extent, position, area, change):
     body = jnp.isfinite(raster)
     value = jnp.where(body, raster, 0) / change  # positive values have the target's sign
     highest = value.max()
-    seen = body & (value >= _LEVEL * highest) & (highest > 0)
-    centre, size = _gravity(body, x, y), jnp.sum(body)
-    middle, size_seen = _gravity(seen, x, y), jnp.sum(seen)
+    seen = body & (value >= _TARGET_LEVEL * highest) & (highest > 0)
+    centre, size = _centre_of_gravity(body, x, y), jnp.sum(body)
+    middle, size_seen = _centre_of_gravity(seen, x, y), jnp.sum(seen)
     circle = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 <= size_seen * pixel / jnp.pi
     distance = jnp.hypot(*(position - centre))
     right = jnp.sum(jnp.where(circle, value, 0))
@@ -133,13 +133,13 @@ def _of_one(raster, extent, position, area, change):
     )
 
 
-def _gravity(inside, x, y):
+def _centre_of_gravity(inside, x, y):
     """Centre of gravity of a set of pixels; NaN for an empty set."""
     size = jnp.sum(inside)
     return jnp.stack([jnp.sum(jnp.where(inside, x, 0)), jnp.sum(jnp.where(inside, y, 0))]) / size
 
 
-def _check(raster, extent, position, area, change) -> None:
+def _check_arguments(raster, extent, position, area, change) -> None:
     if raster.ndim not in (2, 3):
         raise ValueError(
             f"raster has shape {raster.shape}; give one image (rows, columns) or many (targets, rows, columns)."
@@ -176,8 +176,8 @@ def _check(raster, extent, position, area, change) -> None:
         )
 
 
-_DEVIATION = 80
-_REACH = 160
+_WINDOW_DEVIATION = 80
+_WINDOW_HALF_WIDTH = 160
 _C1, _C2 = 1e-4, 9e-4
 RESISTIVE, CONDUCTIVE = 1, 2
 
@@ -199,13 +199,13 @@ def challenge_score(labels: Int[np.ndarray, "256 256"], truth: Int[np.ndarray, "
                 f"{name}: the score is for 256 × 256 pixels of 0 (background), 1 (resistive) and 2 (conductive); "
                 f"got shape {image.shape} with values {np.unique(image)[:5].tolist()}."
             )
-    return float(np.mean([_similarity(labels == kind, truth == kind) for kind in (CONDUCTIVE, RESISTIVE)]))
+    return float(np.mean([_structural_similarity(labels == kind, truth == kind) for kind in (CONDUCTIVE, RESISTIVE)]))
 
 
-def _similarity(first: np.ndarray, second: np.ndarray) -> float:
+def _structural_similarity(first: np.ndarray, second: np.ndarray) -> float:
     """Structural similarity of two masks, averaged over the pixels. Wang et al., IEEE Trans. Image Process. 13
     (2004)."""
-    window = _window(first.shape[0])
+    window = _gaussian_window(first.shape[0])
     # A mask equals its own square.
     a, b, product = (window @ image.astype(float) @ window.T for image in (first, second, first & second))
     variance_a, variance_b, covariance = a - a**2, b - b**2, product - a * b
@@ -214,9 +214,9 @@ def _similarity(first: np.ndarray, second: np.ndarray) -> float:
 
 
 @functools.cache
-def _window(size: int) -> np.ndarray:
+def _gaussian_window(size: int) -> np.ndarray:
     """Matrix of normalised Gaussian weights along one axis, one row per pixel; the two-dimensional window is the
     product of two of them."""
     distance = np.arange(size)[:, None] - np.arange(size)
-    weight = np.where(np.abs(distance) <= _REACH, np.exp(-(distance**2) / (2 * _DEVIATION**2)), 0)
+    weight = np.where(np.abs(distance) <= _WINDOW_HALF_WIDTH, np.exp(-(distance**2) / (2 * _WINDOW_DEVIATION**2)), 0)
     return weight / weight.sum(axis=1, keepdims=True)

@@ -21,21 +21,21 @@ from jeit.mesh import Mesh, measures
 
 # For tetrahedra with nodes sorted from the highest to the lowest value: the end nodes of the edges that the level
 # crosses, in order around the polygon, by the number of nodes above the level.
-_PASSED = {
+_CROSSED_EDGES = {
     1: [[0, 1], [0, 2], [0, 3], [0, 3]],
     2: [[0, 2], [0, 3], [1, 3], [1, 2]],
     3: [[0, 3], [1, 3], [2, 3], [2, 3]],
 }
 # For triangles: the corners of the part above the level; a corner at a node has that node as both ends.
-_ABOVE = {
+_CORNERS_ABOVE = {
     1: [[0, 0], [0, 1], [0, 2], [0, 2]],
     2: [[0, 0], [1, 1], [1, 2], [0, 2]],
     3: [[0, 0], [1, 1], [2, 2], [2, 2]],
 }
-_EDGE = [[0, 1], [0, 2]]
+_CROSSED_SIDES = [[0, 1], [0, 2]]
 
 
-class Pieces(NamedTuple):
+class CutPieces(NamedTuple):
     """Pieces cut out of simplices, at most one per simplex.
 
     **Fields**: `ends`: (p, c, 2) nodes between which each corner lies; `share`: (p, c) position of the corner between
@@ -52,24 +52,24 @@ class Pieces(NamedTuple):
         return (1 - share) * values[self.ends[..., 0]] + share * values[self.ends[..., 1]]
 
 
-def passed(cells: Int[np.ndarray, "m 4"], values: Float[np.ndarray, " n"], level: float = 0.0) -> Pieces:
+def crossed_cells(cells: Int[np.ndarray, "m 4"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
     """The surface in tetrahedra where `values` (n,) at the nodes equal `level`: polygons with four corners, in order
     around each polygon. A node at the level counts as above it, so a facet in the surface is not found from both of its
     cells."""
-    return _cut(cells, values, level, _PASSED)
+    return _cut_cells(cells, values, level, _CROSSED_EDGES)
 
 
-def part_above(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> Pieces:
+def part_above(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
     """The part of a surface of triangles where `values` (n,) at the nodes are at or above `level`."""
-    return _cut(triangles, values, level, _ABOVE)
+    return _cut_cells(triangles, values, level, _CORNERS_ABOVE)
 
 
-def passed_edges(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> Pieces:
+def crossed_edges(triangles: Int[np.ndarray, "b 3"], values: Float[np.ndarray, " n"], level: float = 0.0) -> CutPieces:
     """The lines on a surface of triangles where `values` (n,) at the nodes equal `level`: pieces of two corners."""
-    return _cut(triangles, values, level, {1: _EDGE, 2: [[0, 2], [1, 2]]})
+    return _cut_cells(triangles, values, level, {1: _CROSSED_SIDES, 2: [[0, 2], [1, 2]]})
 
 
-def _cut(cells, values, level: float, cases: dict[int, list[list[int]]]) -> Pieces:
+def _cut_cells(cells, values, level: float, cases: dict[int, list[list[int]]]) -> CutPieces:
     number = (values[cells] >= level).sum(axis=1)
     found = []
     for above, corners in cases.items():
@@ -80,7 +80,7 @@ def _cut(cells, values, level: float, cases: dict[int, list[list[int]]]) -> Piec
         with np.errstate(invalid="ignore"):
             share = np.where(high > low, (high - level) / np.where(high > low, high - low, 1), 0)
         found.append((ends, share, cell))
-    return Pieces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+    return CutPieces(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) ->
     sign = 1.0 if level > 0 else -1.0
     height = sign * node_values(mesh, values) - abs(level)
     points = np.asarray(mesh.points)
-    inner, wall = passed(np.asarray(mesh.cells), height), part_above(np.asarray(mesh.facets), height)
+    inner, wall = crossed_cells(np.asarray(mesh.cells), height), part_above(np.asarray(mesh.facets), height)
     ends, share = np.concatenate([inner.ends, wall.ends]), np.concatenate([inner.share, wall.share])
     # One point for each crossed edge and each node of the wall, shared between cells.
     ends = np.where(
@@ -166,7 +166,7 @@ def _normals(corners: Float[np.ndarray, "m 3 3"]) -> Float[np.ndarray, "m 3"]:
 
 AXES = ("x", "y", "z")
 # Tolerance for treating a point as lying in a plane: its distance from the plane divided by the size of the body.
-_IN_IT = 1e-9
+_IN_PLANE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class Plane:
         point, normal = np.zeros(3), np.zeros(3)
         point[AXES.index(axis)] = value
         normal[AXES.index(axis)] = -1.0 if axis == "y" else 1.0
-        return cls(point, normal, *_page(normal), f"{axis} = {_millimetres(float(value))} mm")
+        return cls(point, normal, *_page_axes(normal), f"{axis} = {_millimetres(float(value))} mm")
 
     @classmethod
     def through(cls, point: ArrayLike, normal: ArrayLike) -> "Plane":
@@ -217,7 +217,7 @@ class Plane:
         toward = direction / length
         where = ", ".join(_millimetres(value) for value in place)
         across = ", ".join(f"{value:.2g}" for value in toward).replace("-", "−")
-        return cls(place, toward, *_page(toward), f"through ({where}) mm across ({across})")
+        return cls(place, toward, *_page_axes(toward), f"through ({where}) mm across ({across})")
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Distance of points (n, 3) from the plane in metres, positive towards the viewer."""
@@ -261,10 +261,10 @@ def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
     points, cells, facets = (np.asarray(one) for one in (mesh.points, mesh.cells, mesh.facets))
     height = plane.distance(points)
     size = float(np.ptp(points, axis=0).max())
-    height = np.where(np.abs(height) < _IN_IT * size, 0.0, height)
-    pieces, edges = passed(cells, height), passed_edges(facets, height)
+    height = np.where(np.abs(height) < _IN_PLANE_TOLERANCE * size, 0.0, height)
+    pieces, edges = crossed_cells(cells, height), crossed_edges(facets, height)
     if len(pieces.cell) == 0:
-        pieces, edges = passed(cells, -height), passed_edges(facets, -height)
+        pieces, edges = crossed_cells(cells, -height), crossed_edges(facets, -height)
     if len(pieces.cell) == 0:
         low, high = (1e3 * value for value in (height.min(), height.max()))
         beside = f"{low:.3g} mm before" if low > 0 else f"{-high:.3g} mm behind"
@@ -280,7 +280,7 @@ def check_solid(mesh: Mesh) -> None:
         raise ValueError("mesh: this is for solids of tetrahedra; draw a plane mesh with plot_image.")
 
 
-def _page(toward) -> tuple[np.ndarray, np.ndarray]:
+def _page_axes(toward) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors to the right and up on the page, for a plane viewed from the direction `toward`."""
     upward = (
         np.array([0.0, 0.0, 1.0]) if abs(toward[2]) < 1 - 1e-9 else np.array([0.0, math.copysign(1, toward[2]), 0.0])

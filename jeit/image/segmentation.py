@@ -55,21 +55,21 @@ def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None
     )
 
 
-def _centroids_from(mesh: Mesh, place: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
+def _centroids_from(mesh: Mesh, point: ArrayLike, name: str) -> Float[np.ndarray, "m d"]:
     """Centroids of the cells relative to a place. Raises `ValueError` for a place with another number of
     coordinates."""
-    given = np.asarray(place, float)
+    given = np.asarray(point, float)
     if given.shape != (mesh.dimension,) or not np.isfinite(given).all():
         raise ValueError(f"{name} must be {mesh.dimension} finite numbers in metres; it has shape {given.shape}.")
     return np.asarray(centroids(mesh)) - given
 
 
-def _check_not_empty(mesh: Mesh, chosen, nothing: str) -> Bool[np.ndarray, " m"]:
-    if not chosen.any():
+def _check_not_empty(mesh: Mesh, region, message: str) -> Bool[np.ndarray, " m"]:
+    if not region.any():
         points = np.asarray(mesh.points)
         low, high = (", ".join(f"{x:.2g}" for x in one) for one in (points.min(axis=0), points.max(axis=0)))
-        raise ValueError(f"the region is empty: {nothing}. The body spans [{low}] to [{high}], metres.")
-    return np.asarray(chosen)
+        raise ValueError(f"the region is empty: {message}. The body spans [{low}] to [{high}], metres.")
+    return np.asarray(region)
 
 
 def shared_facets(mesh: Mesh) -> Int[np.ndarray, "m k"]:

@@ -24,7 +24,8 @@ from jeit_solvers.engines import as_array, has_values, on_device, on_host, undif
 
 # Logarithm of the ratio of a contact impedance to the model's, beyond which it no longer changes the voltages.
 FARTHEST = 50.0
-# Tolerance of the parameters and the misfit in a traced fit: as small as double precision allows.
+# Tolerance of the parameters and the misfit of a fit inside jax.jit, jax.grad or jax.vmap: as small as double precision
+# allows.
 _TRACED_TOLERANCE = 1e-12
 
 
@@ -49,18 +50,20 @@ def traced_fit(model: ForwardModel, measured: Float[Array, " M"], used, contact:
     size = {"fixed": 1, "common": 2, "each": 1 + model.electrodes.num_electrodes}[contact]
     start = jnp.full(size, jnp.log(unit @ unit / (unit @ jnp.where(used, measured, 0))))
     solver = optx.LevenbergMarquardt(rtol=_TRACED_TOLERANCE, atol=_TRACED_TOLERANCE)
-    residual = partial(_residual, contact)
+    residual = partial(_relative_residual, contact)
     frozen_start, frozen = undifferentiated((start, problem))
-    found = optx.least_squares(residual, solver, frozen_start, frozen, max_steps=max_steps, throw=False)
-    parameters = as_minimum(found.value, problem, partial(_gradient, contact), partial(_inverse, contact))
+    solution = optx.least_squares(residual, solver, frozen_start, frozen, max_steps=max_steps, throw=False)
+    parameters = as_minimum(
+        solution.value, problem, partial(_gradient, contact), partial(_inverse_normal_product, contact)
+    )
     fitted, conductivity = _fitted_model(contact, parameters, model)
-    left = residual(parameters, problem)
-    covariance = symmetric_inverse(_normal(contact, parameters, problem))
+    final_residual = residual(parameters, problem)
+    covariance = symmetric_inverse(_normal_matrix(contact, parameters, problem))
     freedom = jnp.maximum(jnp.sum(used) - size, 1)
-    deviation = jnp.sqrt(covariance.diagonal() * (left @ left) / freedom)[1:]
-    misfit = jnp.sqrt(left @ left)
-    outcome = jnp.where(jnp.isfinite(misfit), ended_number(found.result), Status.FAILED.number)
-    steps = found.stats["num_steps"]
+    deviation = jnp.sqrt(covariance.diagonal() * (final_residual @ final_residual) / freedom)[1:]
+    misfit = jnp.sqrt(final_residual @ final_residual)
+    outcome = jnp.where(jnp.isfinite(misfit), ended_number(solution.result), Status.FAILED.number)
+    steps = solution.stats["num_steps"]
     return TracedFit(fitted, conductivity, fitted.voltages(conductivity), misfit, deviation, steps, outcome)
 
 
@@ -74,7 +77,7 @@ def _fitted_model(contact: str, parameters, model: ForwardModel) -> tuple[Forwar
     return model.with_electrodes(model.electrodes.with_contact_impedance(impedance)), conductivity
 
 
-def _residual(contact: str, parameters, problem):
+def _relative_residual(contact: str, parameters, problem):
     model, measured, used = problem
     fitted, conductivity = _fitted_model(contact, parameters, model)
     predicted = fitted.voltages(conductivity)
@@ -82,18 +85,18 @@ def _residual(contact: str, parameters, problem):
 
 
 def _gradient(contact: str, parameters, problem):
-    return jax.grad(lambda p: 0.5 * jnp.sum(_residual(contact, p, problem) ** 2))(parameters)
+    return jax.grad(lambda p: 0.5 * jnp.sum(_relative_residual(contact, p, problem) ** 2))(parameters)
 
 
-def _normal(contact: str, parameters, problem):
+def _normal_matrix(contact: str, parameters, problem):
     """Normal matrix JᵀJ (p, p) of the residual."""
-    jacobian = jax.jacfwd(lambda p: _residual(contact, p, problem))(parameters)
+    jacobian = jax.jacfwd(lambda p: _relative_residual(contact, p, problem))(parameters)
     return jacobian.T @ jacobian
 
 
-def _inverse(contact: str, parameters, problem):
+def _inverse_normal_product(contact: str, parameters, problem):
     """Function that multiplies a vector with the inverse of JᵀJ."""
-    inverse = symmetric_inverse(_normal(contact, parameters, problem))
+    inverse = symmetric_inverse(_normal_matrix(contact, parameters, problem))
     return lambda vector: inverse @ vector
 
 
@@ -101,17 +104,17 @@ _REASONS = {
     Status.STEP_LIMIT: "Stopped after {} steps.",
     Status.FAILED: "The fit became NaN.",
 }
-_TRACED = "It was fitted inside a transformation of JAX; the status says how that ended."
+_TRACED_REASON = "It was fitted inside a transformation of JAX; the status says how that ended."
 
 # Relative misfit above which the model is questioned. It is 1 % for the KIT4 tanks and 8 % for the Kuopio challenge,
 # whose geometry is known.
-_MUCH = 0.12
+_LARGE_MISFIT = 0.12
 # The largest voltage of a frame must lie between this number and its reciprocal, in volts.
-_SMALLEST = 1e-30
+_MIN_VOLTAGE = 1e-30
 # Relative change of the misfit or the parameters that ends a fit: on small meshes, and on large ones.
-_TOLERANCE, _SOLID = 1e-8, 1e-4
+_TOLERANCE, _TOLERANCE_LARGE_MESH = 1e-8, 1e-4
 # Number of cells above which a mesh counts as large: a step then takes seconds.
-_MANY = 30_000
+_LARGE_MESH_CELLS = 30_000
 
 
 class Calibration(eqx.Module):
@@ -169,7 +172,7 @@ class Calibration(eqx.Module):
                 f"square {np.sqrt(np.mean(shift**2)):.2g} mm), which explains the reference far better. If the "
                 "description is exact, look for another cause: contacts, channels, order."
             )
-        if not float(self.misfit) > _MUCH:
+        if not float(self.misfit) > _LARGE_MISFIT:
             return ""
         if self.model.mesh.dimension == 3:
             what, or_else = "size of the body, how high it is filled, places and sizes of the electrodes", ""
@@ -177,8 +180,8 @@ class Calibration(eqx.Module):
             what, or_else = "radius, width of the electrodes", ", or the body deeper than a sheet"
         return (
             f"the model misses {100 * float(self.misfit):.0f} % of the reference: {what}, protocol or gain may be "
-            f"others than described{or_else}. What is missed alike in both frames does little to where a change is "
-            "seen; but do not trust its size, nor the background's."
+            f"others than described{or_else}. An error that is the same in both frames hardly moves the image of a "
+            "change; but do not trust the size of the change, nor the background conductivity."
         )
 
 
@@ -223,15 +226,17 @@ def calibrate(
     if not has_values(model, measured):
         if kind is complex:
             raise ValueError(
-                "voltages are complex and traced; inside a transformation of JAX only real ones are fitted."
+                "voltages are complex, and inside jax.jit, jax.grad or jax.vmap only real ones can be fitted. Call "
+                "calibrate "
+                "outside these functions, or fit the real parts, calibrate(model, voltages.real)."
             )
         kind = "fixed" if model.electrodes.is_point else contact
-        return Calibration(*traced_fit(model, jnp.where(used, measured, 0), used, kind, max_steps), _TRACED)
+        return Calibration(*traced_fit(model, jnp.where(used, measured, 0), used, kind, max_steps), _TRACED_REASON)
     measured = np.where(used, measured, 0)
     largest = np.abs(measured).max()
     if not np.isfinite(largest) or largest == 0:
         raise ValueError("voltages: the reference frame has no finite, non-zero values to calibrate on.")
-    if not _SMALLEST < largest < 1 / _SMALLEST:
+    if not _MIN_VOLTAGE < largest < 1 / _MIN_VOLTAGE:
         raise ValueError(f"voltages: the largest of the reference frame is {largest:.3g} V; are they in volts?")
     with np.errstate(all="ignore"):
         return _fit(model, measured, used, contact, max_steps)
@@ -249,14 +254,14 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
             "round, or the order of the channels another than the protocol's?"
         )
     is_complex = np.iscomplexobj(measured)
-    problem = _Problem(model, contact, is_complex)
+    problem = _CalibrationProblem(model, contact, is_complex)
     conductivity = np.log(unit @ unit / (unit @ measured))
     initial = np.full(problem.num_parameters, conductivity.real)
     if is_complex:
         initial[1] = conductivity.imag
 
-    def parts(values):
-        return np.concatenate([values.real, values.imag]) if is_complex else values
+    def parts(residuals):
+        return np.concatenate([residuals.real, residuals.imag]) if is_complex else residuals
 
     def residual(parameters):
         return parts(np.where(used, problem.voltages(parameters) - measured, 0) / size)
@@ -264,7 +269,7 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     def jacobian(parameters):
         return parts(np.where(used[:, None], problem.jacobian(parameters), 0) / size)
 
-    tolerance = _SOLID if model.mesh.num_cells > _MANY else _TOLERANCE
+    tolerance = _TOLERANCE_LARGE_MESH if model.mesh.num_cells > _LARGE_MESH_CELLS else _TOLERANCE
     ends: dict[str, Any] = {
         "ftol": tolerance,
         "xtol": tolerance,
@@ -279,20 +284,21 @@ def _fit(model: ForwardModel, measured, used, contact: str, max_steps: int) -> C
     status = Status.CONVERGED if solution.status > 0 else Status.STEP_LIMIT
     status = status if np.isfinite(misfit) else Status.FAILED
     reason = "" if status == Status.CONVERGED else _REASONS[status].format(max_steps)
-    deviation: Any = _deviations(solution)[problem.first_contact :]
+    deviation: Any = _standard_deviations(solution)[problem.first_contact :]
     return Calibration(
         fitted, as_array(conductivity), voltages, misfit, deviation, int(solution.njev), status.number, reason
     )
 
 
-def _deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
-    """Standard deviations of the fitted parameters if the residuals are independent errors."""
+def _standard_deviations(solution: "scipy.optimize.OptimizeResult") -> Float[np.ndarray, " p"]:
+    """Standard deviations of the fitted parameters, estimated from the Jacobian and the residuals as if these were
+    independent errors of equal variance."""
     _, size, rows = np.linalg.svd(solution.jac, full_matrices=False)
     freedom = max(np.count_nonzero(solution.fun) - len(solution.x), 1)
     return np.linalg.norm(rows / size[:, None], axis=0) * np.sqrt(2 * solution.cost / freedom)
 
 
-class _Problem:
+class _CalibrationProblem:
     """Voltages as a function of log σ and of log (z·σ / model's z), which is one number or one per electrode.
 
     Voltages are proportional to 1/σ at fixed z·σ, so these parameters are nearly uncorrelated. For a complex

@@ -24,7 +24,7 @@ from jeit.protocol import Protocol
 from jeit_solvers import lower_cholesky, symmetric_inverse
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 
-_RANK = 1e-9
+_RANK_TOLERANCE = 1e-9
 
 
 class Data(eqx.Module):
@@ -67,18 +67,18 @@ class IndependentChannels(eqx.Module):
         size = np.linalg.norm(forms, axis=1)
         factors: Any = scipy.linalg.qr((forms / size[:, None]).T, mode="r", pivoting=True)
         triangle, order = factors[-2:]
-        rank = int(np.sum(np.abs(np.diag(triangle)) > _RANK))
+        rank = int(np.sum(np.abs(np.diag(triangle)) > _RANK_TOLERANCE))
         others = scipy.linalg.solve_triangular(triangle[:rank, :rank], triangle[:rank, rank:])
         combination = np.empty((len(forms), rank))
         combination[order] = np.concatenate([np.eye(rank), others.T]) / size[order[:rank]]
         combination *= size[:, None]
-        combination[np.abs(combination) < _RANK * np.abs(combination).max()] = 0
+        combination[np.abs(combination) < _RANK_TOLERANCE * np.abs(combination).max()] = 0
         sort = np.argsort(order[:rank])
         return cls(as_array(order[:rank][sort]), as_array(combination[:, sort]))
 
     def weigh(self, noise: Float[Array, " M"]) -> "Weighing":
         """Compute the map from voltages with noise of this standard deviation, (M,) volts, to `Data`."""
-        return _weigh(self.combination, noise)
+        return _compute_weighing(self.combination, noise)
 
 
 class Weighing(eqx.Module):
@@ -96,11 +96,11 @@ class Weighing(eqx.Module):
 
     def combine(self, voltages: Float[Array, " M"]) -> Data:
         """Combine voltages (M,) into the data ŷ."""
-        return _combine(self, voltages)
+        return _combine_voltages(self, voltages)
 
 
 @either_engine
-def _combine(weighing: Weighing, voltages) -> Data:
+def _combine_voltages(weighing: Weighing, voltages) -> Data:
     estimate = weighing.estimator @ voltages
     scaled = weighing.weight * estimate
     rest = ((voltages / weighing.noise) ** 2).sum() - scaled @ weighing.precision @ scaled
@@ -109,7 +109,7 @@ def _combine(weighing: Weighing, voltages) -> Data:
 
 
 @either_engine
-def _weigh(combination, noise) -> Weighing:
+def _compute_weighing(combination, noise) -> Weighing:
     weighted = combination / noise[:, None]
     precision = weighted.T @ weighted
     weight = namespace(precision).sqrt(precision.diagonal())

@@ -62,7 +62,7 @@ class DirectProblem(eqx.Module):
 
 
 # Singular values below this fraction of the largest are rounding errors.
-_NOTHING = 1e-12
+_RANK_TOLERANCE = 1e-12
 
 
 class Linearisation(eqx.Module):
@@ -167,7 +167,7 @@ def combined_blocks(
     electrodes = protocol.num_electrodes
     if electrodes * (electrodes + 1) // 2 < len(channels):
         # There are fewer products of fields than channels: ∂v = -Σ_ab d_a m_b ∫ ∇u_a · ∇u_b.
-        weights, blocks = -weights @ _forms(model.protocol, channels), field_products(mesh, fields)
+        weights, blocks = -weights @ _linear_forms(model.protocol, channels), field_products(mesh, fields)
     else:
         blocks = jacobian_blocks(mesh, protocol, fields)
     for cells, block in blocks:
@@ -220,7 +220,7 @@ def data_directions(protocol: Protocol, channels, root_weight) -> Float[np.ndarr
     directions, size, _ = np.linalg.svd(
         root_weight[:, None] * _pair_coefficients(protocol, channels), full_matrices=False
     )
-    return directions[:, size > _NOTHING * size[0]]
+    return directions[:, size > _RANK_TOLERANCE * size[0]]
 
 
 def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array, "K r"]:
@@ -228,16 +228,16 @@ def _traced_directions(protocol: Protocol, channels, root_weight) -> Float[Array
     if not has_values(protocol):
         return jnp.eye(len(channels))
     directions, size, _ = np.linalg.svd(_pair_coefficients(protocol, channels), full_matrices=False)
-    return jnp.linalg.qr(root_weight[:, None] * directions[:, size > _NOTHING * size[0]])[0]
+    return jnp.linalg.qr(root_weight[:, None] * directions[:, size > _RANK_TOLERANCE * size[0]])[0]
 
 
 def _pair_coefficients(protocol: Protocol, channels) -> Float[np.ndarray, "K e"]:
     """Coefficients (K, e) of the channels for each of the e pairs of electrodes."""
     first, second = np.triu_indices(protocol.num_electrodes)
-    return _forms(protocol, channels)[:, first < second]
+    return _linear_forms(protocol, channels)[:, first < second]
 
 
-def _forms(protocol: Protocol, channels) -> Float[np.ndarray, "K f"]:
+def _linear_forms(protocol: Protocol, channels) -> Float[np.ndarray, "K f"]:
     """Coefficients (K, f) of the channels as linear forms of the upper triangle, including the diagonal, of a symmetric
     matrix between electrodes."""
     drive = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]

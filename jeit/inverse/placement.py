@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 from jeit.arguments import check_has_values, describe, is_number
 from jeit.electrodes.electrodes import AbstractMovableElectrodes
 from jeit.forward import ForwardModel
-from jeit.forward.changes import PlacementSensitivity, shifted
+from jeit.forward.changes import PlacementSensitivity, shift_electrodes
 from jeit.forward.model import select_channels
 from jeit.inverse.channels import IndependentChannels, relative_noise
 from jeit.inverse.nonlinear.problem import check_frame
@@ -37,12 +37,12 @@ from jeit_solvers.engines import as_array, on_host
 
 # Standard deviations of the logarithms of contact impedances: of each electrode's own part, and of the common one. And
 # of the logarithm of the conductivity, about that which fits the described model best.
-_OWN_CONTACT, _COMMON_CONTACT, _CONDUCTIVITY = 1.0, 4.0, 2.0
+_OWN_CONTACT_DEVIATION, _COMMON_CONTACT_DEVIATION, _CONDUCTIVITY_DEVIATION = 1.0, 4.0, 2.0
 # Steps of the two fits, before and after κ is estimated, in sheets and in solids, where each takes a second; the
 # tolerance of their cost.
-_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 1e-4, 3: 3e-3}
+_MAX_STEPS, _RTOL = {2: (40, 40), 3: (5, 3)}, {2: 1e-4, 3: 3e-3}
 # κ in units of `relative_noise`: 0.1 % of a voltage at least.
-_LEAST_NOISE = 0.1
+_MIN_NOISE = 0.1
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class ModelError(NamedTuple):
         return np.concatenate([channels(there - here) @ self.factor, drifted], axis=1)
 
 
-class _Point(NamedTuple):
+class _LinearisedModel(NamedTuple):
     """Model at a trial point, with its conductivity, fields F, impedance Z and predicted voltages (M,)."""
 
     model: ForwardModel
@@ -149,11 +149,11 @@ def place_electrodes(
         )
     if not isinstance(model.electrodes, AbstractMovableElectrodes):
         raise ValueError(f"electrodes: {type(model.electrodes).__name__} have no position that can be estimated.")
-    problem = _Problem(model, np.asarray(measured), used, deviation)
+    problem = _PlacementProblem(model, np.asarray(measured), used, deviation)
     size, scale = len(problem.spread), 1.0
     found: Any = np.zeros(size)
     here, covariance = None, np.eye(size)
-    for steps in _STEPS[model.mesh.dimension]:
+    for steps in _MAX_STEPS[model.mesh.dimension]:
         descent = Descent(rtol=_RTOL[model.mesh.dimension], damping=1e-2, history=steps + 1)
         found, _ = descent.at_once(problem.expand, found, scale, steps)
         here = problem.at(found)
@@ -168,7 +168,7 @@ def place_electrodes(
     return Placement(here.model, here.conductivity, shift, left, ModelError(factor))
 
 
-class _Problem:
+class _PlacementProblem:
     """Voltages and their derivatives by coefficients of unit variance: those of log σ, of the shifts, and of log zσ."""
 
     def __init__(self, model: ForwardModel, measured: np.ndarray, used: np.ndarray, deviation: float):
@@ -184,21 +184,21 @@ class _Problem:
         if not unit @ measured[self.used] > 0:
             raise ValueError("voltages: they have the opposite sign of the model's.")
         self.first = float(np.log(unit @ unit / (unit @ measured[self.used])))
-        contact = _OWN_CONTACT**2 * np.eye(number) + _COMMON_CONTACT**2
+        contact = _OWN_CONTACT_DEVIATION**2 * np.eye(number) + _COMMON_CONTACT_DEVIATION**2
         self.spread = np.zeros((1 + number * (ways + 1),) * 2)
-        self.spread[0, 0] = _CONDUCTIVITY
+        self.spread[0, 0] = _CONDUCTIVITY_DEVIATION
         middle = np.arange(1, 1 + number * ways)
         self.spread[middle, middle] = deviation
         self.spread[1 + number * ways :, 1 + number * ways :] = np.linalg.cholesky(contact)
 
-    def at(self, coefficients: Float[np.ndarray, " p"]) -> _Point | None:
+    def at(self, coefficients: Float[np.ndarray, " p"]) -> _LinearisedModel | None:
         """The model at some coefficients; None where electrodes would overlap or leave the body."""
         number, ways = self.directions.shape[:2]
         values = self.spread @ coefficients
         shift, contact = values[1 : 1 + number * ways].reshape(number, ways), values[1 + number * ways :]
         log_conductivity = self.first + values[0]
         given: Any = self.given.electrodes
-        electrodes: Any = shifted(given, self.directions, shift)
+        electrodes: Any = shift_electrodes(given, self.directions, shift)
         impedance = np.asarray(given.contact_impedance) * np.exp(contact - values[0])
         try:
             model = self.given.with_electrodes(electrodes.with_contact_impedance(impedance))
@@ -207,7 +207,7 @@ class _Problem:
         conductivity = float(np.exp(log_conductivity))
         fields, transfer = on_host(model.fields(conductivity))
         predicted = np.asarray(select_channels(self.protocol, transfer))
-        return _Point(model, conductivity, fields, transfer, predicted)
+        return _LinearisedModel(model, conductivity, fields, transfer, predicted)
 
     def expand(self, coefficients, scale: float) -> QuadraticModel:
         """Cost, and a step of Levenberg-Marquardt, at a `scale` κ of the noise."""
@@ -224,13 +224,13 @@ class _Problem:
 
         return cost, step
 
-    def noise_and_covariance(self, here: _Point, scale: float) -> tuple[float, Float[np.ndarray, "p p"]]:
+    def noise_and_covariance(self, point: _LinearisedModel, scale: float) -> tuple[float, Float[np.ndarray, "p p"]]:
         """κ estimated from the residual of a fit at `scale`, and the posterior covariance of the coefficients with it.
 
         Dependent channels count once: the residual has as many degrees of freedom as independent channels, less those
         that the fit has used.
         """
-        residual, rows = self._residual(here), self._jacobian(here)
+        residual, rows = self._residual(point), self._jacobian(point)
         independent = min(self.independent, len(residual))
         share = independent / len(residual)
         # With eigenvalues, the covariance stays definite where the Hessian's inverse loses its sign to rounding.
@@ -238,7 +238,7 @@ class _Problem:
         values = np.maximum(values, 0)
         fitted = np.sum(values / (values + scale**2))
         freedom = max(independent - fitted, 0.3 * independent)
-        scale = max(_LEAST_NOISE, float(np.sqrt(share * (residual @ residual) / freedom)))
+        scale = max(_MIN_NOISE, float(np.sqrt(share * (residual @ residual) / freedom)))
         return scale, (axes / (1 + values / scale**2)) @ axes.T
 
     def factor(self, covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "q q"]:
@@ -249,13 +249,13 @@ class _Problem:
         values, axes = np.linalg.eigh(of_values @ covariance @ of_values.T)
         return axes * np.sqrt(np.maximum(values, 0))
 
-    def _residual(self, here: _Point) -> Float[np.ndarray, " u"]:
-        return ((here.voltages - self.measured) / self.noise)[self.used]
+    def _residual(self, point: _LinearisedModel) -> Float[np.ndarray, " u"]:
+        return ((point.voltages - self.measured) / self.noise)[self.used]
 
-    def _jacobian(self, here: _Point) -> Float[np.ndarray, "u p"]:
+    def _jacobian(self, point: _LinearisedModel) -> Float[np.ndarray, "u p"]:
         """Derivatives of the weighted voltages by the coefficients."""
-        electrodes: Any = here.model.electrodes
-        by_placement = PlacementSensitivity(self.mesh, electrodes)(here.fields, here.impedance)
-        every = np.concatenate([-here.impedance[None], by_placement])  # the first by log σ at fixed zσ
+        electrodes: Any = point.model.electrodes
+        by_placement = PlacementSensitivity(self.mesh, electrodes)(point.fields, point.impedance)
+        every = np.concatenate([-point.impedance[None], by_placement])  # the first by log σ at fixed zσ
         rows = np.stack([np.asarray(select_channels(self.protocol, one)) for one in every], axis=1)
         return (rows / self.noise[:, None])[self.used] @ self.spread

@@ -26,7 +26,7 @@ from jeit_solvers import symmetric_eigen
 from jeit_solvers.engines import adjoint, either_engine, has_values, host, namespace
 
 # Approximate number of cells over which means over the image are taken.
-_ENOUGH = 10_000
+_NUM_MEAN_CELLS = 10_000
 
 
 class Spectrum(eqx.Module):
@@ -85,11 +85,11 @@ class Spectrum(eqx.Module):
     def factors(self, hyperparameter) -> tuple[Float[Array, "m k"], Float[Array, "k M"]]:
         """Factors of R_λ = images · weights: images (m, k) and weights (k, M), k at most the dimension of the data plus
         that of the null space."""
-        return _factors(self, hyperparameter)
+        return _reconstruction_factors(self, hyperparameter)
 
     def image(self, data: ArrayLike, hyperparameter) -> Float[Array, " m"]:
         """Image R_λ v (m,) of whitened data v, computed without forming R_λ."""
-        return _image(self, data, hyperparameter)
+        return _spectrum_image(self, data, hyperparameter)
 
     def filter(self, hyperparameter) -> Float[Array, " r"]:
         """Filter λ²/(Λ + λ²), the fraction of each data component that stays in the residual."""
@@ -100,10 +100,10 @@ class Spectrum(eqx.Module):
         return _modes(self)
 
     def squared_modes(self) -> Float[np.ndarray, " k"]:
-        """Mean over cells of the squared absolute value of each of the `modes`; over a subset of about `_ENOUGH` cells
-        on large meshes."""
+        """Mean over cells of the squared absolute value of each of the `modes`; over a subset of about
+        `_NUM_MEAN_CELLS` cells on large meshes."""
         images, weights = (np.asarray(part) for part in _mode_factors(self))
-        some = images[:: max(1, len(images) // _ENOUGH)]
+        some = images[:: max(1, len(images) // _NUM_MEAN_CELLS)]
         return np.mean(np.abs(some @ weights) ** 2, axis=0)
 
     def candidates(self, size: int = 200) -> Float[np.ndarray, " K"]:
@@ -137,7 +137,7 @@ def _decompose(jacobian, product, null_space, directions):
 
 
 @either_engine
-def _factors(spectrum: Spectrum, hyperparameter):
+def _reconstruction_factors(spectrum: Spectrum, hyperparameter):
     basis, xp = spectrum.basis, namespace(spectrum)
     inverse = (basis / (spectrum.eigenvalues + hyperparameter**2)) @ adjoint(basis)
     weights = spectrum.directions.T @ inverse
@@ -151,7 +151,7 @@ def _factors(spectrum: Spectrum, hyperparameter):
 
 
 @either_engine
-def _image(spectrum: Spectrum, data, hyperparameter):
+def _spectrum_image(spectrum: Spectrum, data, hyperparameter):
     inner = spectrum.basis @ ((adjoint(spectrum.basis) @ data) / (spectrum.eigenvalues + hyperparameter**2))
     image = spectrum.images @ (spectrum.directions.T @ inner)
     if spectrum.null_space.shape[1] == 0:

@@ -35,7 +35,7 @@ from jeit_solvers import Status
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
 
 # Number of rows of the size of an image computed at a time.
-_ROWS = 32
+_ROWS_AT_ONCE = 32
 
 
 class Posterior(eqx.Module):
@@ -54,7 +54,7 @@ class Posterior(eqx.Module):
 
     def standard_deviation(self) -> Float[Array, " m"]:
         """Standard deviation of the conductivity of every cell, S/m (2-D: S), with the link linearised."""
-        estimate, deviation = _estimate(self)
+        estimate, deviation = _sample_estimates(self)
         return self.inversion.link.slope(estimate) * deviation
 
     def credible_interval(self, probability: float = 0.95) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
@@ -67,7 +67,7 @@ class Posterior(eqx.Module):
         if not 0 < probability < 1:
             raise ValueError(f"probability must lie between 0 and 1; it is {probability}.")
         reach = scipy.special.ndtri(0.5 + probability / 2)
-        estimate, deviation = _estimate(self)
+        estimate, deviation = _sample_estimates(self)
         link = self.inversion.link
         return link.conductivity(estimate - reach * deviation), link.conductivity(estimate + reach * deviation)
 
@@ -89,7 +89,7 @@ class Posterior(eqx.Module):
         if not chosen.any():
             raise ValueError("cells: none is chosen; give at least one.")
         weight = jnp.where(chosen, measure, 0) / measure[chosen].sum()
-        mean, deviation = _weighted(self, weight)
+        mean, deviation = _weighted_mean(self, weight)
         return (float(mean), float(deviation)) if has_values(mean) else (mean, deviation)
 
     def unknowns(self) -> dict[str, Float[Array, " k"]]:
@@ -112,7 +112,7 @@ class Posterior(eqx.Module):
         check_key(key)
         prior, noise = jax.random.split(key)
         numbers = jax.random.normal(prior, (number, self.prior.num_draws(len(self.coefficients))))
-        return as_array(_sample(self, numbers, jax.random.normal(noise, (number, len(self.root)))))
+        return as_array(_draw_samples(self, numbers, jax.random.normal(noise, (number, len(self.root)))))
 
 
 def posterior(reconstruction: Reconstruction) -> Posterior:
@@ -131,25 +131,25 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
         raise ValueError(f"posterior: the reconstruction failed. {reconstruction.reason}")
     in_pieces = inversion.model.mesh.dimension == 3 or not inversion.penalty.is_standard_normal
     if not (has_values(inversion, coefficients) and in_pieces):
-        return _posterior(inversion, coefficients)
+        return _compute_posterior(inversion, coefficients)
     # For a solid body, compiled programs would hold several copies of the Jacobian; with sparse factors, compilation
     # takes seconds.
     with np.errstate(all="ignore"):
         known, ended = on_host((inversion, coefficients))
-        jacobian, cross, inner, normal = _within_data(known, ended)
+        jacobian, cross, inner, normal = _data_space_matrices(known, ended)
         root = scipy.linalg.inv(np.linalg.cholesky(inner))
     return Posterior(known, ended, jacobian, root, cross, normal)
 
 
 @eqx.filter_jit
-def _posterior(inversion: Inversion, coefficients) -> Posterior:
-    jacobian, cross, inner, normal = _within_data(inversion, coefficients)
+def _compute_posterior(inversion: Inversion, coefficients) -> Posterior:
+    jacobian, cross, inner, normal = _data_space_matrices(inversion, coefficients)
     lower = jnp.linalg.cholesky(inner)
     root = jax.scipy.linalg.solve_triangular(lower, jnp.eye(len(lower)), lower=True)
     return Posterior(inversion, coefficients, jacobian, root, cross, normal)
 
 
-def _within_data(inversion: Inversion, coefficients):
+def _data_space_matrices(inversion: Inversion, coefficients):
     """Matrices J, JQ⁻¹ and JQ⁻¹Jᵀ + C, and the normal distribution of precision Q."""
     normal = inversion.penalty.normal(coefficients)
     if normal is None:
@@ -163,7 +163,7 @@ def _within_data(inversion: Inversion, coefficients):
 
 
 @either_engine
-def _estimate(posterior: Posterior):
+def _sample_estimates(posterior: Posterior):
     """Image x at the solution, including unknowns that change it, and its standard deviation, per cell, on the link's
     scale.
 
@@ -178,8 +178,8 @@ def _estimate(posterior: Posterior):
     added = [inversion.estimate(coefficients + one) - estimate for one in further]
     variance = posterior.prior.variance(basis) + sum(one**2 for one in added)
     rows = len(posterior.root)
-    for start in range(0, rows, _ROWS):
-        gain = posterior.root[start : start + _ROWS] @ posterior.cross
+    for start in range(0, rows, _ROWS_AT_ONCE):
+        gain = posterior.root[start : start + _ROWS_AT_ONCE] @ posterior.cross
         seen = xp.stack([basis.expand(row[:count]) for row in gain])
         for number, one in enumerate(added):
             seen = seen + gain[:, count + number, None] * one
@@ -188,7 +188,7 @@ def _estimate(posterior: Posterior):
 
 
 @either_engine
-def _weighted(posterior: Posterior, weight):
+def _weighted_mean(posterior: Posterior, weight):
     """Weighted sum of the cells' conductivities, and its standard deviation."""
     inversion, coefficients, xp = posterior.inversion, posterior.coefficients, namespace(posterior, weight)
     estimate, count = inversion.estimate(coefficients), inversion.basis.num_coefficients
@@ -202,7 +202,7 @@ def _weighted(posterior: Posterior, weight):
 
 
 @either_engine
-def _sample(posterior: Posterior, numbers, errors):
+def _draw_samples(posterior: Posterior, numbers, errors):
     """Sample conductivities with c = ĉ + z - Q⁻¹Jᵀ(JQ⁻¹Jᵀ + C)⁻¹(Jz + e), where z is drawn from the prior and e from
     the noise."""
     inversion, root, xp = posterior.inversion, posterior.root, namespace(posterior, numbers)
@@ -226,7 +226,7 @@ def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
     covariance, count = inversion.data.covariance, inversion.basis.num_coefficients
     root = np.linalg.cholesky(covariance).T @ np.linalg.inv(jacobian @ jacobian.T + covariance)
     variance = np.zeros(len(inversion.reference))
-    for start in range(0, len(root), _ROWS):
-        gain = root[start : start + _ROWS] @ jacobian
+    for start in range(0, len(root), _ROWS_AT_ONCE):
+        gain = root[start : start + _ROWS_AT_ONCE] @ jacobian
         variance += np.sum([inversion.basis.expand(row[:count]) ** 2 for row in gain], axis=0)
     return max(1.0, float(reconstruction.misfit)) * np.sqrt(variance)

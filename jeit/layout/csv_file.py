@@ -20,11 +20,11 @@ from jeit.layout.surface_layout import SurfaceLayout
 from jeit.mesh import Domain, Mesh
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-_FLAT = ("x", "y", "diameter")
-_KNOWN = ("x", "y", "z", "diameter")
+_PLANE_COLUMNS = ("x", "y", "diameter")
+_LENGTH_COLUMNS = ("x", "y", "z", "diameter")
 # Title of a column with its unit: "x_mm", "x [mm]", "x (mm)" or "xmm".
-_LENGTH = re.compile(rf"({'|'.join(_KNOWN)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
-_LABEL, _IMPEDANCE = "label", "contact_impedance_ohm_m2"
+_LENGTH_TITLE = re.compile(rf"({'|'.join(_LENGTH_COLUMNS)})[ _]*[\[(]?({'|'.join(_UNITS)})[\])]?")
+_LABEL_COLUMN, _IMPEDANCE_COLUMN = "label", "contact_impedance_ohm_m2"
 MOST_BYTES = 2**24
 """Maximum size of a layout file in bytes: reading a larger file would take more than a minute."""
 
@@ -53,11 +53,11 @@ def millimetres(metres: float) -> float:
 def write_csv(layout: Layout | SurfaceLayout, file: BinaryIO) -> None:
     """Write the electrodes of a layout as a table, without the outline or the surface."""
     lengths = np.column_stack([layout.centres, layout.diameters])
-    names = _FLAT if lengths.shape[1] == 3 else _KNOWN
-    header = [*(f"{name}_mm" for name in names), _LABEL]
+    names = _PLANE_COLUMNS if lengths.shape[1] == 3 else _LENGTH_COLUMNS
+    header = [*(f"{name}_mm" for name in names), _LABEL_COLUMN]
     columns: list[Iterable] = [*(map(millimetres, column) for column in lengths.T), layout.labels]
     if layout.contact_impedance is not None:
-        header.append(_IMPEDANCE)
+        header.append(_IMPEDANCE_COLUMN)
         columns.append(np.asarray(layout.contact_impedance).tolist())
     text = io.StringIO(newline="")
     writer = csv.writer(text)
@@ -69,7 +69,7 @@ def write_csv(layout: Layout | SurfaceLayout, file: BinaryIO) -> None:
 def read_csv(path: Path, outline: Domain | None) -> Layout:
     """Read a layout in a plane from a table, written by `write_csv` or by hand. Raises `ValueError`, naming the
     line."""
-    table = read_table(path, _FLAT)
+    table = read_table(path, _PLANE_COLUMNS)
     centres, diameters = np.column_stack([table.lengths["x"], table.lengths["y"]]), table.lengths["diameter"]
     _check_unit(centres, diameters, table.titles)
     check_discs_fit(centres, diameters, outline, [f"the electrode of line {number}" for number in table.lines])
@@ -83,13 +83,14 @@ def read_csv(path: Path, outline: Domain | None) -> Layout:
     )
 
 
-def read_table(path: Path, wanted: Sequence[str]) -> LayoutTable:
-    """Read a table whose columns of lengths are `wanted`, some of "x", "y", "z" and "diameter", each with a unit.
-    Raises `ValueError` for anything else."""
-    lines = _lines(path, wanted)
+def read_table(path: Path, length_columns: Sequence[str]) -> LayoutTable:
+    """Read a table of electrodes. `length_columns`: the columns of lengths that it must have, from "x", "y", "z" and
+    "diameter"; the title of each states its unit. Raises `ValueError` for a table with other columns or invalid
+    values."""
+    lines = _read_lines(path, length_columns)
     delimiter = next((mark for mark in ";\t" if mark in lines[0][1]), ",")
-    (_, header), *rows = [(number, _cells(line, delimiter)) for number, line in lines]
-    columns = _columns(header, wanted)
+    (_, header), *rows = [(number, _split_cells(line, delimiter)) for number, line in lines]
+    columns = _find_columns(header, length_columns)
     check_electrodes("the table", len(rows))
     if not rows:
         raise ValueError("there is no electrode below the names of the columns.")
@@ -100,19 +101,21 @@ def read_table(path: Path, wanted: Sequence[str]) -> LayoutTable:
 
     def numbers(name: str) -> np.ndarray:
         place, unit = columns[name]
-        return unit * np.array([_number(row[place], delimiter, f"line {at}: {header[place]}") for at, row in rows])
+        return unit * np.array(
+            [_parse_number(row[place], delimiter, f"line {at}: {header[place]}") for at, row in rows]
+        )
 
-    lengths = {name: numbers(name) for name in wanted}
-    contact_impedance = numbers(_IMPEDANCE) if _IMPEDANCE in columns else None
-    for name, values in (("diameter", lengths["diameter"]), (_IMPEDANCE, contact_impedance)):
+    lengths = {name: numbers(name) for name in length_columns}
+    contact_impedance = numbers(_IMPEDANCE_COLUMN) if _IMPEDANCE_COLUMN in columns else None
+    for name, values in (("diameter", lengths["diameter"]), (_IMPEDANCE_COLUMN, contact_impedance)):
         if values is not None and values.min() <= 0:
             raise ValueError(f"line {rows[int(values.argmin())][0]}: {name} is not positive.")
     labels = (
-        [row[columns[_LABEL][0]] or str(index + 1) for index, (_, row) in enumerate(rows)]
-        if _LABEL in columns
+        [row[columns[_LABEL_COLUMN][0]] or str(index + 1) for index, (_, row) in enumerate(rows)]
+        if _LABEL_COLUMN in columns
         else None
     )
-    titles = [header[columns[name][0]] for name in wanted]
+    titles = [header[columns[name][0]] for name in length_columns]
     return LayoutTable(lengths, contact_impedance, labels, [number for number, _ in rows], titles)
 
 
@@ -132,7 +135,7 @@ def _check_unit(centres: np.ndarray, diameters: np.ndarray, titles: list[str]) -
         )
 
 
-def _lines(path: Path, wanted: Sequence[str]) -> list[tuple[int, str]]:
+def _read_lines(path: Path, length_columns: Sequence[str]) -> list[tuple[int, str]]:
     """Read the lines that are neither empty nor comments, with their numbers from 1."""
     try:
         text = read_text(path, encoding="utf-8-sig", most=MOST_BYTES)
@@ -141,51 +144,55 @@ def _lines(path: Path, wanted: Sequence[str]) -> list[tuple[int, str]]:
     lines = [(number, line) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, line) for number, line in lines if line.strip(" \t,;") and not line.lstrip().startswith("#")]
     if not lines:
-        raise ValueError(f"the file is empty; the first line names the columns: {_template(wanted)}.")
+        raise ValueError(f"the file is empty; the first line names the columns: {_header_example(length_columns)}.")
     return lines
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
+def _split_cells(line: str, delimiter: str) -> list[str]:
     with read_as("a line is no row of a table"):
         return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
 
 
-def _columns(header: list[str], wanted: Sequence[str]) -> dict[str, tuple[int, float]]:
+def _find_columns(header: list[str], length_columns: Sequence[str]) -> dict[str, tuple[int, float]]:
     """Index and unit (in metres) of every column, by name. Raises `ValueError` for columns that are missing, unknown,
     repeated, or do not state their unit."""
     columns: dict[str, tuple[int, float]] = {}
     for place, title in enumerate(header):
-        length = _LENGTH.fullmatch(title.lower())
+        length = _LENGTH_TITLE.fullmatch(title.lower())
         name = length[1] if length else title.lower()
-        if name in wanted and not length:
+        if name in length_columns and not length:
             raise ValueError(
-                f"the column {describe(title)} does not say its unit; call it {name}_mm (or {name}_cm, {name}_m)."
+                f"the title of the column {describe(title)} does not state a unit; call it {name}_mm (or {name}_cm, "
+                f"{name}_m)."
             )
-        if name not in (*wanted, _LABEL, _IMPEDANCE):
+        if name not in (*length_columns, _LABEL_COLUMN, _IMPEDANCE_COLUMN):
             raise ValueError(
-                f"there is no column {describe(title)} in a layout; the first line names columns: {_template(wanted)}."
+                f"there is no column {describe(title)} in a layout; the first line names columns: "
+                f"{_header_example(length_columns)}."
             )
         if name in columns:
             raise ValueError(f"there are two columns for {name}; keep one.")
         columns[name] = (place, _UNITS[length[2]] if length else 1.0)
-    missing = [name for name in wanted if name not in columns]
+    missing = [name for name in length_columns if name not in columns]
     if missing:
-        raise ValueError(f"there is no column {missing[0]}_mm; the first line names the columns: {_template(wanted)}.")
+        raise ValueError(
+            f"there is no column {missing[0]}_mm; the first line names the columns: {_header_example(length_columns)}."
+        )
     return columns
 
 
-def _template(wanted: Sequence[str]) -> str:
-    first = ", ".join(f"{name}_mm" for name in wanted)
-    return f"{first} and, if wanted, {_LABEL} and {_IMPEDANCE}"
+def _header_example(length_columns: Sequence[str]) -> str:
+    first = ", ".join(f"{name}_mm" for name in length_columns)
+    return f"{first} and, if wanted, {_LABEL_COLUMN} and {_IMPEDANCE_COLUMN}"
 
 
-def _number(cell: str, delimiter: str, where: str) -> float:
+def _parse_number(cell: str, delimiter: str, cell_name: str) -> float:
     try:
         value = float(cell if delimiter == "," else cell.replace(",", "."))
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise ValueError(f"{where} is {describe(cell)}; give a finite number, such as 12.5.")
+        raise ValueError(f"{cell_name} is {describe(cell)}; give a finite number, such as 12.5.")
     return value
 
 

@@ -17,10 +17,10 @@ from jeit.layout.layout import Layout
 from jeit.mesh import Disk, Domain, Polygon
 
 # Texts for the error message without the extra: the task that needs it, and the formats that do not.
-_DRAWINGS = ("a DXF drawing", "CSV and SVG files need nothing more.")
-_OUTLINE, _ELECTRODES, _LABELS = "OUTLINE", "ELECTRODES", "LABELS"
+_EXTRA_TEXTS = ("a DXF drawing", "CSV and SVG files need nothing more.")
+_OUTLINE_LAYER, _ELECTRODE_LAYER, _LABEL_LAYER = "OUTLINE", "ELECTRODES", "LABELS"
 # AutoCAD's colour numbers: laser cutters distinguish lines to cut from lines to engrave by their colour.
-_COLOURS = {_OUTLINE: 1, _ELECTRODES: 5, _LABELS: 8}
+_LAYER_COLOURS = {_OUTLINE_LAYER: 1, _ELECTRODE_LAYER: 5, _LABEL_LAYER: 8}
 
 
 def write_dxf(layout: Layout, file: BinaryIO) -> None:
@@ -29,27 +29,27 @@ def write_dxf(layout: Layout, file: BinaryIO) -> None:
 
     Raises `ImportError` if the extra `cad` is not installed.
     """
-    ezdxf = optional("ezdxf", *_DRAWINGS)
+    ezdxf = optional("ezdxf", *_EXTRA_TEXTS)
     drawing = ezdxf.new("R2007")
     drawing.units = ezdxf.units.MM
-    for name, colour in _COLOURS.items():
+    for name, colour in _LAYER_COLOURS.items():
         drawing.layers.add(name, color=colour)
     space = drawing.modelspace()
 
     if layout.outline is not None:
-        layout.outline.draw(_Pen(space, _OUTLINE))
-    discs = _Pen(space, _ELECTRODES)
+        layout.outline.draw(_DxfPen(space, _OUTLINE_LAYER))
+    discs = _DxfPen(space, _ELECTRODE_LAYER)
     centred = ezdxf.enums.TextEntityAlignment.MIDDLE_CENTER
     for centre, diameter, label in zip(layout.centres, layout.diameters, layout.labels, strict=True):
         discs.circle(centre, float(diameter) / 2)
-        text = space.add_text(label, height=1e3 * float(diameter) / 3, dxfattribs={"layer": _LABELS})
+        text = space.add_text(label, height=1e3 * float(diameter) / 3, dxfattribs={"layer": _LABEL_LAYER})
         text.set_placement(1e3 * np.asarray(centre), align=centred)
     text = io.StringIO()
     drawing.write(text)
     file.write(text.getvalue().encode(drawing.output_encoding, errors="dxfreplace"))
 
 
-class _Pen:
+class _DxfPen:
     """Draws circles and polygons on one layer of a drawing."""
 
     def __init__(self, space: Any, layer: str):
@@ -77,26 +77,26 @@ class _Entity(NamedTuple):
 def read_dxf(path: Path, outline: Domain | None) -> Layout:
     """Read a layout from a drawing with the layers of `write_dxf`. Raises `ValueError` for an invalid drawing, and
     `ImportError` if the extra `cad` is not installed."""
-    ezdxf = optional("ezdxf", *_DRAWINGS)
+    ezdxf = optional("ezdxf", *_EXTRA_TEXTS)
     check_size(path, MOST_BYTES)
     with read_as("this is not a DXF drawing that is read"):
         drawing = ezdxf.readfile(path)
         units = ezdxf.units
         unit = units.conversion_factor(units.InsertUnits(drawing.units or units.MM), units.InsertUnits.Meters)
         space = [(entity.dxf.layer, entity) for entity in drawing.modelspace()]
-        drawn = {name: [one for layer, one in space if layer.upper() == name] for name in _COLOURS}
-    if not drawn[_ELECTRODES]:
+        drawn = {name: [one for layer, one in space if layer.upper() == name] for name in _LAYER_COLOURS}
+    if not drawn[_ELECTRODE_LAYER]:
         raise ValueError(
-            f"nothing is drawn on the layer {_ELECTRODES}, where electrodes are circles; "
+            f"nothing is drawn on the layer {_ELECTRODE_LAYER}, where electrodes are circles; "
             f"the layers in use are {listed(sorted({layer for layer, _ in space}))}."
         )
-    check_electrodes("the drawing", len(drawn[_ELECTRODES]))
+    check_electrodes("the drawing", len(drawn[_ELECTRODE_LAYER]))
     with read_as("this is not a DXF drawing that is read"):
         decode = ezdxf.lldxf.encoding.decode_dxf_unicode
-        entities = {name: [_entity(one, decode) for one in ones] for name, ones in drawn.items()}
-    circles = np.array([_circle(one) for one in entities[_ELECTRODES]]) * unit
+        entities = {name: [_convert_entity(one, decode) for one in ones] for name, ones in drawn.items()}
+    circles = np.array([_circle_of_entity(one) for one in entities[_ELECTRODE_LAYER]]) * unit
     centres, radii = circles[:, :2], circles[:, 2]
-    texts = [one for one in entities[_LABELS] if one.kind == "TEXT"]
+    texts = [one for one in entities[_LABEL_LAYER] if one.kind == "TEXT"]
     places = np.array([one.place for one in texts]).reshape(-1, 2) * unit
     labels = []
     for electrode, (centre, radius) in enumerate(zip(centres, radii, strict=True), start=1):
@@ -105,11 +105,11 @@ def read_dxf(path: Path, outline: Domain | None) -> Layout:
         if len(written) > 1:
             raise ValueError(f"electrode {electrode} has several labels: {listed(map(repr, written))}.")
         labels += written or [str(electrode)]
-    found = _outline(entities[_OUTLINE], unit)
+    found = _outline_of_entities(entities[_OUTLINE_LAYER], unit)
     return Layout(centres, 2 * radii, outline=found or outline, labels=labels, name=path.stem)
 
 
-def _entity(entity, decode: Callable[[str], str]) -> _Entity:
+def _convert_entity(entity, decode: Callable[[str], str]) -> _Entity:
     """Convert an entity to plane coordinates of the drawing, since mirrored entities have coordinate axes of their own.
     Texts are decoded, since formats before 2007 write letters outside Latin as \\U+0162."""
     kind = entity.dxftype()
@@ -126,29 +126,32 @@ def _entity(entity, decode: Callable[[str], str]) -> _Entity:
     return _Entity(kind)
 
 
-def _circle(entity: _Entity) -> tuple[float, float, float]:
+def _circle_of_entity(entity: _Entity) -> tuple[float, float, float]:
     if entity.kind != "CIRCLE":
         raise ValueError(
-            f"there is a {entity.kind[:40]} on the layer {_ELECTRODES}; electrodes are circles, and blocks must be "
+            f"there is a {entity.kind[:40]} on the layer {_ELECTRODE_LAYER}; electrodes are circles, and blocks must "
+            "be "
             "exploded to circles."
         )
     return entity.circle
 
 
-def _outline(entities: list[_Entity], unit: float) -> Domain | None:
+def _outline_of_entities(entities: list[_Entity], unit: float) -> Domain | None:
     if not entities:
         return None
     if len(entities) == 1 and entities[0].kind == "CIRCLE":
-        x, y, radius = _circle(entities[0])
+        x, y, radius = _circle_of_entity(entities[0])
         return Disk(unit * radius, (unit * x, unit * y))
-    loops = sorted((unit * _loop(entity) for entity in entities), key=lambda loop: -np.prod(np.ptp(loop, axis=0)))
+    loops = sorted(
+        (unit * _polyline_vertices(entity) for entity in entities), key=lambda loop: -np.prod(np.ptp(loop, axis=0))
+    )
     return Polygon(loops[0], loops[1:])
 
 
-def _loop(entity: _Entity) -> np.ndarray:
+def _polyline_vertices(entity: _Entity) -> np.ndarray:
     """Vertices (k, 2) of a closed polyline with straight sides, in the unit of the drawing. Raises `ValueError` for
     other entities."""
-    advice = f"on the layer {_OUTLINE}; draw closed polylines of straight sides, or one circle."
+    advice = f"on the layer {_OUTLINE_LAYER}; draw closed polylines of straight sides, or one circle."
     if entity.loop is None:
         raise ValueError(f"there is a {entity.kind[:40]} {advice}")
     if entity.arcs:

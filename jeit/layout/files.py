@@ -46,7 +46,7 @@ def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
     electrode.
     """
     path = Path(path)
-    reader = _by_suffix(path, _READERS)
+    reader = _for_suffix(path, _READERS)
     if not path.is_file():
         raise FileNotFoundError(f"path: there is no file {path}. Check the name and the working directory.")
     try:
@@ -67,7 +67,7 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
     Raises `ValueError` for another suffix or a path that cannot be written; `ImportError` if the extra is missing.
     """
     path = Path(path)
-    writer = _by_suffix(path, _WRITERS)
+    writer = _for_suffix(path, _WRITERS)
     if isinstance(layout, SurfaceLayout) and writer is not write_csv:
         raise ValueError(f"path: drawings are flat, and '{layout.name}' is of a curved skin; give a name in .csv.")
     if not isinstance(layout, Layout | SurfaceLayout):
@@ -79,7 +79,7 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
         raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None
 
 
-def _by_suffix(path: Path, table: dict):
+def _for_suffix(path: Path, table: dict):
     suffix = path.suffix.lower()
     if suffix not in table:
         raise ValueError(f"path: {path} ends with none of {', '.join(table)}, which give the format of a layout.")

@@ -16,14 +16,14 @@ from jeit.mesh import Domain
 from jeit_solvers.engines import has_values
 
 
-def check_labels(labels: Sequence[str] | None, number: int) -> tuple[str, ...]:
-    """Check the labels of `number` electrodes and return them as a tuple; by default "1", "2", … Raises `ValueError`
-    for another number of labels, for invalid labels, and for labels that are repeated."""
+def check_labels(labels: Sequence[str] | None, num_electrodes: int) -> tuple[str, ...]:
+    """Check the labels of `num_electrodes` electrodes and return them as a tuple; by default "1", "2", … Raises
+    `ValueError` for another number of labels, for invalid labels, and for labels that are repeated."""
     if labels is None:
-        return tuple(str(index + 1) for index in range(number))
+        return tuple(str(index + 1) for index in range(num_electrodes))
     labels = list(labels)
-    if len(labels) != number:
-        raise ValueError(f"labels: there are {len(labels)}; give one for each of the {number} electrodes.")
+    if len(labels) != num_electrodes:
+        raise ValueError(f"labels: there are {len(labels)}; give one for each of the {num_electrodes} electrodes.")
     for label in labels:
         if not isinstance(label, str) or not label or label != label.strip() or not label.isprintable():
             raise ValueError(
@@ -144,9 +144,11 @@ class Layout(eqx.Module):
         return SheetDiscs(self.centres, self.diameters / 2, chosen)
 
 
-def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain | None, called: Sequence[str]) -> None:
-    """Raise `ValueError` if discs overlap or extend beyond `outline`; lengths in metres. `called` (L,): names of the
-    discs in the error message."""
+def check_discs_fit(
+    centres: np.ndarray, diameters: np.ndarray, outline: Domain | None, disc_names: Sequence[str]
+) -> None:
+    """Raise `ValueError` if discs overlap or extend beyond `outline`; lengths in metres. `disc_names` (L,): names of
+    the discs in the error message."""
     x_min, x_max, y_min, y_max = bounds(centres, diameters) if outline is None else outline.extent
     size = max(x_max - x_min, y_max - y_min)
     check_size(size)
@@ -156,7 +158,7 @@ def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain 
         first, second = map(int, np.unravel_index(gap.argmin(), gap.shape))
         same = np.linalg.norm(centres[first] - centres[second]) < _ROUNDING
         how = "are at the same place" if same else f"overlap by {-1e3 * gap.min():.3g} mm"
-        raise ValueError(f"centres: {called[first]} and {called[second]} {how}; remove one or move them apart.")
+        raise ValueError(f"centres: {disc_names[first]} and {disc_names[second]} {how}; remove one or move them apart.")
     if outline is None:
         return
     room = np.asarray(outline.signed_distance(centres)) - diameters / 2
@@ -169,7 +171,7 @@ def check_discs_fit(centres: np.ndarray, diameters: np.ndarray, outline: Domain 
             hint = " Is its diameter in metres?"
         x, y = 1e3 * centres[worst]
         raise ValueError(
-            f"centres: {called[worst]}, {1e3 * diameters[worst]:g} mm across at ({x:g}, {y:g}) mm, reaches "
+            f"centres: {disc_names[worst]}, {1e3 * diameters[worst]:g} mm across at ({x:g}, {y:g}) mm, reaches "
             f"{-1e3 * room[worst]:.3g} mm beyond the outline, which spans {1e3 * x_min:g} to {1e3 * x_max:g} mm by "
             f"{1e3 * y_min:g} to {1e3 * y_max:g} mm.{hint}"
         )

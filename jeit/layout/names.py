@@ -111,25 +111,25 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
     return position
 
 
-def check_count(number: int, least: int) -> None:
-    """Raise `ValueError` unless `number` is a whole number of at least `least`."""
-    if not is_number(number) or int(number) != number or number < least:
-        raise ValueError(f"Give a whole number of electrodes, at least {least}; got {describe(number)}.")
+def check_count(num_electrodes: int, minimum: int) -> None:
+    """Raise `ValueError` unless `num_electrodes` is a whole number of at least `minimum`."""
+    if not is_number(num_electrodes) or int(num_electrodes) != num_electrodes or num_electrodes < minimum:
+        raise ValueError(f"Give a whole number of electrodes, at least {minimum}; got {describe(num_electrodes)}.")
 
 
 # Side of the skin of the paper, diameter of the electrodes in its Fig. S4, and distance of electrodes from the edge in
 # the conventional layout, metres. The paper does not state the distance: here 2 mm of hydrogel remain outside.
-_SIDE, DIAMETER, _FROM_EDGE = 0.2, 6e-3, 2e-3
-_PARK = ("park-inner", "park-boundary")
+_PARK_SIDE, DIAMETER, _PARK_EDGE_DISTANCE = 0.2, 6e-3, 2e-3
+_PARK_NAMES = ("park-inner", "park-boundary")
 # Maximum number of electrodes of a built-in layout, since the distances between all pairs are checked.
-_MOST = 1024
+_MAX_ELECTRODES = 1024
 
 BUILT_IN = {
     "park-inner": "32 electrodes spread evenly inside 200 × 200 mm (Park et al. 2022, the proposed design)",
     "park-boundary": "32 electrodes evenly along the edge of 200 × 200 mm (Park et al. 2022, the conventional design)",
     "grid-8x4": "a regular grid of 8 columns and 4 rows; any other counts likewise, and any rectangular skin",
 }
-NAMES = (*_PARK, "grid-CxR", "perimeter-N", "inner-N")
+NAMES = (*_PARK_NAMES, "grid-CxR", "perimeter-N", "inner-N")
 
 
 def named_layout(name: str, outline: Domain | None = None, *, diameter: float = DIAMETER) -> Layout:
@@ -148,25 +148,25 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
     `diameter`: diameter of the electrodes, metres. Raises `ValueError` for an unknown name, for a skin that the layout
     does not exist for, and for electrodes that would overlap.
     """
-    outline = Rectangle(_SIDE, _SIDE) if outline is None else outline
+    outline = Rectangle(_PARK_SIDE, _PARK_SIDE) if outline is None else outline
     made = re.fullmatch(r"(perimeter|inner)-(\d{1,4})", name) if isinstance(name, str) else None
     counts = re.fullmatch(r"grid-(\d{1,4})x(\d{1,4})", name) if isinstance(name, str) else None
-    if name in _PARK:
+    if name in _PARK_NAMES:
         _check_park(name, outline)
         centres = _park_centres(name)
     elif counts is not None:
         centres = _grid_centres(name, outline, diameter, int(counts[1]), int(counts[2]))
     elif made is not None:
         number = int(made[2])
-        if number > _MOST:
-            raise ValueError(f"name: {name!r} has {number} electrodes; give {_MOST} or fewer.")
+        if number > _MAX_ELECTRODES:
+            raise ValueError(f"name: {name!r} has {number} electrodes; give {_MAX_ELECTRODES} or fewer.")
         centres = (
             _inner_centres(outline, number, diameter)
             if made[1] == "inner"
             else _perimeter_centres(name, outline, diameter, number)
         )
     else:
-        meant = did_you_mean(name, [*_PARK, *NAMES[2:]])
+        meant = did_you_mean(name, [*_PARK_NAMES, *NAMES[2:]])
         raise ValueError(
             f"name: there is no layout {name!r}{meant}; take {', '.join(BUILT_IN)} (or another grid-CxR), "
             "perimeter-N, inner-N, or a file's."
@@ -174,28 +174,28 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
     return Layout(centres, diameter, outline=outline, name=name)
 
 
-def same_outline(one: Domain | None, other: Domain) -> bool:
-    """Whether two outlines have the same bounding box and area, up to rounding of lengths to decimal millimetres."""
+def same_outline(outline: Domain | None, other_outline: Domain) -> bool:
+    """Whether two outlines have the same bounding box and area, except for rounding of their lengths in millimetres."""
     return (
-        one is not None
-        and np.allclose(one.extent, other.extent, atol=1e-6)
-        and math.isclose(other.area, one.area, rel_tol=1e-3)
+        outline is not None
+        and np.allclose(outline.extent, other_outline.extent, atol=1e-6)
+        and math.isclose(other_outline.area, outline.area, rel_tol=1e-3)
     )
 
 
 @lru_cache(maxsize=2)
 def _park_centres(name: str) -> np.ndarray:
     if name == "park-inner":
-        return quasi_uniform(Rectangle(_SIDE, _SIDE), 32)
-    inset = DIAMETER + 2 * _FROM_EDGE
-    track = Rectangle(_SIDE - inset, _SIDE - inset)
+        return quasi_uniform(Rectangle(_PARK_SIDE, _PARK_SIDE), 32)
+    inset = DIAMETER + 2 * _PARK_EDGE_DISTANCE
+    track = Rectangle(_PARK_SIDE - inset, _PARK_SIDE - inset)
     pitch = track.perimeter / 32
     return np.asarray(track.boundary(pitch * (np.arange(32) + 0.5)))
 
 
 def _check_park(name: str, outline: Domain) -> None:
-    if not same_outline(outline, Rectangle(_SIDE, _SIDE)):
-        span = f"{-5e2 * _SIDE:g} to {5e2 * _SIDE:g} mm"
+    if not same_outline(outline, Rectangle(_PARK_SIDE, _PARK_SIDE)):
+        span = f"{-5e2 * _PARK_SIDE:g} to {5e2 * _PARK_SIDE:g} mm"
         other = "inner-32" if name == "park-inner" else "perimeter-32"
         raise ValueError(f"name: its skin spans {span} by {span}; on another take {other}.")
 
@@ -203,8 +203,8 @@ def _check_park(name: str, outline: Domain) -> None:
 def _grid_centres(name: str, outline: Domain, diameter: float, columns: int, rows: int) -> np.ndarray:
     if min(columns, rows) < 1:
         raise ValueError(f"name: {name!r} has no electrodes; give at least one column and one row.")
-    if columns * rows > _MOST:
-        raise ValueError(f"name: {name!r} has {columns * rows} electrodes; give {_MOST} or fewer.")
+    if columns * rows > _MAX_ELECTRODES:
+        raise ValueError(f"name: {name!r} has {columns * rows} electrodes; give {_MAX_ELECTRODES} or fewer.")
     x_min, x_max, y_min, y_max = outline.extent
     pitches = (x_max - x_min) / columns, (y_max - y_min) / rows
     if min(pitches) < diameter:
@@ -221,7 +221,7 @@ def _perimeter_centres(name: str, outline: Domain, diameter: float, number: int)
     if not isinstance(outline, Disk | Rectangle):
         raise ValueError(f"name: {name!r} is of rectangles and disks, and this skin is neither; take inner-N.")
     x_min, x_max, y_min, y_max = outline.extent
-    width, height, inset = x_max - x_min, y_max - y_min, diameter + 2 * _FROM_EDGE
+    width, height, inset = x_max - x_min, y_max - y_min, diameter + 2 * _PARK_EDGE_DISTANCE
     if inset >= min(width, height):
         raise ValueError(
             f"name: electrodes {1e3 * diameter:g} mm across do not fit around the edge; make them smaller."
@@ -236,10 +236,10 @@ def _inner_centres(outline: Domain, number: int, diameter: float) -> np.ndarray:
     """Centres spread evenly inside an outline. Those of rectangles are cached, since a study needs the same ones for
     many parameters."""
     if isinstance(outline, Rectangle):
-        return _spread(outline, number, diameter)
+        return _spread_centres(outline, number, diameter)
     return quasi_uniform(outline, number, margin=diameter / 2)
 
 
 @lru_cache(maxsize=256)
-def _spread(outline: Rectangle, number: int, diameter: float) -> np.ndarray:
+def _spread_centres(outline: Rectangle, number: int, diameter: float) -> np.ndarray:
     return quasi_uniform(outline, number, margin=diameter / 2)

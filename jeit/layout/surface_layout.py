@@ -21,12 +21,12 @@ from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit_solvers.engines import as_array, has_values
 
 # Minimum number of nodes per position: a coarser surface is refined by halving its triangles.
-_NODES = 30
+_MIN_NODES_PER_POSITION = 30
 # The surface is not refined any further once it has this many nodes.
-_MOST = 60_000
+_MAX_NODES = 60_000
 # Number of positions above which they are so close to each other that paths between them are nearly straight: the
 # nearest position is then found by the distance in space and the direction of the normal.
-_BY_WAYS = 128
+_MAX_GEODESIC_POSITIONS = 128
 
 
 def spread(
@@ -47,16 +47,18 @@ def spread(
     """
     check_count(number, 1)
     triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
-    while len(triangles.points) < min(_NODES * number, _MOST):
+    while len(triangles.points) < min(_MIN_NODES_PER_POSITION * number, _MAX_NODES):
         triangles = triangles.finer()
     weight = triangles.node_areas * (triangles.distance_to_border(triangles.points) >= margin)
     usable = np.flatnonzero(weight > 0)
     if len(usable) < number:
         raise ValueError(f"margin: {1e3 * margin:g} mm leaves no room for {number} electrodes on the surface.")
     ways = Geodesics.create(triangles)
-    position = triangles.points[_begin(ways, usable, weight, number)]
+    position = triangles.points[_initial_nodes(ways, usable, weight, number)]
     for _ in range(iterations):
-        owner = (ways.owners(position)[0] if number <= _BY_WAYS else _nearest(triangles, position))[usable]
+        owner = (
+            ways.owners(position)[0] if number <= _MAX_GEODESIC_POSITIONS else _nearest_positions(triangles, position)
+        )[usable]
         own = np.bincount(owner, weight[usable], number)
         middle = np.stack([np.bincount(owner, weight[usable] * x, number) for x in triangles.points[usable].T], axis=1)
         moved = np.where(own[:, None] > 0, middle / np.maximum(own, 1e-300)[:, None], position)
@@ -68,7 +70,7 @@ def spread(
     return position
 
 
-def _nearest(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.ndarray:
+def _nearest_positions(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.ndarray:
     """Index of the nearest position of each node, by the distance in space and the difference of their normals."""
     half = 0.5 * np.sqrt(triangles.areas.sum() / len(position))
     facing = half * triangles.normals[triangles.nearest(position).triangle]
@@ -76,20 +78,21 @@ def _nearest(triangles: Triangles, position: Float[np.ndarray, "L 3"]) -> np.nda
     return np.asarray(tree.query(np.hstack([triangles.points, half * triangles.node_normals]))[1])
 
 
-def _begin(ways: Geodesics, usable: np.ndarray, weight: np.ndarray, number: int) -> np.ndarray:
-    """Indices of the initial nodes: farthest-point sampling, or a random choice by area for many positions."""
-    if number > _BY_WAYS:
+def _initial_nodes(geodesics: Geodesics, usable: np.ndarray, weight: np.ndarray, number: int) -> np.ndarray:
+    """Indices of `number` nodes with which Lloyd's algorithm starts: by farthest-point sampling or, for many positions,
+    drawn at random with probabilities proportional to their areas."""
+    if number > _MAX_GEODESIC_POSITIONS:
         share = weight[usable] / weight.sum()
         return np.random.default_rng(0).choice(usable, number, replace=False, p=share)
-    points = ways.surface.points
+    points = geodesics.surface.points
     # The first node is the one farthest from the centroid, so that the result depends on the surface only.
     middle = np.average(points[usable], axis=0, weights=weight[usable])
     chosen = [usable[np.linalg.norm(points[usable] - middle, axis=1).round(9).argmax()]]
-    lengths = ways.distances(points[chosen[:1]])[0]
+    lengths = geodesics.distances(points[chosen[:1]])[0]
     while len(chosen) < number:
         chosen.append(usable[lengths[usable].argmax()])
         farthest = float(lengths[usable].max())
-        lengths = np.minimum(lengths, ways.distances(points[chosen[-1:]], limit=farthest)[0])
+        lengths = np.minimum(lengths, geodesics.distances(points[chosen[-1:]], limit=farthest)[0])
     return np.array(chosen)
 
 
@@ -222,9 +225,9 @@ def _check_apart(centres: np.ndarray, diameters: np.ndarray, labels: Sequence[st
         )
 
 
-def check_layout(name: str, given) -> None:
-    """Raise `ValueError`, about the argument `name`, unless `given` is a `Layout` or `SurfaceLayout`."""
-    check_kind(name, given, (Layout, SurfaceLayout), "a Layout, as of named_layout('park-inner') or read_layout(path)")
+def check_layout(name: str, layout) -> None:
+    """Raise `ValueError`, about the argument `name`, unless `layout` is a `Layout` or `SurfaceLayout`."""
+    check_kind(name, layout, (Layout, SurfaceLayout), "a Layout, as of named_layout('park-inner') or read_layout(path)")
 
 
 def flat_layout(layout: Layout | SurfaceLayout) -> Layout:

@@ -28,7 +28,7 @@ def transform_of(element: ElementTree.Element) -> np.ndarray:
     """Matrix (2, 3) of the transform of an element. Raises `ValueError` for a transform that cannot be read."""
     text, found = element.get("transform", "").strip(), np.eye(2, 3)
     if re.fullmatch(r"(\w++\s*+\([^()]*+\)[\s,]*+)*+", text) is None:
-        raise ValueError(f"transform of {described(element)} is {describe(text)}, not a list of transforms.")
+        raise ValueError(f"transform of {describe_element(element)} is {describe(text)}, not a list of transforms.")
     for kind, inside in re.findall(r"(\w+)\s*\(([^()]*)\)", text):
         numbers = [number_of(element, "transform", part) for part in re.split(r"[\s,]+", inside.strip()) if part]
         match kind, numbers:
@@ -44,23 +44,24 @@ def transform_of(element: ElementTree.Element) -> np.ndarray:
                 one = np.column_stack([turn, middle - turn @ middle])
             case _:
                 raise ValueError(
-                    f"{described(element)} has {kind[:20]}({inside[:40]}); jeit reads matrix, translate, scale and "
+                    f"{describe_element(element)} has {kind[:20]}({inside[:40]}); jeit reads matrix, translate, scale "
+                    "and "
                     "rotate."
                 )
-        found = composed(found, one)
+        found = compose_transforms(found, one)
     if not (np.abs(found) < LARGEST).all():
-        raise ValueError(f"transform of {described(element)} is too large for a drawing.")
+        raise ValueError(f"transform of {describe_element(element)} is too large for a drawing.")
     return found
 
 
-def composed(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
+def compose_transforms(outer: np.ndarray, inner: np.ndarray) -> np.ndarray:
     """Matrix (2, 3) that applies the transform `inner`, then `outer`."""
     return outer[:, :2] @ inner + np.column_stack([np.zeros((2, 2)), outer[:, 2]])
 
 
-def moved(points, to: np.ndarray) -> np.ndarray:
-    """Apply the transform with matrix `to` (2, 3) to points (k, 2)."""
-    return np.asarray(points, float).reshape(-1, 2) @ to[:, :2].T + to[:, 2]
+def transform_points(points, matrix: np.ndarray) -> np.ndarray:
+    """Apply the transform with the given `matrix` (2, 3) to points (k, 2)."""
+    return np.asarray(points, float).reshape(-1, 2) @ matrix[:, :2].T + matrix[:, 2]
 
 
 def tag_of(element: ElementTree.Element) -> str:
@@ -68,7 +69,7 @@ def tag_of(element: ElementTree.Element) -> str:
     return element.tag.split("}")[-1]
 
 
-def described(element: ElementTree.Element) -> str:
+def describe_element(element: ElementTree.Element) -> str:
     """Text that names an element in messages."""
     return (
         f"<{tag_of(element)[:20]} id={describe(element.get('id'))}>"
@@ -80,28 +81,29 @@ def described(element: ElementTree.Element) -> str:
 def number_of(element: ElementTree.Element, name: str, text: str | None) -> float:
     """Convert `text`, the value of the attribute `name`, to a number. Raises `ValueError` if it is not one."""
     if text is None or re.fullmatch(NUMBER, text.strip()) is None:
-        raise ValueError(f"{name} of {described(element)} is {describe(text)}, not a number.")
+        raise ValueError(f"{name} of {describe_element(element)} is {describe(text)}, not a number.")
     value = float(text)
     if not abs(value) < LARGEST:
-        raise ValueError(f"{name} of {described(element)} is {describe(text)}, too large for a drawing.")
+        raise ValueError(f"{name} of {describe_element(element)} is {describe(text)}, too large for a drawing.")
     return value
 
 
-def disc_of(element: ElementTree.Element, to: np.ndarray) -> tuple[float, float, float]:
-    """Centre and radius of a circle in metres, with y up. `to`: matrix (2, 3) to metres. Raises `ValueError` if the
+def disc_of(element: ElementTree.Element, matrix: np.ndarray) -> tuple[float, float, float]:
+    """Centre and radius of a circle in metres, with y up. `matrix`: matrix (2, 3) to metres. Raises `ValueError` if the
     element is not a circle."""
     if tag_of(element) not in ROUND:
-        raise ValueError(f"{described(element)} stands where a circle should: electrodes are circles.")
+        raise ValueError(f"{describe_element(element)} stands where a circle should: electrodes are circles.")
     x, y = (number_of(element, name, element.get(name, "0")) for name in ("cx", "cy"))
     names = ("r", "r") if tag_of(element) == "circle" else ("rx", "ry")
     radii = [number_of(element, name, element.get(name)) for name in names]
-    half = np.linalg.svd(to[:, :2] * radii, compute_uv=False)
+    half = np.linalg.svd(matrix[:, :2] * radii, compute_uv=False)
     if half[0] > half[1] * (1 + 1e-3):
         raise ValueError(
-            f"{described(element)} is {2e3 * half[0]:.4g} mm long and {2e3 * half[1]:.4g} mm wide as it is drawn; "
+            f"{describe_element(element)} is {2e3 * half[0]:.4g} mm long and {2e3 * half[1]:.4g} mm wide as it is "
+            "drawn; "
             "electrodes are circles."
         )
-    centre = moved([x, y], to)[0]
+    centre = transform_points([x, y], matrix)[0]
     return float(centre[0]), float(centre[1]), float(half.mean())
 
 
@@ -113,22 +115,24 @@ def loops_of(element: ElementTree.Element) -> list[np.ndarray]:
         x, y = (number_of(element, name, element.get(name, "0")) for name in ("x", "y"))
         width, height = (number_of(element, name, element.get(name)) for name in ("width", "height"))
         if any(number_of(element, name, element.get(name, "0")) for name in ("rx", "ry")):
-            raise ValueError(f"{described(element)} has round corners; draw the skin with straight sides.")
+            raise ValueError(f"{describe_element(element)} has round corners; draw the skin with straight sides.")
         return [np.array([[x, y], [x + width, y], [x + width, y + height], [x, y + height]])]
     if tag in ("polygon", "polyline"):
         values = [number_of(element, "points", text) for text in re.split(r"[\s,]+", element.get("points", "").strip())]
         if len(values) % 2:
-            raise ValueError(f"points of {described(element)} are {len(values)} numbers, not pairs.")
-        return [_closed(element, np.array(values).reshape(-1, 2), tag == "polygon")]
+            raise ValueError(f"points of {describe_element(element)} are {len(values)} numbers, not pairs.")
+        return [_closed_loop(element, np.array(values).reshape(-1, 2), tag == "polygon")]
     if tag == "path":
         return _path_loops(element)
-    raise ValueError(f"{described(element)} stands where the skin should: draw a rectangle, polygon, path or circle.")
+    raise ValueError(
+        f"{describe_element(element)} stands where the skin should: draw a rectangle, polygon, path or circle."
+    )
 
 
 def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
     text = element.get("d", "")
     if re.fullmatch(rf"(?:[MmLlHhVvZz]|{NUMBER}|[\s,])*+", text) is None or not text.strip():
-        raise ValueError(f"{described(element)} has curves, or is no path; draw the skin with straight sides.")
+        raise ValueError(f"{describe_element(element)} has curves, or is no path; draw the skin with straight sides.")
     loops: list[tuple[list[np.ndarray], bool]] = []
     place = np.zeros(2)
     for letter, inside in re.findall(r"([MmLlHhVvZz])([^MmLlHhVvZz]*)", text):
@@ -140,7 +144,7 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
             place = loops[-1][0][0]
             continue
         if kind == "Z" or not numbers or len(numbers) % size or (kind != "M" and not loops):
-            raise ValueError(f"d of {described(element)} is not a path: {letter}{inside.strip()[:40]}.")
+            raise ValueError(f"d of {describe_element(element)} is not a path: {letter}{inside.strip()[:40]}.")
         for index in range(0, len(numbers), size):
             origin = place if relative else np.array({"H": [0, place[1]], "V": [place[0], 0]}.get(kind, [0, 0]))
             step = {"H": [numbers[index], 0], "V": [0, numbers[index]]}.get(kind, numbers[index : index + 2])
@@ -151,26 +155,26 @@ def _path_loops(element: ElementTree.Element) -> list[np.ndarray]:
                 if loops[-1][1]:
                     loops.append(([start], False))
                 loops[-1][0].append(place)
-    return [_closed(element, np.array(points), closed) for points, closed in loops]
+    return [_closed_loop(element, np.array(points), closed) for points, closed in loops]
 
 
-def _closed(element: ElementTree.Element, loop: np.ndarray, closed: bool) -> np.ndarray:
+def _closed_loop(element: ElementTree.Element, loop: np.ndarray, closed: bool) -> np.ndarray:
     """Vertices of a loop without a repetition of the first. Raises `ValueError` if the loop is not closed."""
     meets = len(loop) > 3 and np.allclose(loop[0], loop[-1], rtol=0, atol=1e-6 * np.ptp(loop))
     if not (closed or meets):
-        raise ValueError(f"{described(element)} is not closed; close the skin's outline.")
+        raise ValueError(f"{describe_element(element)} is not closed; close the skin's outline.")
     return loop[:-1] if meets else loop
 
 
-_SPACE = "http://www.w3.org/2000/svg"
+_SVG_NAMESPACE = "http://www.w3.org/2000/svg"
 _MARGIN = 1e-3  # m, around the drawing, so that lines on its edge are not cut off
 # Units in metres; 96 pixels are an inch.
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "in": 25.4e-3, "px": 25.4e-3 / 96, "pt": 25.4e-3 / 72}
-_ROLES = ("OUTLINE", "ELECTRODES", "LABELS")
+_GROUP_NAMES = ("OUTLINE", "ELECTRODES", "LABELS")
 _INKSCAPE_LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
-_GROUPS = ("svg", "g", "a", "switch")
-_UNSEEN = ("defs", "clipPath", "mask", "pattern", "symbol", "marker", "metadata", "style", "title", "desc")
-_STRAIGHT = ("rect", "polygon", "polyline", "path")
+_GROUP_TAGS = ("svg", "g", "a", "switch")
+_INVISIBLE_TAGS = ("defs", "clipPath", "mask", "pattern", "symbol", "marker", "metadata", "style", "title", "desc")
+_STRAIGHT_SHAPES = ("rect", "polygon", "polyline", "path")
 
 
 def write_svg(layout: Layout, file: BinaryIO) -> None:
@@ -180,20 +184,20 @@ def write_svg(layout: Layout, file: BinaryIO) -> None:
     left, top = millimetres(x_min - _MARGIN), millimetres(-y_max - _MARGIN)
     width, height = millimetres(x_max - x_min + 2 * _MARGIN), millimetres(y_max - y_min + 2 * _MARGIN)
     size = {"width": f"{width}mm", "height": f"{height}mm", "viewBox": f"{left} {top} {width} {height}"}
-    root = ElementTree.Element("svg", {"xmlns": _SPACE, **size})
-    _add(root, "title").text = layout.name
+    root = ElementTree.Element("svg", {"xmlns": _SVG_NAMESPACE, **size})
+    _add_element(root, "title").text = layout.name
     line = {"fill": "none", "stroke-width": "0.1"}
-    group = _add(root, "g", id="OUTLINE", stroke="#ff0000", **line)
+    group = _add_element(root, "g", id="OUTLINE", stroke="#ff0000", **line)
     if layout.outline is not None:
-        layout.outline.draw(_Pen(group))
-    group = _add(root, "g", id="ELECTRODES", stroke="#0000ff", **line)
+        layout.outline.draw(_SvgPen(group))
+    group = _add_element(root, "g", id="ELECTRODES", stroke="#0000ff", **line)
     centred = {"text-anchor": "middle", "dominant-baseline": "central", "font-family": "sans-serif"}
-    names = _add(root, "g", id="LABELS", fill="#808080", **centred)
+    names = _add_element(root, "g", id="LABELS", fill="#808080", **centred)
     for centre, diameter, label in zip(layout.centres, layout.diameters, layout.labels, strict=True):
-        circle = _circle(centre, diameter)
-        _add(group, "circle", **circle)
+        circle = _add_circle(centre, diameter)
+        _add_element(group, "circle", **circle)
         place = {"x": circle["cx"], "y": circle["cy"], "font-size": str(millimetres(float(diameter) / 3))}
-        _add(names, "text", **place).text = label
+        _add_element(names, "text", **place).text = label
     ElementTree.indent(root)
     ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
 
@@ -204,9 +208,9 @@ def read_svg(path: Path, outline: Domain | None) -> Layout:
     check_size(path, MOST_BYTES)
     with read_as("this is not an SVG drawing that is read"):
         root = ElementTree.parse(path, ElementTree.XMLParser(target=_Builder())).getroot()
-    if root.tag != f"{{{_SPACE}}}svg":
+    if root.tag != f"{{{_SVG_NAMESPACE}}}svg":
         raise ValueError(f"this is not an SVG drawing: it begins with <{str(root.tag)[:40]}>.")
-    shapes = list(_shapes(root))
+    shapes = list(_drawn_shapes(root))
     roles = {role for _, role, _ in shapes}
     labels = ["".join(one.itertext()).strip() for one, role, _ in shapes if role == "LABELS" and tag_of(one) == "text"]
     chosen = "ELECTRODES" if "ELECTRODES" in roles else None
@@ -215,33 +219,35 @@ def read_svg(path: Path, outline: Domain | None) -> Layout:
         raise ValueError("there is no circle in the drawing; electrodes are circles, in a group ELECTRODES or all.")
     check_electrodes("the drawing", len(electrodes))
     circles = np.array([disc_of(one, to) for one, to in electrodes])
-    drawn = _outline([(one, to) for one, role, to in shapes if role == "OUTLINE"]) if "OUTLINE" in roles else None
+    drawn = (
+        _outline_of_shapes([(one, to) for one, role, to in shapes if role == "OUTLINE"]) if "OUTLINE" in roles else None
+    )
     if "OUTLINE" not in roles:
-        drawn = _only_outline([(one, to) for one, role, to in shapes if role is None])
+        drawn = _single_closed_outline([(one, to) for one, role, to in shapes if role is None])
     return Layout(circles[:, :2], 2 * circles[:, 2], outline=drawn or outline, labels=labels or None, name=path.stem)
 
 
-def _add(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
+def _add_element(parent: ElementTree.Element, tag: str, **attributes: str) -> ElementTree.Element:
     return ElementTree.SubElement(parent, tag, attributes)
 
 
-def _circle(centre, diameter) -> dict[str, str]:
+def _add_circle(centre, diameter) -> dict[str, str]:
     x, y = centre
     return {"cx": str(millimetres(x)), "cy": str(millimetres(-y)), "r": str(millimetres(diameter / 2))}
 
 
-class _Pen:
+class _SvgPen:
     """Draws circles and polygons into a group of a drawing."""
 
     def __init__(self, group: ElementTree.Element):
         self.group = group
 
     def circle(self, centre: tuple[float, float], radius: float) -> None:
-        _add(self.group, "circle", **_circle(centre, 2 * radius))
+        _add_element(self.group, "circle", **_add_circle(centre, 2 * radius))
 
     def loop(self, vertices: np.ndarray) -> None:
         points = " ".join(f"{millimetres(x)},{millimetres(-y)}" for x, y in vertices)
-        _add(self.group, "polygon", points=points)
+        _add_element(self.group, "polygon", points=points)
 
 
 class _Builder(ElementTree.TreeBuilder):
@@ -251,32 +257,36 @@ class _Builder(ElementTree.TreeBuilder):
         raise ValueError("the file has a <!DOCTYPE …>, which jeit does not read; remove it with a text editor.")
 
 
-def _shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str | None, np.ndarray]]:
+def _drawn_shapes(root: ElementTree.Element) -> Iterator[tuple[ElementTree.Element, str | None, np.ndarray]]:
     """Yield the shapes of a drawing in their order: element, role (that of the element or of an enclosing group), and
     matrix (2, 3) from its units to metres, with y up."""
-    waiting: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [(root, None, _to_metres(root))]
+    waiting: list[tuple[ElementTree.Element, str | None, np.ndarray]] = [(root, None, _matrix_to_metres(root))]
     while waiting:
         element, role, to = waiting.pop()
         tag = tag_of(element)
-        if tag in _UNSEEN or not element.tag.startswith(f"{{{_SPACE}}}") or "display:none" in _style(element):
+        if (
+            tag in _INVISIBLE_TAGS
+            or not element.tag.startswith(f"{{{_SVG_NAMESPACE}}}")
+            or "display:none" in _style(element)
+        ):
             continue
         if tag == "use" or (tag == "svg" and element is not root):
             raise ValueError(
-                f"there is {described(element)} in the drawing; unlink clones and embedded drawings first."
+                f"there is {describe_element(element)} in the drawing; unlink clones and embedded drawings first."
             )
         called = {element.get("id", ""), element.get(_INKSCAPE_LABEL, ""), *element.get("class", "").split()}
-        role = next((name for name in _ROLES if name in {one.upper() for one in called}), role)
+        role = next((name for name in _GROUP_NAMES if name in {one.upper() for one in called}), role)
         if "transform" in element.attrib:
-            to = composed(to, transform_of(element))
+            to = compose_transforms(to, transform_of(element))
             if not (np.abs(to) < LARGEST).all():
-                raise ValueError(f"transforms about {described(element)} are too large for a drawing.")
-        if tag in _GROUPS:
+                raise ValueError(f"transforms about {describe_element(element)} are too large for a drawing.")
+        if tag in _GROUP_TAGS:
             waiting += [(child, role, to) for child in reversed(element)]
         else:
             yield element, role, to
 
 
-def _to_metres(root: ElementTree.Element) -> np.ndarray:
+def _matrix_to_metres(root: ElementTree.Element) -> np.ndarray:
     """Matrix (2, 3) from the units of the drawing to metres, with y up. Raises `ValueError` if the drawing does not
     state its size."""
     box = [number_of(root, "viewBox", part) for part in re.split(r"[\s,]+", root.get("viewBox", "").strip()) if part]
@@ -303,23 +313,23 @@ def _style(element: ElementTree.Element) -> str:
     return "".join(f"{element.get('style', '')};display:{element.get('display', '')}".split())
 
 
-def _outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
+def _outline_of_shapes(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain:
     """Outline from the content of the group OUTLINE: a single circle, or shapes with straight sides, of which the
     largest is the skin and others are holes."""
     if len(drawn) == 1 and tag_of(drawn[0][0]) in ROUND:
         x, y, radius = disc_of(*drawn[0])
         return Disk(radius, (x, y))
-    loops = [moved(loop, to) for one, to in drawn for loop in loops_of(one)]
+    loops = [transform_points(loop, to) for one, to in drawn for loop in loops_of(one)]
     loops.sort(key=lambda loop: -np.prod(np.ptp(loop, axis=0)))
     return Polygon(loops[0], loops[1:])
 
 
-def _only_outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain | None:
+def _single_closed_outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain | None:
     """Outline of a drawing without a group OUTLINE: its only closed shape with straight sides; None if it has no shape
     with straight sides."""
     found, complaints = [], []
     for one, to in drawn:
-        if tag_of(one) in _STRAIGHT:
+        if tag_of(one) in _STRAIGHT_SHAPES:
             try:
                 loops_of(one)
                 found.append((one, to))
@@ -327,9 +337,10 @@ def _only_outline(drawn: list[tuple[ElementTree.Element, np.ndarray]]) -> Domain
                 complaints.append(error)
     if len(found) > 1:
         raise ValueError(
-            f"there are {len(found)} closed shapes, {described(found[0][0])} the first; put the skin's into a group "
+            f"there are {len(found)} closed shapes, {describe_element(found[0][0])} the first; put the skin's into a "
+            "group "
             "OUTLINE."
         )
     if not found and complaints:
         raise complaints[0]
-    return _outline(found) if found else None
+    return _outline_of_shapes(found) if found else None

@@ -13,22 +13,22 @@ from scipy.spatial import KDTree
 from jeit.mesh import topology
 
 # Distance, relative to the extent of the surface, below which triangles count as touching.
-_TOUCHING = 1e-9
+_TOUCH_TOLERANCE = 1e-9
 # Approximate number of pairs of triangles that are tested together.
-_PAIRS = 500_000
+_PAIRS_PER_BATCH = 500_000
 # For each corner of a triangle, the next corner.
-_NEXT = np.array([1, 2, 0])
+_NEXT_CORNER = np.array([1, 2, 0])
 
 
 def first_crossing(points: np.ndarray, cells: np.ndarray) -> tuple[int, int] | None:
     """Find a pair of triangles (m, 3) that cross, touch or overlap outside the nodes and edges they share; None if no
     pair does."""
-    tolerance = _TOUCHING * float(np.ptp(points, axis=0).max())
+    tolerance = _TOUCH_TOLERANCE * float(np.ptp(points, axis=0).max())
     for pairs in _near_pairs(points[cells], tolerance):
         shared = (cells[pairs[:, 0], :, None] == cells[pairs[:, 1], None, :]).sum(axis=(1, 2))
         meet = np.zeros(len(pairs), bool)
         apart, one, two = shared == 0, shared == 1, shared == 2
-        meet[apart] = _cross(points, cells, pairs[apart], tolerance)
+        meet[apart] = _intersect(points, cells, pairs[apart], tolerance)
         meet[one] = _cross_opposite(points, cells, pairs[one], tolerance)
         meet[two] = _overlap_at_edge(points, cells, pairs[two])
         if meet.any():
@@ -51,7 +51,7 @@ def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
     for k, members in enumerate(kinds):
         tree = KDTree(middle[members])
         larger = np.concatenate(kinds[k:])
-        step = max(1, _PAIRS // 64)
+        step = max(1, _PAIRS_PER_BATCH // 64)
         for start in range(0, len(larger), step):
             asked = larger[start : start + step]
             found = tree.query_ball_point(middle[asked], reach[asked] + reach[members].max() + tolerance)
@@ -64,13 +64,13 @@ def _near_pairs(corners: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
             yield np.column_stack([first, second])[once & overlap]
 
 
-def _cross(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
+def _intersect(points: np.ndarray, cells: np.ndarray, pairs: np.ndarray, tolerance: float) -> np.ndarray:
     """Whether the two triangles of each pair intersect (p,); the triangles have no node in common."""
     first, second = points[cells[pairs[:, 0]]], points[cells[pairs[:, 1]]]
     meet = _overlap_in_plane(first, second, tolerance)
     for one, other in ((first, second), (second, first)):
         for k in range(3):
-            meet |= _pierces(one[:, k], one[:, _NEXT[k]], other, tolerance)
+            meet |= _pierces(one[:, k], one[:, _NEXT_CORNER[k]], other, tolerance)
     return meet
 
 
@@ -114,7 +114,7 @@ def _pierces(start: np.ndarray, end: np.ndarray, corners: np.ndarray, tolerance:
     place = start + share[:, None] * (end - start) - corners[:, 0]
     u = (np.cross(place, b) * unit).sum(axis=1) / size
     v = (np.cross(a, place) * unit).sum(axis=1) / size
-    return through & (np.minimum(np.minimum(u, v), 1 - u - v) >= -_TOUCHING)
+    return through & (np.minimum(np.minimum(u, v), 1 - u - v) >= -_TOUCH_TOLERANCE)
 
 
 def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -> np.ndarray:
@@ -128,7 +128,7 @@ def _overlap_in_plane(first: np.ndarray, second: np.ndarray, tolerance: float) -
     apart = np.zeros(len(first), bool)
     for one in (first, second):
         for k in range(3):
-            outward = np.cross(one[:, _NEXT[k]] - one[:, k], unit)
+            outward = np.cross(one[:, _NEXT_CORNER[k]] - one[:, k], unit)
             outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
             spans = [np.einsum("pki,pi->pk", corners, outward) for corners in (first, second)]
             gap = np.maximum(spans[0].min(axis=1) - spans[1].max(axis=1), spans[1].min(axis=1) - spans[0].max(axis=1))
@@ -151,8 +151,8 @@ def orient_surface(cells: np.ndarray, points: np.ndarray | None) -> np.ndarray:
     # Two triangles have the same orientation if they traverse their common edge in opposite directions; otherwise one
     # of them must be turned.
     turn = odd[first] == odd[second]
-    turned = _sides(row, other, turn, cells)
-    _check_fans(cells, first, second)
+    turned = _triangles_to_turn(row, other, turn, cells)
+    _check_node_contacts(cells, first, second)
     if np.count_nonzero(turned) * 2 > len(cells):
         turned = ~turned
     closed = 2 * len(first) == 3 * len(cells)
@@ -192,21 +192,22 @@ def _pair_edges(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         nodes = np.sort(edges[crowded[0]]).tolist()
         raise ValueError(
             f"cells: the edge of nodes {nodes} belongs to more than two triangles (among them "
-            f"{sorted((crowded // 3).tolist())}), so the surface is not manifold there: walls meet in a T. Remove the "
-            "triangles that are not of the skin, such as inner walls."
+            f"{sorted((crowded // 3).tolist())}), so the surface is not manifold there, as where walls "
+            "meet in a T. Remove the triangles that are not of the skin, such as inner walls."
         )
     return first, second
 
 
-def _sides(first: np.ndarray, second: np.ndarray, turn: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Which triangles to turn (m,) so that all agree with triangle 0. Raises `ValueError` for a one-sided surface.
+def _triangles_to_turn(first: np.ndarray, second: np.ndarray, opposite: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Whether each triangle (m,) must be reversed so that all are oriented like triangle 0. Raises `ValueError` for a
+    one-sided surface.
 
     The graph has two nodes per triangle, as given and turned. It falls into two components if the surface has two
     sides.
     """
     count = len(cells)
     rows = np.concatenate([first, first + count])
-    columns = np.concatenate([second + count * turn, second + count * ~turn])
+    columns = np.concatenate([second + count * opposite, second + count * ~opposite])
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count))
     _, label = connected_components(graph, directed=False)
     if label[0] == label[count]:
@@ -217,7 +218,7 @@ def _sides(first: np.ndarray, second: np.ndarray, turn: np.ndarray, cells: np.nd
     return label[:count] != label[0]
 
 
-def _check_fans(cells: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
+def _check_node_contacts(cells: np.ndarray, first: np.ndarray, second: np.ndarray) -> None:
     """Raise `ValueError` if sheets of a surface meet only in a node, so that the triangles around it form several
     fans."""
     corner = np.arange(cells.size).reshape(cells.shape)

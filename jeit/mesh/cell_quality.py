@@ -47,7 +47,7 @@ def quality(mesh: Mesh) -> Quality:
     corners = points[cells]
     first, second = np.triu_indices(mesh.dimension + 1, 1)
     length = np.linalg.norm(corners[:, first] - corners[:, second], axis=2)
-    angle, ratio = _triangles(corners) if mesh.dimension == 2 else _tetrahedra(corners)
+    angle, ratio = _triangle_measures(corners) if mesh.dimension == 2 else _tetrahedron_measures(corners)
     return Quality(
         dimension=mesh.dimension,
         num_points=mesh.num_points,
@@ -58,7 +58,7 @@ def quality(mesh: Mesh) -> Quality:
     )
 
 
-def _triangles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _triangle_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     edges = np.roll(corners, -1, axis=1) - corners
     length = np.linalg.norm(edges, axis=2)
     if corners.shape[2] == 2:
@@ -71,7 +71,7 @@ def _triangles(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return angle, 2 * (doubled / length.sum(axis=1)) * (2 * doubled / length.prod(axis=1))
 
 
-def _tetrahedra(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _tetrahedron_measures(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     a, b, c = (corners[:, k] - corners[:, 0] for k in (1, 2, 3))
     # Inward normals of the faces opposite to nodes 1, 2, 3 and 0; the length of each is twice the area of its face.
     normals = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
@@ -88,7 +88,7 @@ def _tetrahedra(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return angle, 3 * (volume / area.sum(axis=1)) / circumradius
 
 
-def merged(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+def merge_points(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """Merge points (n, d) closer than `tolerance` metres to each other, and renumber the cells (m, k).
 
     The first point of each group is kept. Cells of which two corners are merged are removed.
@@ -108,15 +108,15 @@ def merged(points: np.ndarray, cells: np.ndarray, tolerance: float) -> tuple[np.
 
 
 # Layout of a triangle in a binary .stl file: a normal, three corners, and two bytes of attributes.
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_HEADER = 84
+_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_STL_HEADER_BYTES = 84
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
 # Distance, relative to the largest coordinate, below which nodes are merged: these files store six digits.
-_SEAM = 2e-6
+_MERGE_TOLERANCE = 2e-6
 # Maximum number of characters of an error message about the content of a file.
-_LONGEST = 120
+_MAX_MESSAGE = 120
 # Maximum memory needed to read a file, divided by the file's size; an .obj file describes a face in few characters.
-_GROWTH = {".stl": 8, ".obj": 16}
+_MEMORY_FACTORS = {".stl": 8, ".obj": 16}
 
 
 def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -126,13 +126,13 @@ def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     `ValueError` with the file's `name` if the file contains no valid triangles.
     """
     ending = path.suffix.lower()
-    check_memory(name, _GROWTH[ending] * path.stat().st_size)
+    check_memory(name, _MEMORY_FACTORS[ending] * path.stat().st_size)
     content = path.read_bytes()
     try:
-        points, cells = _stl(content) if ending == ".stl" else _obj(content)
+        points, cells = _parse_stl(content) if ending == ".stl" else _parse_obj(content)
     except (ValueError, IndexError, OverflowError) as error:
         said = " ".join(str(error).split())
-        said = said if len(said) <= _LONGEST else f"{said[:_LONGEST]} …"
+        said = said if len(said) <= _MAX_MESSAGE else f"{said[:_MAX_MESSAGE]} …"
         raise ValueError(f"path: {name} does not work as a mesh file: {said}.") from None
     if not len(cells):
         raise ValueError(f"path: {name} does not work as a mesh file: there are no triangles in it.")
@@ -141,7 +141,7 @@ def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     used, number = np.unique(cells, return_inverse=True)
     points, cells = points[used], number.reshape(cells.shape)
     size, place = float(np.ptp(points, axis=0).max()), points[0].tolist()
-    points, cells = merged(points, cells, _SEAM * float(np.abs(points).max()))
+    points, cells = merge_points(points, cells, _MERGE_TOLERANCE * float(np.abs(points).max()))
     if not len(cells):
         raise ValueError(
             f"path: {name} does not work as a mesh file: no triangle in it has an area. All that it holds lies within "
@@ -150,10 +150,10 @@ def read_loose(path: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
     return points, cells
 
 
-def _stl(content: bytes) -> tuple[np.ndarray, np.ndarray]:
-    number = int.from_bytes(content[_HEADER - 4 : _HEADER], "little")
-    if len(content) == _HEADER + number * _TRIANGLE.itemsize:
-        corners = np.frombuffer(content, _TRIANGLE, offset=_HEADER)["corners"].astype(float)
+def _parse_stl(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+    number = int.from_bytes(content[_STL_HEADER_BYTES - 4 : _STL_HEADER_BYTES], "little")
+    if len(content) == _STL_HEADER_BYTES + number * _STL_TRIANGLE.itemsize:
+        corners = np.frombuffer(content, _STL_TRIANGLE, offset=_STL_HEADER_BYTES)["corners"].astype(float)
     elif content[:5].lower() != b"solid":
         raise ValueError("it is neither a text that begins with 'solid' nor as long as its number of triangles asks")
     else:
@@ -164,7 +164,7 @@ def _stl(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     return points, np.arange(len(points)).reshape(-1, 3)
 
 
-def _obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
+def _parse_obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     points: list[list[float]] = []
     cells: list[tuple[int, int, int]] = []
     for line in content.replace(b"\\\n", b" ").splitlines():
@@ -174,7 +174,7 @@ def _obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
             if len(points[-1]) != 3:
                 raise ValueError("a vertex has not three coordinates")
         elif word == b"f":
-            corners = [_index(value, len(points)) for value in values]
+            corners = [_vertex_index(value, len(points)) for value in values]
             cells += [(corners[0], *pair) for pair in pairwise(corners[1:])]
     array = np.array(cells, np.int64).reshape(-1, 3)
     if array.size and array.max() >= len(points):
@@ -182,7 +182,7 @@ def _obj(content: bytes) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points, float).reshape(-1, 3), array
 
 
-def _index(value: bytes, count: int) -> int:
+def _vertex_index(value: bytes, count: int) -> int:
     """Vertex index of a corner of a face, given as vertex/texture/normal; negative numbers count back from the last
     vertex."""
     number = int(value.split(b"/")[0])

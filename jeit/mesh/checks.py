@@ -17,9 +17,9 @@ from jeit.mesh import topology
 
 # Minimum area or volume of a cell, relative to that power of its longest edge: gradients on flatter cells are
 # inaccurate in double precision.
-_FLAT = 1e-10
+_MIN_MEASURE = 1e-10
 # Nodes whose distance, relative to the extent of the mesh, is at most this are treated as coincident.
-_COINCIDING = 1e-10
+_COINCIDENT_DISTANCE = 1e-10
 # Three node numbers of a facet are packed into one 64-bit integer.
 MOST_POINTS = 2_000_000
 
@@ -92,7 +92,7 @@ def check_coinciding(points: np.ndarray) -> None:
     if len(points) < 2:
         return
     distance, neighbour = map(np.asarray, KDTree(points).query(points, k=2))
-    close = np.flatnonzero(distance[:, 1] <= _COINCIDING * np.ptp(points, axis=0).max())
+    close = np.flatnonzero(distance[:, 1] <= _COINCIDENT_DISTANCE * np.ptp(points, axis=0).max())
     if close.size:
         first = int(close[0])
         other = int(neighbour[first, 1] if neighbour[first, 1] != first else neighbour[first, 0])
@@ -117,7 +117,7 @@ def orient(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     dimension = cells.shape[1] - 1
     corners = points[cells]
     size = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    flat = np.flatnonzero(np.abs(measure) <= _FLAT * size**dimension)
+    flat = np.flatnonzero(np.abs(measure) <= _MIN_MEASURE * size**dimension)
     if flat.size:
         name = "area" if dimension == 2 else "volume"
         raise ValueError(
@@ -154,7 +154,7 @@ def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, 
         if not np.issubdtype(array.dtype, np.integer):
             raise ValueError(f"tags: {name!r} must hold integers, got {array.dtype}.")
         if array.ndim == 2 and array.shape[1] == facets.shape[1]:
-            array = _match(name, array.astype(np.int64), facets)
+            array = _match_facets(name, array.astype(np.int64), facets)
         elif array.ndim != 1:
             raise ValueError(
                 f"tags: {name!r} must be facet indices (t,) or facet nodes (t, {facets.shape[1]}), got {array.shape}."
@@ -168,7 +168,7 @@ def locate_tags(tags: Mapping[str, ArrayLike], facets: np.ndarray) -> dict[str, 
     return located
 
 
-def _match(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
+def _match_facets(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
     count = int(max(facets.max(), nodes.max())) + 1
     keys = topology.facet_keys(facets, count)
     order = np.argsort(keys)
@@ -185,18 +185,18 @@ def _match(name: str, nodes: np.ndarray, facets: np.ndarray) -> np.ndarray:
 
 LARGE = 10.0
 """Size in metres above which a warning is given: no tank or skin is larger."""
-_CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
+_SIZE_CHECKED: ContextVar[bool] = ContextVar("size_checked", default=False)
 
 
 @contextmanager
 def size_checked() -> Iterator[None]:
-    """Context, or decorator of a function, in which sizes are not warned about: for meshes made from a body or another
-    mesh, whose size has been checked before."""
-    before = _CHECKED.set(True)
+    """Context manager or decorator that suppresses warnings about large sizes, for meshes made from a body or another
+    mesh whose size has been checked before."""
+    before = _SIZE_CHECKED.set(True)
     try:
         yield
     finally:
-        _CHECKED.reset(before)
+        _SIZE_CHECKED.reset(before)
 
 
 def warn_large(extent: float, name: str, across: float = 1.0, *, of_file: bool = False) -> None:
@@ -205,7 +205,7 @@ def warn_large(extent: float, name: str, across: float = 1.0, *, of_file: bool =
     `across`: size of the object divided by this length; `of_file`: whether the length may come from a file, for which
     the message suggests a scale. Inside `size_checked` there is no warning.
     """
-    if not across * extent > LARGE or _CHECKED.get():
+    if not across * extent > LARGE or _SIZE_CHECKED.get():
         return
     scale = [f" (a file is read with scale={one})" if of_file else "" for one in ("1e-3", "1e-2", "0.0254")]
     warnings.warn(

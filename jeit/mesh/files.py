@@ -47,20 +47,20 @@ FORMATS = {
     ".xmf": "xdmf",
 }
 # Memory needed to read a mesh, divided by the size of its file.
-_GROWTH = 4
+_MEMORY_FACTOR = 4
 _INCLUDE = re.compile(rb"^[ \t]*\*[ \t]*include", re.IGNORECASE | re.MULTILINE)
 # First pattern: sets in an Abaqus file that are given by their first and last number. Second pattern: counts in a VTK
 # file, including the numbers of grid points along each axis.
-_GENERATED = re.compile(rb"^[ \t]*\*.*generate", re.IGNORECASE | re.MULTILINE)
+_GENERATED_SET = re.compile(rb"^[ \t]*\*.*generate", re.IGNORECASE | re.MULTILINE)
 _VTK_COUNTS = re.compile(
     rb"^[ \t]*(DIMENSIONS|POINTS|CELLS|CELL_TYPES|\w+_COORDINATES)((?:[ \t]+\d+)+)", re.IGNORECASE | re.MULTILINE
 )
 # In a .msh file: sections that start with a count, integers of at least eight digits, and the layout of a binary node.
-_COUNTED = re.compile(rb"^\$(Nodes|Elements|PhysicalNames)\s*?\n\s*(\d+)\r?\n", re.MULTILINE)
-_LONG = re.compile(rb"(?<![\w.+-])\d{8,}(?![\d.eE])")
-_NODE = np.dtype([("number", "<i4"), ("place", "<f8", 3)])
+_MSH_COUNTS = re.compile(rb"^\$(Nodes|Elements|PhysicalNames)\s*?\n\s*(\d+)\r?\n", re.MULTILINE)
+_LONG_INTEGER = re.compile(rb"(?<![\w.+-])\d{8,}(?![\d.eE])")
+_MSH_NODE = np.dtype([("number", "<i4"), ("place", "<f8", 3)])
 # Maximum accepted node number: meshio allocates an array as long as the largest node number.
-_LARGEST = 10**7
+_MAX_NODE_NUMBER = 10**7
 _reading = threading.Lock()
 
 
@@ -73,7 +73,7 @@ def check_foreign(path: Path) -> str:
             f"path: {path.name[:80]} does not work as a mesh file: the ending of the name gives the format, "
             f"{', '.join(FORMATS)}. Others that meshio knows are read with trusted=True, where a file comes from you."
         )
-    check_memory(path.name[:80], _GROWTH * path.stat().st_size)
+    check_memory(path.name[:80], _MEMORY_FACTOR * path.stat().st_size)
     if kind in ("vtu", "xdmf"):
         _check_prologue(path)
     if kind == "xdmf":
@@ -82,7 +82,7 @@ def check_foreign(path: Path) -> str:
         _check_numbers(path)
     if kind == "abaqus" and _INCLUDE.search(path.read_bytes()):
         raise ValueError(f"path: {path.name[:80]} includes another file; put all into one.")
-    if kind == "abaqus" and _GENERATED.search(path.read_bytes()):
+    if kind == "abaqus" and _GENERATED_SET.search(path.read_bytes()):
         raise ValueError(f"path: {path.name[:80]} has a set by its ends (GENERATE); write its members out.")
     if kind == "vtk":
         _check_counts(path)
@@ -99,15 +99,15 @@ def _check_numbers(path: Path) -> None:
             f"path: {path.name[:80]} is a binary file of Gmsh's format {version[:8].decode('ascii', 'replace')}; save "
             "it as text, or in version 2.2."
         )
-    numbers = [int(found[2][:20]) for found in _COUNTED.finditer(content)]
+    numbers = [int(found[2][:20]) for found in _MSH_COUNTS.finditer(content)]
     if binary == b"1":
-        for found in _COUNTED.finditer(content):
-            count = min(int(found[2][:20]), (len(content) - found.end()) // _NODE.itemsize)
+        for found in _MSH_COUNTS.finditer(content):
+            count = min(int(found[2][:20]), (len(content) - found.end()) // _MSH_NODE.itemsize)
             if found[1] == b"Nodes" and count:
-                numbers.append(int(np.frombuffer(content, _NODE, count, found.end())["number"].max()))
+                numbers.append(int(np.frombuffer(content, _MSH_NODE, count, found.end())["number"].max()))
     else:
-        numbers += [int(found[0][:20]) for found in _LONG.finditer(content)]
-    most = max(_LARGEST, len(content))
+        numbers += [int(found[0][:20]) for found in _LONG_INTEGER.finditer(content)]
+    most = max(_MAX_NODE_NUMBER, len(content))
     if max(numbers, default=0) > most:
         raise ValueError(
             f"path: {path.name[:80]} does not work as a mesh file: it counts to {max(numbers)}, and a file of its size "
@@ -128,8 +128,8 @@ def _check_counts(path: Path) -> None:
             )
 
 
-class _Begun(Exception):
-    """Raised to stop parsing at the first XML element."""
+class _FirstElement(Exception):
+    """Raised at the first XML element, to stop parsing there."""
 
 
 def _check_prologue(path: Path) -> None:
@@ -140,13 +140,13 @@ def _check_prologue(path: Path) -> None:
         raise ValueError(f"path: {path.name[:80]} has a document type (<!DOCTYPE), which mesh files have no use for.")
 
     def begun(*_: Any) -> None:
-        raise _Begun
+        raise _FirstElement
 
     parser.StartDoctypeDeclHandler, parser.StartElementHandler = declared, begun
     try:
         with path.open("rb") as file:
             parser.ParseFile(file)
-    except _Begun:
+    except _FirstElement:
         return
     except expat.ExpatError:
         return  # meshio reports the error
@@ -197,13 +197,13 @@ def bounded_inflation(path: Path) -> Iterator[None]:
             own.update(modules)
 
 
-_CELLS = {2: "triangle", 3: "tetra"}
-_FACETS = {2: "line", 3: "triangle"}
+_CELL_TYPES = {2: "triangle", 3: "tetra"}
+_FACET_TYPES = {2: "line", 3: "triangle"}
 # Formats that list triangles without connectivity, so that coincident nodes must be merged.
-_LOOSE = (".stl", ".obj")
+_UNCONNECTED = (".stl", ".obj")
 # Exceptions that meshio raises for invalid content, and maximum number of characters of their messages.
-_FAULTS = (LookupError, TypeError, AttributeError, ArithmeticError, MemoryError)
-_SAID = 80
+_READ_ERRORS = (LookupError, TypeError, AttributeError, ArithmeticError, MemoryError)
+_MAX_MESSAGE = 80
 
 
 def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh:
@@ -230,14 +230,14 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
     if not path.stat().st_size:
         raise ValueError(f"path: {path.name[:80]} does not work as a mesh file: it is empty.")
     kind = None if trusted else check_foreign(path)
-    if path.suffix.lower() in _LOOSE:
+    if path.suffix.lower() in _UNCONNECTED:
         points, cells = read_loose(path, path.name[:80])
         return _create_mesh(points * float(scale), cells, {})
     with bounded_inflation(path) if kind == "vtu" else nullcontext():
-        content = _quietly(path, lambda meshio: meshio.read(path, file_format=kind))
+        content = _call_meshio(path, lambda meshio: meshio.read(path, file_format=kind))
     try:
         return _from_meshio(content, float(scale), path.name[:80])
-    except _FAULTS as error:
+    except _READ_ERRORS as error:
         raise ValueError(f"path: {path.name[:80]} holds no mesh ({_short(error)}).") from None
 
 
@@ -258,11 +258,11 @@ def write(
     points = np.asarray(mesh.points, dtype=float)
     if mesh.space_dimension == 2:
         points = np.column_stack([points, np.zeros(len(points))])
-    cells = {name: _data("cell_data", name, value, mesh.num_cells) for name, value in (cell_data or {}).items()}
+    cells = {name: _check_data("cell_data", name, value, mesh.num_cells) for name, value in (cell_data or {}).items()}
     nodes: dict[str, ArrayLike] = {
-        name: _data("point_data", name, value, mesh.num_points) for name, value in (point_data or {}).items()
+        name: _check_data("point_data", name, value, mesh.num_points) for name, value in (point_data or {}).items()
     }
-    blocks: list[Any] = [(_CELLS[mesh.dimension], np.asarray(mesh.cells))]
+    blocks: list[Any] = [(_CELL_TYPES[mesh.dimension], np.asarray(mesh.cells))]
     data: dict[str, Any] = {name: [value] for name, value in cells.items()}
     field_data = {}
     options: dict[str, Any] = {}
@@ -277,19 +277,19 @@ def write(
         field_data["domain"] = np.array([1, mesh.dimension])
         for number, (tag, index) in enumerate(sorted(mesh.tags.items()), start=2):
             facets = np.asarray(mesh.facets)[np.asarray(index)]
-            blocks.append((_FACETS[mesh.dimension], facets))
+            blocks.append((_FACET_TYPES[mesh.dimension], facets))
             physical.append(np.full(len(facets), number))
             field_data[tag] = np.array([number, mesh.dimension - 1])
         data["gmsh:physical"] = physical
         data["gmsh:geometrical"] = physical
     try:
         content = {"point_data": dict(nodes), "cell_data": data, "field_data": field_data}
-        _quietly(path, lambda meshio: meshio.Mesh(points, blocks, **content).write(path, **options), writing=True)
+        _call_meshio(path, lambda meshio: meshio.Mesh(points, blocks, **content).write(path, **options), writing=True)
     except OSError as error:
         raise ValueError(f"path: {path} cannot be written: {error.strerror}. Is there such a folder?") from None
 
 
-def _data(argument: str, name: str, value: ArrayLike, length: int) -> np.ndarray:
+def _check_data(argument: str, name: str, value: ArrayLike, length: int) -> np.ndarray:
     array = np.asarray(value)
     if array.ndim < 1 or len(array) != length:
         what = "cell" if argument == "cell_data" else "node"
@@ -299,8 +299,9 @@ def _data(argument: str, name: str, value: ArrayLike, length: int) -> np.ndarray
     return array
 
 
-def _quietly(path: Path, action: Any, *, writing: bool = False) -> Any:
-    """Call `action` with meshio: raise `ValueError` where meshio prints a message or exits the interpreter."""
+def _call_meshio(path: Path, action: Any, *, writing: bool = False) -> Any:
+    """Call `action`, a function of meshio, and raise `ValueError` where meshio prints a message or exits the
+    interpreter."""
     import meshio  # takes a tenth of a second
 
     said = io.StringIO()
@@ -325,7 +326,7 @@ def _quietly(path: Path, action: Any, *, writing: bool = False) -> Any:
 def _short(error: BaseException | str) -> str:
     """Shorten a message to one line."""
     said = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return said if len(said) <= _SAID else f"{said[: _SAID - 1]}…"
+    return said if len(said) <= _MAX_MESSAGE else f"{said[: _MAX_MESSAGE - 1]}…"
 
 
 def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
@@ -333,7 +334,7 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
     dimension = 3 if "tetra" in kinds else 2
     if not kinds:
         raise ValueError(f"path: {source} does not work as a mesh file: there are no cells in it.")
-    if _CELLS[dimension] not in kinds:
+    if _CELL_TYPES[dimension] not in kinds:
         raise ValueError(
             f"path: {source} holds cells of type {sorted(kinds)}, but jeit needs linear triangles or tetrahedra. "
             "Save it with elements of order 1 and without quadrilaterals or hexahedra."
@@ -341,7 +342,7 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
     if mixed := kinds & ({"quad"} if dimension == 2 else {"hexahedron", "wedge", "pyramid"}):
         raise ValueError(f"path: {source} mixes in cells of type {sorted(mixed)}. Split them into simplices first.")
     points = np.asarray(content.points, dtype=float) * scale
-    cells = np.concatenate([block.data for block in content.cells if block.type == _CELLS[dimension]])
+    cells = np.concatenate([block.data for block in content.cells if block.type == _CELL_TYPES[dimension]])
     used, inverse = np.unique(cells, return_inverse=True)
     cells = inverse.reshape(cells.shape)
     points = points[used]
@@ -351,7 +352,7 @@ def _from_meshio(content: meshio.Mesh, scale: float, source: str) -> Mesh:
     keys, occurrences = np.unique(topology.facet_keys(topology.cell_facets(cells), len(used)), return_counts=True)
     boundary = keys[occurrences == 1]
     tags = {}
-    for name, facets in _groups(content, _FACETS[dimension]).items():
+    for name, facets in _facet_groups(content, _FACET_TYPES[dimension]).items():
         nodes = number[facets]
         nodes = nodes[(nodes >= 0).all(axis=1)]
         nodes = nodes[np.isin(topology.facet_keys(nodes, len(used)), boundary)]
@@ -367,14 +368,14 @@ def _create_mesh(points: np.ndarray, cells: np.ndarray, tags: Mapping[str, Array
     return Mesh.create(points, cells, tags=tags)
 
 
-def _groups(content: meshio.Mesh, kind: str) -> dict[str, np.ndarray]:
+def _facet_groups(content: meshio.Mesh, facet_type: str) -> dict[str, np.ndarray]:
     """Facets (t, d) of each named group in the file."""
     found: dict[str, list[np.ndarray]] = {}
-    order = 2 if kind == "triangle" else 1
+    order = 2 if facet_type == "triangle" else 1
     names = {int(value[0]): name for name, value in content.field_data.items() if int(value[1]) == order}
     physical = content.cell_data.get("gmsh:physical", [])
     for block, numbers in zip(content.cells, physical, strict=False):
-        if block.type != kind:
+        if block.type != facet_type:
             continue
         for value in np.unique(numbers):
             if value > 0:
@@ -383,6 +384,6 @@ def _groups(content: meshio.Mesh, kind: str) -> dict[str, np.ndarray]:
     if not found:
         for name, members in content.cell_sets.items():
             for block, chosen in zip(content.cells, members, strict=False):
-                if block.type == kind and np.size(chosen) and not name.startswith("gmsh:"):
+                if block.type == facet_type and np.size(chosen) and not name.startswith("gmsh:"):
                     found.setdefault(name, []).append(block.data[np.asarray(chosen)])
     return {name: np.concatenate(facets) for name, facets in found.items()}

@@ -17,7 +17,7 @@ from jeit.mesh.outline import Domain
 CAD = (".step", ".stp", ".iges", ".igs", ".brep")
 """File name extensions of CAD geometry without a mesh."""
 # File name extensions that Gmsh always reads as geometry; it treats files with other extensions as scripts.
-_PLAIN = (*CAD, ".stl")
+_GEOMETRY_FORMATS = (*CAD, ".stl")
 
 
 def from_gmsh(
@@ -40,10 +40,10 @@ def from_gmsh(
     Raises `ImportError` if the gmsh package or a system library that it needs is missing, `FileNotFoundError` if the
     file does not exist, and `ValueError` if Gmsh rejects the geometry, and for scripts unless `scripts` is True.
     """
-    if isinstance(source, (str, Path)) and not scripts and Path(source).suffix.lower() not in _PLAIN:
+    if isinstance(source, (str, Path)) and not scripts and Path(source).suffix.lower() not in _GEOMETRY_FORMATS:
         raise ValueError(
             f"source: {Path(source).name[:80]} may be a script of Gmsh's, which can run any command. Give a file of "
-            f"{', '.join(_PLAIN)}; or scripts=True, where it is your own."
+            f"{', '.join(_GEOMETRY_FORMATS)}; or scripts=True, where it is your own."
         )
     gmsh = optional(
         "gmsh",
@@ -75,7 +75,7 @@ def from_gmsh(
                 # of its own.
                 name = Path(source).name
                 source = shutil.copy(str(source), Path(folder) / f"geometry{Path(source).suffix.lower()}")
-            _write(gmsh, source, cell_size, dimension, path, name)
+            _mesh_with_gmsh(gmsh, source, cell_size, dimension, path, name)
             return read(path, scale=scale)
     finally:
         gmsh.option.setNumber("General.Terminal", quiet)
@@ -83,7 +83,7 @@ def from_gmsh(
             gmsh.finalize()
 
 
-def _write(
+def _mesh_with_gmsh(
     gmsh: ModuleType,
     source: str | Path | Domain | None,
     cell_size: float | None,
@@ -97,7 +97,7 @@ def _write(
             gmsh.open(str(source))
         elif source is not None:
             gmsh.model.add("jeit")
-            _draw(gmsh, source)
+            _draw_outline(gmsh, source)
         if cell_size is not None:
             gmsh.option.setNumber("Mesh.MeshSizeMax", cell_size)
         dimension = dimension or max(gmsh.model.getDimension(), 2)
@@ -119,7 +119,7 @@ def _write(
         raise ValueError(f"source: Gmsh could not mesh the geometry: {said}.") from error
 
 
-class _Kernel:
+class _GmshPen:
     """Pen that draws into Gmsh's geometry kernel: each stroke becomes a curve loop."""
 
     def __init__(self, gmsh: ModuleType):
@@ -135,10 +135,10 @@ class _Kernel:
         self.loops.append(self.shape.addCurveLoop(sides))
 
 
-def _draw(gmsh: ModuleType, domain: Domain) -> None:
+def _draw_outline(gmsh: ModuleType, domain: Domain) -> None:
     if not isinstance(domain, Domain):
         raise ValueError(f"source: expected a file, an outline or None, got {type(domain).__name__}")
-    kernel = _Kernel(gmsh)
+    kernel = _GmshPen(gmsh)
     domain.draw(kernel)
     kernel.shape.addPlaneSurface(kernel.loops)
     kernel.shape.synchronize()

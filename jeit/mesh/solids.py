@@ -131,7 +131,7 @@ def stacked_wall(edges: np.ndarray, count: int, num_layers: int) -> np.ndarray:
 
 
 # In a solid, 'bottom' and 'top' are the horizontal faces, so the sides of a rectangle with these names are renamed.
-_RENAMED = {"bottom": "front", "top": "back"}
+_RENAMED_TAGS = {"bottom": "front", "top": "back"}
 
 
 def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLike | None = None) -> Mesh:
@@ -153,7 +153,7 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
     if mesh.dimension != 2:
         raise ValueError("mesh: a layer is made from a plane (2-D) mesh, this one is 3-D.")
     thickness = check_length("thickness", thickness)
-    levels = _levels(thickness, num_layers, heights)
+    levels = _check_heights(thickness, num_layers, heights)
     num_layers = len(levels) - 1
     plane, cells, facets = np.asarray(mesh.points), np.asarray(mesh.cells), np.asarray(mesh.facets)
     count = len(plane)
@@ -167,7 +167,7 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
 
     tags: dict[str, ArrayLike] = {"bottom": cells, "top": cells + num_layers * count, "side": side(facets)}
     for name, index in mesh.tags.items():
-        new = _RENAMED.get(name, name)
+        new = _RENAMED_TAGS.get(name, name)
         if new in tags:
             raise ValueError(f"mesh: its tag {name!r} would be called {new!r} in the layer, which is taken. Rename it.")
         tags[new] = side(facets[np.asarray(index)])
@@ -175,7 +175,7 @@ def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLi
         return Mesh.create(points, solid, tags=tags)
 
 
-def _levels(thickness: float, num_layers: int, heights: ArrayLike | None) -> np.ndarray:
+def _check_heights(thickness: float, num_layers: int, heights: ArrayLike | None) -> np.ndarray:
     """Heights of the nodes, lowest first."""
     if heights is None:
         return np.linspace(0.0, thickness, unstructured.check_count("num_layers", num_layers, 1) + 1)

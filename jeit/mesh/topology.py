@@ -115,7 +115,7 @@ def signed_area(outline: np.ndarray) -> float:
 
 
 # Maximum number of pairs of sides that are compared at once.
-_PAIRS = 250_000
+_PAIRS_PER_BATCH = 250_000
 
 
 def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray:
@@ -150,10 +150,10 @@ def check_loop(vertices: ArrayLike, name: str, *, clockwise: bool) -> np.ndarray
 def check_apart(outer: np.ndarray, holes: Sequence[np.ndarray]) -> None:
     """Raise `ValueError` unless every hole lies inside the outline and separate from the others."""
     for k, hole in enumerate(holes):
-        if not inside(hole, [outer]).all() or _touching(hole, outer):
+        if not inside(hole, [outer]).all() or _touches(hole, outer):
             raise ValueError(f"holes[{k}]: does not lie strictly inside the outline. Move or shrink it.")
         for j, other in enumerate(holes[:k]):
-            if _touching(hole, other) or inside(hole[:1], [other])[0] or inside(other[:1], [hole])[0]:
+            if _touches(hole, other) or inside(hole[:1], [other])[0] or inside(other[:1], [hole])[0]:
                 raise ValueError(f"holes[{k}]: overlaps or touches holes[{j}]. Merge them into one hole.")
 
 
@@ -188,34 +188,36 @@ def distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarr
     return np.linalg.norm(offset - fraction[..., None] * along, axis=-1)
 
 
-def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+def _signed_area_of_corner(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
 
 
-def _meeting(first: np.ndarray, second: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
+def _intersecting_sides(first: np.ndarray, second: np.ndarray, tolerance: float) -> Iterator[np.ndarray]:
     """Yield, in order and in batches, pairs (p, 2) of a side of the first loop and a side of the second that cross or
     come within `tolerance` of each other. Only sides whose bounding boxes overlap are tested."""
     a, b, c, d = first, np.roll(first, -1, axis=0), second, np.roll(second, -1, axis=0)
     low, high = np.minimum(a, b) - tolerance, np.maximum(a, b) + tolerance
     other_low, other_high = np.minimum(c, d), np.maximum(c, d)
-    rows = max(1, _PAIRS // len(second))
+    rows = max(1, _PAIRS_PER_BATCH // len(second))
     for start in range(0, len(first), rows):
         block = slice(start, start + rows)
         near = ((low[block, None] <= other_high) & (other_low <= high[block, None])).all(axis=-1)
         one, other = np.nonzero(near)
         one += start
-        yield np.column_stack([one, other])[_meet(a[one], b[one], c[other], d[other], tolerance)]
+        yield np.column_stack([one, other])[_intersects(a[one], b[one], c[other], d[other], tolerance)]
 
 
-def _meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, tolerance: float) -> np.ndarray:
+def _intersects(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, tolerance: float) -> np.ndarray:
     """Whether each segment from a to b crosses the segment from c to d or comes within `tolerance` of it; all (p,
     2)."""
-    crosses = (_turn(a, b, c) * _turn(a, b, d) < 0) & (_turn(c, d, a) * _turn(c, d, b) < 0)
-    near = (_apart(a, c, d) <= tolerance) | (_apart(b, c, d) <= tolerance)
-    return crosses | near | (_apart(c, a, b) <= tolerance) | (_apart(d, a, b) <= tolerance)
+    crosses = (_signed_area_of_corner(a, b, c) * _signed_area_of_corner(a, b, d) < 0) & (
+        _signed_area_of_corner(c, d, a) * _signed_area_of_corner(c, d, b) < 0
+    )
+    near = (_segment_distance(a, c, d) <= tolerance) | (_segment_distance(b, c, d) <= tolerance)
+    return crosses | near | (_segment_distance(c, a, b) <= tolerance) | (_segment_distance(d, a, b) <= tolerance)
 
 
-def _apart(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _segment_distance(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """Distance (p,) of each of points (p, 2) from the segment of the same index."""
     along, offset = end - start, points - start
     fraction = np.clip((offset * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
@@ -224,7 +226,7 @@ def _apart(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray
 
 def _first_crossing(loop: np.ndarray) -> tuple[int, int] | None:
     count = len(loop)
-    for pairs in _meeting(loop, loop, 1e-9 * np.ptp(loop, axis=0).max()):
+    for pairs in _intersecting_sides(loop, loop, 1e-9 * np.ptp(loop, axis=0).max()):
         apart = np.abs(pairs[:, 0] - pairs[:, 1])
         others = pairs[(apart > 1) & (apart < count - 1)]
         if len(others):
@@ -239,5 +241,5 @@ def _first_crossing(loop: np.ndarray) -> tuple[int, int] | None:
     return None
 
 
-def _touching(first: np.ndarray, second: np.ndarray) -> bool:
-    return any(len(pairs) for pairs in _meeting(first, second, 1e-9 * np.ptp(second, axis=0).max()))
+def _touches(first: np.ndarray, second: np.ndarray) -> bool:
+    return any(len(pairs) for pairs in _intersecting_sides(first, second, 1e-9 * np.ptp(second, axis=0).max()))

@@ -35,10 +35,10 @@ def axes_or_new(ax: Axes | None, size: tuple[float, float] = (6.4, 5.6)) -> Axes
 
 
 # Distance of numbers from a body, and width of a digit in a small picture, divided by the size of the body.
-_AWAY, _LETTER = 0.04, 0.021
+_BAR_DISTANCE, _LETTER = 0.04, 0.021
 
 
-def bare(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
+def hide_axes(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool = True) -> None:
     """Set equal scales, and remove frame and ticks. Around the `extent` (metres), space is left for a scale bar and, if
     electrodes are `numbered`, for their numbers, as much as the longest text beside the body needs."""
     x_min, x_max, y_min, y_max = extent
@@ -49,7 +49,7 @@ def bare(ax: Axes, extent: tuple[float, float, float, float], *, numbered: bool 
         for one in ax.texts
         if one.get_horizontalalignment() != "center" and not x_min <= one.get_position()[0] <= x_max
     ]
-    across = max([room, *((_AWAY + _LETTER * len(one.get_text())) * size for one in begun)])
+    across = max([room, *((_BAR_DISTANCE + _LETTER * len(one.get_text())) * size for one in begun)])
     ax.set_aspect("equal")
     ax.set_xlim(x_min - across, x_max + across)
     ax.set_ylim(y_min - 0.18 * size, y_max + (room if numbered else 0.03 * size))
@@ -96,12 +96,14 @@ def draw_scale_bar(ax: Axes, extent: tuple[float, float, float, float]) -> None:
 
 
 def draw_colour_bar(
-    ax: Axes, drawn: ScalarMappable, label: str, *, signed: bool = False, place: Axes | None = None
+    ax: Axes, mappable: ScalarMappable, label: str, *, signed: bool = False, position: Axes | None = None
 ) -> None:
-    """Draw a slim colour bar at the right of `ax`, or on the axes `place`; `signed`: whether tick labels have a sign,
-    for differences."""
-    where: dict[str, Any] = {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if place is None else {"cax": place}
-    bar = ax.figure.colorbar(drawn, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **where)
+    """Draw a slim colour bar at the right of `ax`, or on the axes `position`; `signed`: whether tick labels have a
+    sign, for differences."""
+    where: dict[str, Any] = (
+        {"ax": ax, "shrink": 0.72, "aspect": 28, "pad": 0.02} if position is None else {"cax": position}
+    )
+    bar = ax.figure.colorbar(mappable, ticks=MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]), **where)
     if signed:
         bar.ax.yaxis.set_major_formatter(
             lambda value, _: "0" if abs(value) < 1e-12 else f"{value:+g}".replace("-", "−")
@@ -111,7 +113,7 @@ def draw_colour_bar(
     bar.ax.tick_params(length=2, color=SOFT, labelcolor=INK)
 
 
-def prefixed(largest: float, unit: str) -> tuple[float, str]:
+def with_si_prefix(largest: float, unit: str) -> tuple[float, str]:
     """Choose the SI prefix for values up to `largest`; return the factor to multiply values with, and the unit with its
     prefix, such as (1e3, "mS")."""
     if not unit or unit == "%" or not (math.isfinite(largest) and largest > 0):
@@ -163,7 +165,7 @@ class ColourScale(eqx.Module):
         largest = float(np.abs(values).max()) if self.limit is None else float(self.limit)
         if not np.isfinite(largest):
             raise ValueError("values must be finite to be drawn.")
-        factor, with_prefix = prefixed(largest, unit)
+        factor, with_prefix = with_si_prefix(largest, unit)
         high = factor * largest or 1.0
         if self.difference:
             low = -high

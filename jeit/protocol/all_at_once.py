@@ -129,7 +129,7 @@ def from_channels(
     return Protocol(drive, rows[first[appearance]], index, rank[inverse.ravel()], name)
 
 
-def _as_matrix(values: Any, what: str) -> np.ndarray:
+def _as_matrix(values: Any, pattern_kind: str) -> np.ndarray:
     if not has_values(values):
         return values
     if hasattr(values, "toarray"):  # a scipy.sparse matrix, as loadmat returns EIDORS patterns
@@ -137,19 +137,19 @@ def _as_matrix(values: Any, what: str) -> np.ndarray:
     matrix = np.asarray(values)
     if matrix.ndim != 2 or matrix.dtype.kind not in "fiu":
         raise ValueError(
-            f"Protocol: {what} patterns must be a matrix of real numbers, one row per pattern; got shape "
+            f"Protocol: {pattern_kind} patterns must be a matrix of real numbers, one row per pattern; got shape "
             f"{matrix.shape} of {matrix.dtype}."
         )
     return matrix.astype(float)
 
 
-def _check_currents(drive, where: str) -> None:
+def _check_currents(drive, function_name: str) -> None:
     if has_values(drive) and drive.size and np.all(np.isfinite(drive)):
-        check_amplitude(float(np.max(np.abs(drive))), where)
+        check_amplitude(float(np.max(np.abs(drive))), function_name)
 
 
 # Drive patterns whose distinguishability, relative to the maximum, is below this value are due to rounding.
-_NOTHING = 1e-12
+_MIN_DISTINGUISHABILITY = 1e-12
 
 
 def trigonometric(
@@ -175,7 +175,7 @@ def trigonometric(
     waves = [wave(k * angle) for k in range(1, count // 2 + 1) for wave in (np.cos, np.sin)]
     drive = np.array(waves[: count - 1])
     drive -= drive.mean(axis=1, keepdims=True)  # removes rounding errors that violate Kirchhoff's law
-    return _read_everywhere("trigonometric", drive, measurement, reference, current)
+    return _all_combinations("trigonometric", drive, measurement, reference, current)
 
 
 def haar(
@@ -207,7 +207,7 @@ def haar(
         drives.append(pattern / len(first))  # the first half is at least as large as the second
         parts += [half for half in (first, second) if len(half) > 1]
     drive = np.array(drives)
-    return _read_everywhere("haar", drive / np.abs(drive).max(axis=1, keepdims=True), measurement, reference, current)
+    return _all_combinations("haar", drive / np.abs(drive).max(axis=1, keepdims=True), measurement, reference, current)
 
 
 def optimal(
@@ -250,25 +250,25 @@ def optimal(
                 f"other: its shape is {second.shape}, and that of transfer {first.shape}; give one body's."
             )
         change = dissipated - basis.T @ second @ basis
-    if np.linalg.norm(change) <= _NOTHING * np.linalg.norm(dissipated):
+    if np.linalg.norm(change) <= _MIN_DISTINGUISHABILITY * np.linalg.norm(dissipated):
         raise ValueError("other: it equals transfer, and no current distinguishes them.")
     if power is None:
-        values, directions = _largest_first(np.linalg.eigh(change @ change))
+        values, directions = _sort_descending(np.linalg.eigh(change @ change))
     else:
-        directions, values = _for_power(dissipated, change, power, other is None)
-    keep = values > _NOTHING * values[0]
+        directions, values = _drives_for_power(dissipated, change, power, other is None)
+    keep = values > _MIN_DISTINGUISHABILITY * values[0]
     drive = (basis @ directions[:, keep][:, :most]).T
     # The sign of an eigenvector is arbitrary: make its largest component positive.
     drive *= np.sign(drive[np.arange(len(drive)), np.abs(drive).argmax(axis=1)])[:, None]
     if power is None:
         drive /= np.abs(drive).max(axis=1, keepdims=True)
-        return _read_everywhere("optimal", drive, measurement, reference, current)
+        return _all_combinations("optimal", drive, measurement, reference, current)
     drive *= np.sqrt(power / np.einsum("si,ij,sj->s", drive, first, drive))[:, None]
     check_amplitude(float(np.abs(drive).max()), "optimal: power")
-    return _read_everywhere("optimal for a given power", drive, measurement, reference, 1.0)
+    return _all_combinations("optimal for a given power", drive, measurement, reference, 1.0)
 
 
-def _for_power(dissipated, change, power: float, alone: bool) -> tuple[np.ndarray, np.ndarray]:
+def _drives_for_power(dissipated, change, power: float, alone: bool) -> tuple[np.ndarray, np.ndarray]:
     """Drive directions for a given power and their squared distinguishabilities, best first."""
     if alone:
         raise ValueError("power needs other: with one body alone the currents for a given power are those of no power.")
@@ -277,18 +277,18 @@ def _for_power(dissipated, change, power: float, alone: bool) -> tuple[np.ndarra
     symmetric = (dissipated + dissipated.T) / 2
     if np.linalg.eigvalsh(symmetric)[0] <= 0:
         raise ValueError("transfer: some currents dissipate no power in it; is it the transfer impedance of a body?")
-    values, directions = _largest_first(scipy.linalg.eigh(change @ change, symmetric))
+    values, directions = _sort_descending(scipy.linalg.eigh(change @ change, symmetric))
     return directions, values
 
 
-def _largest_first(found) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and eigenvectors, largest first."""
-    values, vectors = found
+def _sort_descending(eigenpairs) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and eigenvectors, sorted by eigenvalue with the largest first."""
+    values, vectors = eigenpairs
     return values[::-1], vectors[:, ::-1]
 
 
-def _check_transfer(name: str, given: ArrayLike) -> np.ndarray:
-    matrix = np.asarray(given)
+def _check_transfer(name: str, transfer: ArrayLike) -> np.ndarray:
+    matrix = np.asarray(transfer)
     if matrix.ndim == 3 and matrix.shape[1] == matrix.shape[2]:
         raise ValueError(
             f"{name} has shape {matrix.shape}, of {counted(len(matrix), 'frame')}; give one, (L, L): {name}[0] of the "
@@ -304,8 +304,8 @@ def _check_transfer(name: str, given: ArrayLike) -> np.ndarray:
     return (matrix + matrix.T) / 2
 
 
-def _read_everywhere(kind: str, drive, measurement: Reading, reference: int | None, current: Current) -> Protocol:
+def _all_combinations(name: str, drive, measurement: Reading, reference: int | None, current: Current) -> Protocol:
     """Protocol that combines every drive with every measurement pattern."""
-    check_current(current, kind)
+    check_current(current, name)
     rows = measurement_patterns(drive.shape[1], measurement, reference)
-    return from_matrices(current * drive, rows, name=f"{kind}, {measurement} measurement, {drive.shape[1]} electrodes")
+    return from_matrices(current * drive, rows, name=f"{name}, {measurement} measurement, {drive.shape[1]} electrodes")

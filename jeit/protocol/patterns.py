@@ -39,10 +39,10 @@ def pair_patterns(pairs: np.ndarray, num_electrodes: int) -> np.ndarray:
     return patterns
 
 
-def ring_pairs(count: int, step: int) -> np.ndarray:
-    """Pairs (L, 2) of every electrode of a ring with the electrode `step` positions further."""
-    start = np.arange(count)
-    return np.stack([start, (start + step) % count], axis=1)
+def ring_pairs(num_electrodes: int, offset: int) -> np.ndarray:
+    """Pairs (L, 2) of every electrode of a ring with the electrode `offset` positions further."""
+    start = np.arange(num_electrodes)
+    return np.stack([start, (start + offset) % num_electrodes], axis=1)
 
 
 @dataclass(frozen=True)

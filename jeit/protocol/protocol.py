@@ -15,11 +15,11 @@ from jeit.protocol.reciprocity import reciprocal_channel_pairs
 from jeit_solvers.engines import as_array, either_engine, has_values
 
 
-def check_patterns(patterns, what: str) -> None:
+def check_patterns(patterns, pattern_kind: str) -> None:
     """Raise `ValueError` unless patterns (rows, L) are finite, no row is zero, and every row sums to zero."""
     if patterns.ndim != 2 or patterns.shape[0] == 0 or patterns.shape[1] < 2:
         raise ValueError(
-            f"Protocol: {what} patterns have shape {tuple(patterns.shape)}. Give a matrix with one row per "
+            f"Protocol: {pattern_kind} patterns have shape {tuple(patterns.shape)}. Give a matrix with one row per "
             "pattern and one column per electrode, at least 1 x 2."
         )
     if not has_values(patterns):
@@ -28,14 +28,14 @@ def check_patterns(patterns, what: str) -> None:
     bad = np.flatnonzero(~np.all(np.isfinite(values), axis=1))
     if bad.size:
         raise ValueError(
-            f"Protocol: {what} pattern {bad[0]} contains NaN or infinity. Leave missing electrodes out of "
+            f"Protocol: {pattern_kind} pattern {bad[0]} contains NaN or infinity. Leave missing electrodes out of "
             "the patterns with 0, and mask their channels."
         )
     size = np.max(np.abs(values), axis=1)
     bad = np.flatnonzero(size == 0)
     if bad.size:
         raise ValueError(
-            f"Protocol: {what} pattern {bad[0]} is all zero: it drives or measures nothing. Remove it "
+            f"Protocol: {pattern_kind} pattern {bad[0]} is all zero: it drives or measures nothing. Remove it "
             f"({bad.size} such rows)."
         )
     total = np.abs(values.sum(axis=1)) / size
@@ -43,17 +43,17 @@ def check_patterns(patterns, what: str) -> None:
     if bad.size:
         reason = (
             "current that goes in must come out"
-            if what == "drive"
+            if pattern_kind == "drive"
             else "only differences of potential can be measured; subtract a reference electrode"
         )
         raise ValueError(
-            f"Protocol: {what} pattern {bad[0]} sums to {values[bad[0]].sum():.6g}, not to zero ({reason}). "
+            f"Protocol: {pattern_kind} pattern {bad[0]} sums to {values[bad[0]].sum():.6g}, not to zero ({reason}). "
             "If the matrix has one row per electrode, transpose it."
         )
 
 
-def check_indices(index, size: int, name: str, of: str) -> None:
-    """Raise `ValueError` unless indices (M,) are 0-based integers into `size` patterns."""
+def check_indices(index, num_patterns: int, name: str, pattern_kind: str) -> None:
+    """Raise `ValueError` unless indices (M,) are 0-based integers into `num_patterns` patterns."""
     if index.ndim != 1 or index.shape[0] == 0:
         raise ValueError(
             f"Protocol: {name} has shape {tuple(index.shape)}; give one integer per channel, at least one."
@@ -61,39 +61,46 @@ def check_indices(index, size: int, name: str, of: str) -> None:
     if not has_values(index):
         return
     values = np.asarray(index)
-    if values.min() < 0 or values.max() >= size:
+    if values.min() < 0 or values.max() >= num_patterns:
         raise ValueError(
-            f"Protocol: {name} runs from {values.min()} to {values.max()}, but there are {size} {of} "
-            f"patterns, numbered 0 to {size - 1}. Indices are 0-based: subtract 1 from MATLAB's."
+            f"Protocol: {name} runs from {values.min()} to {values.max()}, but there are {num_patterns} {pattern_kind} "
+            f"patterns, numbered 0 to {num_patterns - 1}. Indices are 0-based: subtract 1 from MATLAB's."
         )
 
 
-def check_current(current, where: str) -> None:
+def check_current(current, function_name: str) -> None:
     """Raise `ValueError` unless an amplitude in amperes is positive and at most 1 A, above which it is probably in
     milliamperes."""
     if not has_values(current):
         return
     value = np.asarray(current)
     if value.ndim != 0 or value.dtype.kind not in "fiu" or not np.isfinite(value) or value <= 0:
-        raise ValueError(f"{where}: current must be one positive, finite number in amperes; got {current!r}.")
-    check_amplitude(float(value), where)
+        raise ValueError(f"{function_name}: current must be one positive, finite number in amperes; got {current!r}.")
+    check_amplitude(float(value), function_name)
 
 
-def check_amplitude(value: float, where: str) -> None:
+def check_amplitude(value: float, function_name: str) -> None:
     """Raise `ValueError` for a current above one ampere, which is probably in milliamperes or microamperes."""
     if value > 1.0 + 1e-9:
         raise ValueError(
-            f"{where}: a current of {value:.6g} A is far above what a tank or a skin carries. Currents are "
+            f"{function_name}: a current of {value:.6g} A is far above what a tank or a skin carries. Currents are "
             f"in amperes: if you meant {value:.6g} mA, write {value:.6g}e-3 (microamperes: {value:.6g}e-6); "
             "1.0 is accepted as a unit current."
         )
 
 
-def check_count(number, where: str, least: int) -> int:
-    """Return the number of electrodes. Raises `ValueError` unless it is an integer of at least `least`."""
-    if isinstance(number, bool) or not isinstance(number, (int, np.integer)) or number < least:
-        raise ValueError(f"{where}: the number of electrodes must be an integer of at least {least}; got {number!r}.")
-    return int(number)
+def check_count(num_electrodes, function_name: str, minimum: int) -> int:
+    """Return the number of electrodes. Raises `ValueError` unless it is an integer of at least `minimum`."""
+    if (
+        isinstance(num_electrodes, bool)
+        or not isinstance(num_electrodes, (int, np.integer))
+        or num_electrodes < minimum
+    ):
+        raise ValueError(
+            f"{function_name}: the number of electrodes must be an integer of at least {minimum}; got "
+            f"{num_electrodes!r}."
+        )
+    return int(num_electrodes)
 
 
 def electrode_indices(electrodes, num_electrodes: int) -> np.ndarray:
@@ -109,28 +116,32 @@ def electrode_indices(electrodes, num_electrodes: int) -> np.ndarray:
     return values
 
 
-def check_pairs(pairs, num_electrodes: int, what: str) -> np.ndarray:
+def check_pairs(pairs, num_electrodes: int, argument_name: str) -> np.ndarray:
     """Return electrode pairs (P, 2), 0-based. Raises `ValueError` for other arrays, electrodes that do not exist, and
     an electrode paired with itself."""
     values = np.asarray(pairs)
     if values.ndim != 2 or values.shape[1] != 2 or values.shape[0] == 0 or values.dtype.kind not in "iu":
         raise ValueError(
-            f"{what}: give pairs of electrodes as integers of shape (P, 2); got shape {values.shape} of {values.dtype}."
+            f"{argument_name}: give pairs of electrodes as integers of shape (P, 2); got shape {values.shape} of "
+            f"{values.dtype}."
         )
     electrode_indices(values.ravel(), num_electrodes)
     same = np.flatnonzero(values[:, 0] == values[:, 1])
     if same.size:
         raise ValueError(
-            f"{what}: pair {same[0]} is electrode {values[same[0], 0]} with itself. Use two different electrodes."
+            f"{argument_name}: pair {same[0]} is electrode {values[same[0], 0]} with itself. Use two different "
+            "electrodes."
         )
     return values
 
 
-def check_choice(value, choices: tuple[str, ...], where: str, name: str) -> None:
+def check_choice(value, choices: tuple[str, ...], function_name: str, name: str) -> None:
     """Raise `ValueError` unless the value of the argument `name` is one of `choices`."""
     if value not in choices:
         meant = did_you_mean(value, choices)
-        raise ValueError(f"{where}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}{meant}.")
+        raise ValueError(
+            f"{function_name}: {name} must be one of {', '.join(map(repr, choices))}; got {value!r}{meant}."
+        )
 
 
 def _as_float(values) -> Array:
@@ -323,11 +334,15 @@ class Protocol(eqx.Module):
         return (
             self.num_electrodes == other.num_electrodes
             and self.num_measurements == other.num_measurements
-            and bool(np.allclose(_rows(self.drive, self.drive_index), _rows(other.drive, other.drive_index), 1e-9, 0))
             and bool(
                 np.allclose(
-                    _rows(self.measurement, self.measurement_index),
-                    _rows(other.measurement, other.measurement_index),
+                    _pattern_rows(self.drive, self.drive_index), _pattern_rows(other.drive, other.drive_index), 1e-9, 0
+                )
+            )
+            and bool(
+                np.allclose(
+                    _pattern_rows(self.measurement, self.measurement_index),
+                    _pattern_rows(other.measurement, other.measurement_index),
                     rtol=1e-9,
                     atol=0,
                 )
@@ -335,7 +350,7 @@ class Protocol(eqx.Module):
         )
 
 
-def _rows(patterns, index) -> np.ndarray:
+def _pattern_rows(patterns, index) -> np.ndarray:
     """Pattern of each channel, with NumPy, because JAX would compile the indexing."""
     return np.asarray(patterns)[np.asarray(index)]
 

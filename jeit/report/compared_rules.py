@@ -16,10 +16,17 @@ from jeit.imaging import imaging_mesh
 from jeit.imaging.compared_rules import ComparedRules, RuleOutcome
 from jeit.imaging.wiring import MOST_MISFIT, find_wiring
 from jeit.mesh import Mesh
-from jeit.report.folder import describe_domain, describe_electrodes, describe_measurement, plain, results, write_json
+from jeit.report.folder import (
+    as_plain_values,
+    describe_domain,
+    describe_electrodes,
+    describe_measurement,
+    results,
+    write_json,
+)
 
 # Number of mesh nodes for the comparison of wirings.
-_NODES = 1000
+_MAX_MESH_NODES = 1000
 
 
 def report_measurement(measurement: Measurement) -> dict[str, Any]:
@@ -43,7 +50,7 @@ def report_measurement(measurement: Measurement) -> dict[str, Any]:
         "impossible_signs": None if signs is None else float(signs.max()),
         "wiring": _wiring(measurement),
     }
-    return plain(content)
+    return as_plain_values(content)
 
 
 def _wiring(measurement: Measurement) -> str | None:
@@ -53,7 +60,9 @@ def _wiring(measurement: Measurement) -> str | None:
     if domain is None or electrodes is None:
         return None
     _, reference = measurement.split_reference() if "reference" in measurement.frame_names else (None, measurement)
-    model = ForwardModel(imaging_mesh(domain, electrodes, None, usual=_NODES), electrodes, measurement.protocol)
+    model = ForwardModel(
+        imaging_mesh(domain, electrodes, None, usual=_MAX_MESH_NODES), electrodes, measurement.protocol
+    )
     found, broken = find_wiring(model, reference), reciprocity_error(reference)
     if broken is not None and broken > MOST_DIFFERENCE_RECIPROCITY_ERROR and not found.explanation:
         return (
@@ -68,7 +77,7 @@ def _wiring(measurement: Measurement) -> str | None:
 
 
 # Maximum number of inclusions marked in one image, so that the marks do not overlap.
-_MOST_MARKED = 8
+_MAX_MARKED = 8
 
 
 def write_choice(result: ComparedRules, folder: str | Path) -> None:
@@ -101,13 +110,13 @@ def draw_choice(result: ComparedRules):
 
 def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
     """Draw the image of one rule on its own colour scale, with inclusions marked unless there are more than
-    `_MOST_MARKED`."""
+    `_MAX_MARKED`."""
     from jeit.plot import ColourScale, plot_image
     from jeit.plot.axes import INK
     from jeit.plot.imaging.hyperparameter import COLOURS
 
     number = len(outcome.inclusions)
-    marked = outcome.inclusions if number <= _MOST_MARKED else ()
+    marked = outcome.inclusions if number <= _MAX_MARKED else ()
     plot_image(mesh, outcome.change, inclusions=marked, scale=ColourScale(bar=False), ax=ax)
     _draw_scale(ax, float(jnp.abs(outcome.change).max()), "S" if mesh.dimension == 2 else "S/m")
     ax.set_title(f"{name}\n{counted(number, 'inclusion')}", color=COLOURS.get(name, INK), fontsize=11, pad=0)
@@ -115,9 +124,9 @@ def _draw_outcome(ax, name: str, outcome: RuleOutcome, mesh: Mesh) -> None:
 
 def _draw_scale(ax, largest: float, unit: str) -> None:
     """Draw a small colour bar below an image, with labels at its ends and at zero."""
-    from jeit.plot.axes import INK, SOFT, prefixed
+    from jeit.plot.axes import INK, SOFT, with_si_prefix
 
-    factor, unit = prefixed(largest, unit)
+    factor, unit = with_si_prefix(largest, unit)
     end = factor * largest
     drawn = next(one for one in (*ax.images, *ax.collections) if one.get_array() is not None)
     bar = ax.figure.colorbar(drawn, ax=ax, orientation="horizontal", shrink=0.62, aspect=18, pad=0.01)
@@ -164,4 +173,4 @@ def report_choice(result: ComparedRules) -> dict[str, Any]:
         "rules": rules,
         "refused": result.refused,
     }
-    return plain(content)
+    return as_plain_values(content)

@@ -86,7 +86,7 @@ def describe_electrodes(electrodes: AbstractElectrodes | None) -> dict[str, Any]
     """Describe electrodes by their kind, number, places and sizes in metres."""
     if electrodes is None:
         return {"kind": "at places not known"}
-    return plain(electrodes.describe())
+    return as_plain_values(electrodes.describe())
 
 
 def version_of(package: str) -> str | None:
@@ -97,17 +97,17 @@ def version_of(package: str) -> str | None:
         return None
 
 
-def plain(value: Any) -> Any:
+def as_plain_values(value: Any) -> Any:
     """Convert a value for JSON: arrays to lists, complex numbers to their real and imaginary part, and numbers that are
     not finite to None."""
     if isinstance(value, dict):
-        return {key: plain(entry) for key, entry in value.items()}
+        return {key: as_plain_values(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(entry) for entry in value]
+        return [as_plain_values(entry) for entry in value]
     if hasattr(value, "tolist"):
-        return plain(np.asarray(value).tolist())
+        return as_plain_values(np.asarray(value).tolist())
     if isinstance(value, complex):
-        return {"real": plain(value.real), "imaginary": plain(value.imag)}
+        return {"real": as_plain_values(value.real), "imaginary": as_plain_values(value.imag)}
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

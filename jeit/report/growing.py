@@ -21,7 +21,7 @@ from jeit.arguments import counted
 from jeit.files import written_whole
 
 # Number of bytes read and compressed at once, and maximum number of values of a `Sample`.
-_BLOCK, _MOST = 2**20, 2**16
+_BLOCK_BYTES, _MAX_SAMPLE = 2**20, 2**16
 
 
 class GrowingTable:
@@ -85,7 +85,7 @@ class GrowingRows:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array_header_1_0(member, header)
                 for done, block in self._blocks():
-                    if progress is not None and self._file.tell() > _BLOCK:
+                    if progress is not None and self._file.tell() > _BLOCK_BYTES:
                         progress(f"{100 * done:.0f} %")
                     member.write(block)
             for other, values in others.items():
@@ -96,7 +96,7 @@ class GrowingRows:
         """Blocks of the file, each with the share of the file that has been read with it."""
         size = self._file.seek(0, os.SEEK_END)
         self._file.seek(0)
-        while block := self._file.read(_BLOCK):
+        while block := self._file.read(_BLOCK_BYTES):
             yield self._file.tell() / size, block
 
     def __enter__(self) -> "GrowingRows":
@@ -108,7 +108,7 @@ class GrowingRows:
 
 
 @contextlib.contextmanager
-def saying_what_is_left(rows: GrowingRows) -> Iterator[None]:
+def reporting_partial_results(rows: GrowingRows) -> Iterator[None]:
     """Context manager that adds to an `OSError`, such as for a full disk, which frames have been written. Raises
     `OSError`."""
     try:
@@ -129,7 +129,7 @@ class Sample:
     def append(self, value: float) -> None:
         """Add the next number of the series, and store it if it belongs to the sample."""
         if self._number % self._step == 0:
-            if len(self._values) == _MOST:
+            if len(self._values) == _MAX_SAMPLE:
                 self._values, self._step = self._values[::2], 2 * self._step
             self._values.append(value)
         self._number += 1

@@ -16,10 +16,10 @@ from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes import Ellipsoid, Star
 from jeit.protocol import Protocol
 from jeit.report.folder import (
+    as_plain_values,
     describe_domain,
     describe_electrodes,
     describe_measurement,
-    plain,
     results,
     version_of,
     write_json,
@@ -75,11 +75,11 @@ def _arrays(result: ImagedDifference) -> dict[str, Any]:
     if result.labels is not None:
         arrays["labels"] = result.labels
     if result.iterative and not result.is_complex:
-        arrays["departure"] = _drawn(result)
+        arrays["departure"] = _draw_views(result)
     return {**arrays, **saved_extras(result.mesh, result.electrodes, result.inclusions)}
 
 
-def _drawn(result: ImagedDifference) -> np.ndarray:
+def _draw_views(result: ImagedDifference) -> np.ndarray:
     """Values per cell for the picture: the change of conductivity, or, for iterative images, which range from 0.01 to
     100 times the background, the change of its logarithm to base 10."""
     return np.asarray(result.departure) / (math.log(10) if result.iterative else 1)
@@ -107,13 +107,13 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
     if result.mesh.dimension == 3:
         from jeit.plot.solid.overview import plot_solid
 
-        figure = plot_solid(result.mesh, _drawn(result), electrodes, inclusions=result.inclusions, scale=scale)
+        figure = plot_solid(result.mesh, _draw_views(result), electrodes, inclusions=result.inclusions, scale=scale)
         figure.suptitle(result.measurement.name)
         return figure
     figure = Figure(figsize=(6.4, 5.6), layout="constrained")
     ax = plot_image(
         result.mesh,
-        _drawn(result),
+        _draw_views(result),
         electrodes,
         inclusions=result.inclusions if result.labels is None and result.shapes is None else (),
         title=result.measurement.name,
@@ -148,7 +148,7 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
             "mesh": {"points": result.mesh.num_points, "cells": result.mesh.num_cells},
         },
         "protocol": _protocol(result.measurement.protocol),
-        "uncertainty": _uncertainty(result.reference.uncertainty or Uncertainty()),
+        "uncertainty": _uncertainty_report(result.reference.uncertainty or Uncertainty()),
         "calibration": _calibration(result),
         "noise": None
         if noise is None
@@ -182,15 +182,15 @@ def report_image(result: ImagedDifference) -> dict[str, Any]:
         },
         "doubts": list(result.doubts),
         "inclusions": [_inclusion(result, one) for one in result.inclusions],
-        "shapes": _shapes(result),
+        "shapes": _shapes_report(result),
         "inclusion_settings": {"level": result.level, "least_peak": settings.least_peak},
         "timings": {**result.timings, "unit": "s"},
         "versions": {name: version_of(name) for name in _PACKAGES},
     }
-    return plain(content)
+    return as_plain_values(content)
 
 
-def _uncertainty(known: Uncertainty) -> dict[str, Any]:
+def _uncertainty_report(known: Uncertainty) -> dict[str, Any]:
     """The uncertainty of the description, which intervals are based on; the position is None by default, for 0.0175 of
     the width of the body."""
     return {
@@ -247,15 +247,15 @@ def _inclusion(result: ImagedDifference, inclusion: Inclusion) -> dict[str, Any]
         "kind": inclusion.kind,
         "centroid": list(inclusion.centroid),
         "centroid_unit": "m",
-        **_size(inclusion),
+        **_size_report(inclusion),
         "peak": inclusion.peak,
         "peak_unit": _unit(result),
         "peak_relative_to_background": inclusion.peak / float(np.real(result.calibration.conductivity)),
-        **_intervals(inclusion),
+        **_interval_report(inclusion),
     }
 
 
-def _intervals(inclusion: Inclusion) -> dict[str, Any]:
+def _interval_report(inclusion: Inclusion) -> dict[str, Any]:
     """68 % intervals of what was estimated of a body, None at an open end; nothing where none were estimated."""
     if inclusion.contrast_interval is None:
         return {}
@@ -269,14 +269,14 @@ def _intervals(inclusion: Inclusion) -> dict[str, Any]:
     }
 
 
-def _size(inclusion: Inclusion) -> dict[str, Any]:
+def _size_report(inclusion: Inclusion) -> dict[str, Any]:
     """Size of an inclusion: its volume in a solid, its area in a sheet."""
     if inclusion.is_solid:
         return {"volume": inclusion.area, "volume_unit": "m³"}
     return {"area": inclusion.area, "area_unit": "m²"}
 
 
-def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
+def _shapes_report(result: ImagedDifference) -> dict[str, Any] | None:
     """Report of fitted bodies with their outlines, and of bodies left out as artefacts; None if none were fitted."""
     if result.shapes is None:
         return None
@@ -285,7 +285,7 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
             {
                 "sign": one.sign,
                 "centroid": one.centroid,
-                **_form(one),
+                **_form_report(one),
                 "conductivity_over_background": math.exp(one.sign * one.contrast),
                 "conductivity_is": _evidence_text(one),
                 "rise": one.rise,
@@ -299,7 +299,7 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
         if other is not None:
             ratio = math.exp(other.sign * other.contrast)
             said = {"conductivity_over_background": ratio, "deviation_of_logarithm": its}
-            one["or"] = {"centroid": other.centroid, **_form(other), **said}
+            one["or"] = {"centroid": other.centroid, **_form_report(other), **said}
     return {
         "bodies": kept,
         "left_out": left,
@@ -311,7 +311,7 @@ def _shapes(result: ImagedDifference) -> dict[str, Any] | None:
     }
 
 
-def _form(body: Star | Ellipsoid) -> dict[str, Any]:
+def _form_report(body: Star | Ellipsoid) -> dict[str, Any]:
     """Form of a body: area and outline of a star, or volume, centre and half axes of an ellipsoid or a column."""
     if isinstance(body, Star):
         return {"area": body.area, "outline": body.outline}

@@ -19,13 +19,13 @@ from jeit_solvers.engines import has_values
 _DPI, _FRAMES = 90, 12
 
 
-def picture(one: Any) -> bytes | None:
+def picture(value: Any) -> bytes | None:
     """PNG of an object; None for one of another kind, and inside `jax.jit` or a derivative."""
-    draw = _DRAWN.get(type(one).__name__)
-    if draw is None or not has_values(one):
+    draw = _DRAWN.get(type(value).__name__)
+    if draw is None or not has_values(value):
         return None
     file = io.BytesIO()
-    draw(one).savefig(file, dpi=_DPI, format="png")
+    draw(value).savefig(file, dpi=_DPI, format="png")
     return file.getvalue()
 
 
@@ -56,7 +56,7 @@ def _mesh(mesh: Any) -> Figure:
 def _layout(layout: Any) -> Figure:
     from matplotlib.patches import Circle
 
-    from jeit.plot.axes import INK, SOFT, bare, draw_scale_bar
+    from jeit.plot.axes import INK, SOFT, draw_scale_bar, hide_axes
 
     figure = Figure(figsize=(5.0, 4.6), layout="constrained")
     ax = figure.subplots()
@@ -69,20 +69,20 @@ def _layout(layout: Any) -> Figure:
         ax.annotate(label, tuple(centre), ha="center", va="center", fontsize=7)
     x, y = np.asarray(ax.dataLim.intervalx), np.asarray(ax.dataLim.intervaly)
     extent = (x[0], x[1], y[0], y[1])
-    bare(ax, extent, numbered=False)
+    hide_axes(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     ax.set_title(layout.name, fontsize=10)
     return figure
 
 
 def _measurement(measurement: Any) -> Figure:
-    from jeit.plot.axes import prefixed
+    from jeit.plot.axes import with_si_prefix
 
     figure = Figure(figsize=(7.0, 3.2), layout="constrained")
     ax = figure.subplots()
     shown = np.unique(np.linspace(0, measurement.num_frames - 1, _FRAMES).round().astype(int))
     values = np.where(measurement.mask, np.real(np.asarray(measurement.voltages)), np.nan)[shown]
-    factor, unit = prefixed(float(np.abs(values[np.isfinite(values)]).max(initial=0)) or 1.0, "V")
+    factor, unit = with_si_prefix(float(np.abs(values[np.isfinite(values)]).max(initial=0)) or 1.0, "V")
     ax.plot(factor * values.T, linewidth=0.8)
     ax.set(xlabel="Channel", ylabel=f"Voltage ({unit})")
     few = "" if len(shown) == measurement.num_frames else f"{len(shown)} of "

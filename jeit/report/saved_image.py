@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
     from jeit.plot import Camera, ColourScale
 
-_GIVE = "give the image.npz that jeit reconstruct writes"
+_REMEDY = "give the image.npz that jeit reconstruct writes"
 # Descriptions of files that are not images, with the suffixes of their names.
-_OTHERS = {
+_OTHER_FILES = {
     "a table of data, which is to be imaged first": (".csv", ".txt", ".mat", ".eit", ".get", ".npy"),
     "a picture, which any viewer shows": (".png", ".gif", ".mp4", ".jpg", ".jpeg", ".svg", ".pdf"),
     "a file for ParaView": (".vtu", ".vtk", ".xdmf", ".pvd"),
@@ -35,9 +35,9 @@ _OTHERS = {
     "a description": (".toml",),
     "a report": (".json", ".html"),
 }
-_NEEDED = ("conductivity", "points", "cells")
+_REQUIRED_ARRAYS = ("conductivity", "points", "cells")
 _READ_ARRAYS = (
-    *_NEEDED,
+    *_REQUIRED_ARRAYS,
     "background",
     "departure",
     "electrode_corners",
@@ -121,10 +121,10 @@ def read_image(path: str | Path) -> SavedImage:
     try:
         with path.open("rb") as file:
             if file.read(2) != b"PK":
-                raise ValueError(f"not an image that jeit wrote{_instead(path)}; {_GIVE}.")
+                raise ValueError(f"not an image that jeit wrote{_other_file_hint(path)}; {_REMEDY}.")
         arrays = npz_arrays(path, *_READ_ARRAYS)
         _check_kind(arrays)
-        need(arrays, *_NEEDED)
+        need(arrays, *_REQUIRED_ARRAYS)
         if arrays["points"].dtype.kind not in "fiu":
             raise ValueError(f"'points' is {describe(arrays['points'])}; real numbers are wanted, metres.")
         with size_checked():  # the size of the mesh was checked by the command that wrote it
@@ -139,13 +139,13 @@ def _check_kind(arrays: dict[str, np.ndarray]) -> None:
     held = set(arrays[""].tolist())
     if held & {"images", "depth", "functional"}:
         raise ValueError("it holds many frames; give the image.npz of one, of jeit reconstruct.")
-    if not held & {*_NEEDED}:
+    if not held & {*_REQUIRED_ARRAYS}:
         few = ", ".join(name[:40] for name in sorted(held)[:6])
-        raise ValueError(f"it holds {few or 'nothing'}, and no image; {_GIVE}.")
+        raise ValueError(f"it holds {few or 'nothing'}, and no image; {_REMEDY}.")
 
 
-def _instead(path: Path) -> str:
-    kind = next((kind for kind, ends in _OTHERS.items() if path.suffix.lower() in ends), None)
+def _other_file_hint(path: Path) -> str:
+    kind = next((kind for kind, ends in _OTHER_FILES.items() if path.suffix.lower() in ends), None)
     return "" if kind is None else f", but {kind}"
 
 
@@ -203,14 +203,14 @@ def _inclusions(mesh: Mesh, arrays: dict[str, np.ndarray]) -> tuple[Inclusion, .
         raise ValueError("'inclusion_centroids', '_sizes' and '_peaks' do not belong together; write it again.")
     if not all(one.dtype.kind == "f" and np.isfinite(one).all() for one in (centroids, sizes, peaks)):
         raise ValueError("inclusions have values that are not finite; write it again.")
-    listed = zip(centroids.tolist(), sizes.tolist(), peaks.tolist(), _forms(arrays, number), strict=True)
+    listed = zip(centroids.tolist(), sizes.tolist(), peaks.tolist(), _read_forms(arrays, number), strict=True)
     return tuple(
         Inclusion(1 if peak > 0 else -1, tuple(centroid), size, peak, mesh.is_surface, form)
         for centroid, size, peak, form in listed
     )
 
 
-def _forms(arrays: dict[str, np.ndarray], number: int) -> list[SolidForm | None]:
+def _read_forms(arrays: dict[str, np.ndarray], number: int) -> list[SolidForm | None]:
     if "inclusion_axes" not in arrays:
         return [None] * number
     need(arrays, "inclusion_centres", "inclusion_columns")
@@ -228,7 +228,7 @@ def _forms(arrays: dict[str, np.ndarray], number: int) -> list[SolidForm | None]
 VIEW_FILES = ("overview.png", "isosurfaces.png", "slices.png", "planes.png", "surface.png", "image.png")
 """Names of the files written by `write_views`: the first three for a solid, `planes.png` if planes are given,
 `surface.png` for a surface in space, and `image.png` for a sheet."""
-_HALF, _DPI = (0.5,), 150
+_HALF_LEVEL, _DPI = (0.5,), 150
 
 
 def write_views(
@@ -236,7 +236,7 @@ def write_views(
     folder: str | Path,
     *,
     camera: "Camera | None" = None,
-    levels: Sequence[float] = _HALF,
+    levels: Sequence[float] = _HALF_LEVEL,
     planes: Sequence[Plane] = (),
     axis: str = "z",
     slices: int = 9,
@@ -284,7 +284,7 @@ def _figures(image: SavedImage, camera, levels, planes, axis: str, slices: int) 
     values, scale = drawn_values(image)
     mesh, electrodes = image.mesh, image.electrodes
     if mesh.dimension == 2 and not mesh.is_surface:
-        return {"image.png": _sheet(image, values, scale)}
+        return {"image.png": _draw_sheet(image, values, scale)}
     other = Camera(first.azimuth + 180, first.elevation)
     sides = {"": first, "from the other side": other, "from the front": Camera(-90, 0), "from above": Camera(-90, 90)}
 
@@ -336,8 +336,8 @@ def _figure(width: float, height: float) -> "Figure":
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _sheet(image: SavedImage, values, scale) -> "Figure":
-    from jeit.plot.axes import bare, extent_of
+def _draw_sheet(image: SavedImage, values, scale) -> "Figure":
+    from jeit.plot.axes import extent_of, hide_axes
     from jeit.plot.imaging.electrodes import draw_shapes
     from jeit.plot.imaging.image import plot_image
 
@@ -345,5 +345,5 @@ def _sheet(image: SavedImage, values, scale) -> "Figure":
     ax = plot_image(image.mesh, values, inclusions=image.inclusions, scale=scale, ax=figure.subplots())
     if image.electrodes is not None:
         draw_shapes(image.mesh, image.electrodes, ax=ax)
-        bare(ax, extent_of(np.asarray(image.mesh.points)))
+        hide_axes(ax, extent_of(np.asarray(image.mesh.points)))
     return figure

@@ -13,13 +13,13 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.image import Oscillation, oscillation
 from jeit.imaging.sequence import ImagedSequence
 from jeit.mesh import Mesh
-from jeit.report.folder import describe_measurement, plain, results, write_json, write_rows
+from jeit.report.folder import as_plain_values, describe_measurement, results, write_json, write_rows
 
 FILMS = (".gif", ".mp4")
 FILM_FRAMES = 120
 """Maximum number of frames of a film."""
 # Frames per second of a film: the maximum, and the default if the rate of the stream is not known.
-_FASTEST, _PACE = 25.0, 10.0
+_MAX_RATE, _DEFAULT_RATE = 25.0, 10.0
 
 
 def check_film(name: str) -> str:
@@ -77,7 +77,7 @@ def write_film(
         figure.supxlabel(text, fontsize=9, color=SOFT)
     figure.canvas.draw()
     figure.set_layout_engine("none")  # prevents a different layout in each frame
-    pace = min(_PACE if rate is None else rate * len(chosen) / len(values), _FASTEST)
+    pace = min(_DEFAULT_RATE if rate is None else rate * len(chosen) / len(values), _MAX_RATE)
     writer = (PillowWriter if path.suffix.lower() == ".gif" else FFMpegWriter)(fps=max(pace, 0.1))  # pyright: ignore
     with writer.saving(figure, str(path), 80):
         for done, frame in enumerate(chosen):
@@ -91,7 +91,7 @@ SERIES_FILES = ("series.png", "series.npz", "regions.csv", "report.json")
 
 
 def write_series(
-    found: ImagedSequence,
+    series_result: ImagedSequence,
     folder: str | Path,
     *,
     regions: Mapping[str, Bool[np.ndarray, " m"]] | None = None,
@@ -102,18 +102,18 @@ def write_series(
     return the report.
 
     - `regions`: cells (m,) of each region, by name; default: the whole body.
-    - `oscillations`: oscillations of `found.series.changes`.
+    - `oscillations`: oscillations of `series_result.series.changes`.
 
     The table has the time in seconds, or the number of the frame, and the mean change of each region, S/m (2-D: S),
     empty for refused frames. The NPZ has `changes` (F, m), `times` (F,), `background`, `points`, `cells`, `functional`
     (m,), and, for k oscillations, `frequency` (k,), `amplitude` (k, m) and `phase` (k, m) in radians. Raises
     `ValueError` for names that cannot be a folder or a film.
     """
-    series, model = found.series, found.prepared.model
+    series, model = series_result.series, series_result.prepared.model
     chosen = {"whole body": np.ones(series.mesh.num_cells, bool)} if not regions else dict(regions)
     films = () if film is None else (check_film(film),)
     curves = {name: series.mean_change(region) for name, region in chosen.items()}
-    report = _report(found, curves, oscillations)
+    report = _report(series_result, curves, oscillations)
     from jeit.plot.imaging.series import plot_series
 
     with results(folder, (*SERIES_FILES, *films)) as made:
@@ -154,7 +154,7 @@ def _report(found: ImagedSequence, curves: Mapping[str, np.ndarray], oscillation
             for name, part in at.items()
         }
         reported.append({"frequency": one.frequency, "resolution": one.resolution, "unit": "Hz", "regions": parts})
-    return plain(
+    return as_plain_values(
         {
             "measurement": describe_measurement(found.prepared.measurement),
             "frames": len(series.times),

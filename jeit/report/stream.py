@@ -15,18 +15,18 @@ from jeit.inverse.calibration import Calibration
 from jeit.inverse.streaming.stream import FrameImage, FrameStatus
 from jeit.mesh import centroids
 from jeit.report.folder import results_folder
-from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_is_left
+from jeit.report.growing import GrowingRows, GrowingTable, Sample, reporting_partial_results
 from jeit.report.series import FILM_FRAMES, check_film, write_film
 
 PICTURES = ("contact sheet", "film")
 """Names of the pictures of a stream, as passed to `drawing`."""
 
 _COLUMNS = ("frame", "status", "channels", "misfit", "iterations", "latency_ms", "x_m", "y_m", "peak", "reason")
-_NOTHING = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
+_WITHOUT_IMAGE = (FrameStatus.REFUSED, FrameStatus.UNCHANGED)
 # End of the colour scale of streams without changes, as a share of the background, so that noise is not visible.
-_FAINT = 0.01
+_MIN_SCALE_SHARE = 0.01
 # Maximum number of refused frames named below the contact sheet.
-_NAMED = 8
+_MAX_NAMED = 8
 
 
 @dataclass(frozen=True)
@@ -85,12 +85,12 @@ def write_stream(
         (folder / earlier).unlink(missing_ok=True)  # it belongs to an earlier stream
     clear_unfinished(folder)
     report = drawing or (lambda said: None)
-    mesh, seen = calibration.model.mesh, _Seen(calibration)
+    mesh, seen = calibration.model.mesh, _StreamSummary(calibration)
     with GrowingRows(folder, (mesh.num_cells,)) as rows:
         with GrowingTable(folder / "frames.csv", _COLUMNS) as table:
             for one in images:
                 row, image = seen.take(one)
-                with saying_what_is_left(rows):
+                with reporting_partial_results(rows):
                     table.write(row)
                     rows.append(image)
                 if progress is not None:
@@ -99,15 +99,15 @@ def write_stream(
             raise ValueError(f"'{name}': there was no frame in it.")
         others = {"background": calibration.conductivity, "points": mesh.points, "cells": mesh.cells}
         report("images")
-        with saying_what_is_left(rows):
+        with reporting_partial_results(rows):
             rows.write_npz(folder / "images.npz", "conductivity", others, lambda far: report(f"images: {far}"))
         latency = seen.latency.values()
         if latency.size:
-            _Pictures(folder, film, rate, report).draw(rows, seen)
+            _StreamPictures(folder, film, rate, report).draw(rows, seen)
         return WrittenStream(rows.number, seen.counts, latency, seen.first_reason)
 
 
-class _Seen:
+class _StreamSummary:
     """Statistics of the frames of a stream, of constant size for any number of frames."""
 
     def __init__(self, calibration: Calibration):
@@ -123,24 +123,24 @@ class _Seen:
         self.counts[str(one.status)] = self.counts.get(str(one.status), 0) + 1
         if one.conductivity is None:
             self.first_reason = self.first_reason or one.reason
-            self.refused += [one.number] if len(self.refused) < _NAMED else []
-            return _row(one, self._centre, self.background), self._nothing
+            self.refused += [one.number] if len(self.refused) < _MAX_NAMED else []
+            return _table_row(one, self._centre, self.background), self._nothing
         self.first_imaged = one.number if self.first_imaged < 0 else self.first_imaged
         self.latency.append(one.latency)
         image = one.conductivity.astype(np.float32)
         self.largest = max(self.largest, float(np.abs(image - np.float32(self.background)).max()))
-        return _row(one, self._centre, self.background), image
+        return _table_row(one, self._centre, self.background), image
 
     @property
     def limit(self) -> float:
-        """End of the colour scale: the maximum change, or, for streams without changes, `_FAINT` times the background,
-        so that noise does not fill the scale."""
-        changed = sum(self.counts.values()) > sum(self.counts.get(status, 0) for status in _NOTHING)
-        return self.largest if changed else _FAINT * self.background
+        """End of the colour scale: the maximum change, or, for streams without changes, `_MIN_SCALE_SHARE` times the
+        background, so that noise does not fill the scale."""
+        changed = sum(self.counts.values()) > sum(self.counts.get(status, 0) for status in _WITHOUT_IMAGE)
+        return self.largest if changed else _MIN_SCALE_SHARE * self.background
 
 
 @dataclass(frozen=True)
-class _Pictures:
+class _StreamPictures:
     """Settings of the pictures of a stream: folder, film, frame rate, and the function to which progress is
     reported."""
 
@@ -149,7 +149,7 @@ class _Pictures:
     rate: float | None
     report: Callable[[str], None]
 
-    def draw(self, rows: GrowingRows, seen: _Seen) -> None:
+    def draw(self, rows: GrowingRows, seen: _StreamSummary) -> None:
         """Draw the contact sheet and the film from evenly spaced rows."""
         from jeit.plot import ColourScale, plot_frames
         from jeit.plot.imaging.series import SHEET_FRAMES, FrameCount
@@ -178,7 +178,7 @@ class _Pictures:
                 progress=lambda far: self.report(f"{PICTURES[1]}: {far}"),
             )
 
-    def _some(self, rows: GrowingRows, seen: _Seen, most: int) -> tuple[Float[np.ndarray, "k m"], list[str]]:
+    def _some(self, rows: GrowingRows, seen: _StreamSummary, most: int) -> tuple[Float[np.ndarray, "k m"], list[str]]:
         from jeit.plot.imaging.series import chosen_frames
 
         chosen = chosen_frames(rows.number, most)
@@ -192,15 +192,33 @@ class _Pictures:
         return [f"frame {one}" if self.rate is None else f"{one / self.rate:.2f} s" for one in numbers]
 
 
-def _row(one: FrameImage, centre, background: float) -> list[object]:
+def _table_row(frame_image: FrameImage, centre, background: float) -> list[object]:
     """Values of a frame for the table."""
-    spent = f"{1e3 * one.latency:.3f}"
-    if one.conductivity is None:
-        return [one.number, one.status, int(one.usable.sum()), "", one.iterations, spent, "", "", "", one.reason]
-    change = one.conductivity - background
+    spent = f"{1e3 * frame_image.latency:.3f}"
+    if frame_image.conductivity is None:
+        return [
+            frame_image.number,
+            frame_image.status,
+            int(frame_image.usable.sum()),
+            "",
+            frame_image.iterations,
+            spent,
+            "",
+            "",
+            "",
+            frame_image.reason,
+        ]
+    change = frame_image.conductivity - background
     peak = int(np.argmax(np.abs(change)))
-    misfit = "" if np.isnan(one.misfit) else f"{one.misfit:.4g}"
-    head = [one.number, one.status, int(one.usable.sum()), misfit, one.iterations, spent]
-    if one.status == FrameStatus.UNCHANGED:
-        return [*head, "", "", "", one.reason]
-    return [*head, *(f"{value:.5f}" for value in centre[peak]), f"{change[peak]:.5g}", one.reason]
+    misfit = "" if np.isnan(frame_image.misfit) else f"{frame_image.misfit:.4g}"
+    head = [
+        frame_image.number,
+        frame_image.status,
+        int(frame_image.usable.sum()),
+        misfit,
+        frame_image.iterations,
+        spent,
+    ]
+    if frame_image.status == FrameStatus.UNCHANGED:
+        return [*head, "", "", "", frame_image.reason]
+    return [*head, *(f"{value:.5f}" for value in centre[peak]), f"{change[peak]:.5g}", frame_image.reason]

@@ -19,7 +19,7 @@ from jeit.mesh.geometry import facet_measures
 from jeit.report.folder import results_folder
 
 # Minimum share of the surface around a node that an electrode must cover for the node to count as under it.
-_UNDER = 0.1
+_NODE_TOLERANCE = 0.1
 
 
 def write_vtu(
@@ -121,7 +121,7 @@ def electrode_of_nodes(mesh: Mesh, electrodes: AbstractElectrodes) -> Int[np.nda
             load = load / np.where(round_it > 0, round_it, np.inf)[:, None]
         else:
             load = load / load.max(axis=0)
-    return np.where(load.max(axis=1) > _UNDER, load.argmax(axis=1) + 1, 0)
+    return np.where(load.max(axis=1) > _NODE_TOLERANCE, load.argmax(axis=1) + 1, 0)
 
 
 def _real(data: Mapping[str, ArrayLike]) -> dict[str, np.ndarray]:

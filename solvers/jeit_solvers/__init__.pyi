@@ -32,14 +32,22 @@ from .optimise.small_problems import (
     symmetric_small,
 )
 from .sparse.choose import ColumnSolver, ConjugateGradient, DirectSolver, FrontalCholesky, SparseCholesky, choose_solver
-from .sparse.frontal import FrontalFactor, factorise_fronts
-from .sparse.fronts import Fronts, find_fronts
-from .sparse.multifrontal import Factor, factorise, half_solve, inverse_entries, inverse_root, quadratic_form, solve
+from .sparse.exact_fronts import Fronts, find_fronts
+from .sparse.exact_fronts_numpy import FrontalFactor, factorise_fronts
 from .sparse.multigrid import Multigrid
 from .sparse.near_inverse import NearInverse, Strips, near_inverse
 from .sparse.operator import SparseSymmetric
+from .sparse.padded_fronts import FactorisationPlan, analyse
+from .sparse.padded_fronts_jax import (
+    Factor,
+    factorise,
+    half_solve,
+    inverse_entries,
+    inverse_root,
+    quadratic_form,
+    solve,
+)
 from .sparse.pattern import SparsityPattern
-from .sparse.plan import FactorisationPlan, analyse
 
 __all__ = [
     "BoundedMinimum",

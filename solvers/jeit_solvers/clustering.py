@@ -69,7 +69,7 @@ def kmeans(
     _check_count("restarts", restarts)
     _check_count("max_steps", max_steps)
     if num_clusters > number:
-        raise ValueError(f"num_clusters is {num_clusters}, but there are only {number} points to part.")
+        raise ValueError(f"num_clusters is {num_clusters}, but there are only {number} points; ask for fewer clusters.")
     if has_values(tolerance) and not 0 <= tolerance < 1:
         raise ValueError(f"tolerance must be a share of the inertia, from 0 and less than 1; it is {tolerance!r}.")
     if not isinstance(key, (jax.Array, np.ndarray)):
@@ -87,9 +87,9 @@ def _check_count(name: str, count: int) -> None:
 @partial(jax.jit, static_argnums=(3, 4))
 def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int) -> KMeans:
     # Labels have no derivative. Means for constant labels have one, which needs no loop.
-    find = in_turn(partial(_best_of_all, num_clusters, restarts))
+    find = in_turn(partial(_best_restart, num_clusters, restarts))
     best = find(jax.lax.stop_gradient(points), key, stop)
-    centres = _means(points, best.labels, best.centres)
+    centres = _cluster_means(points, best.labels, best.centres)
     return KMeans(
         centres=centres,
         labels=best.labels,
@@ -110,27 +110,27 @@ class _State(eqx.Module):
     settled: Bool[Array, ""]
 
 
-def _best_of_all(num_clusters: int, restarts: int, points, key, stop) -> _State:
+def _best_restart(num_clusters: int, restarts: int, points, key, stop) -> _State:
     middle = jnp.mean(points, axis=0)
     centred = points - middle
     squares = jnp.sum(centred**2, axis=1)
     # All starts take the same number of steps, so they run side by side, and the points pass through memory once for
     # all of them. The number of later iterations differs, so these run one after the other, and none waits for the
     # slowest.
-    draws = jax.random.uniform(key, (restarts, num_clusters, _trials(num_clusters)), points.dtype)
-    starts = jax.vmap(lambda draws: _start(centred, squares, draws))(draws)
+    draws = jax.random.uniform(key, (restarts, num_clusters, _num_candidates(num_clusters)), points.dtype)
+    starts = jax.vmap(lambda draws: _kmeans_plus_plus(centred, squares, draws))(draws)
     descend = in_turn(_lloyd)
     ends = jax.vmap(lambda start: descend(start, centred, squares, stop))(starts)
     best = jax.tree.map(lambda array: array[jnp.argmin(ends.inertia)], ends)
     return eqx.tree_at(lambda state: state.centres, best, best.centres + middle)
 
 
-def _trials(num_clusters: int) -> int:
+def _num_candidates(num_clusters: int) -> int:
     """Number of points to draw for every centre of a start, as in scikit-learn."""
     return 2 + int(np.log(num_clusters))
 
 
-def _start(points, squares, draws: Float[Array, "k trials"]) -> Float[Array, "k d"]:
+def _kmeans_plus_plus(points, squares, draws: Float[Array, "k trials"]) -> Float[Array, "k d"]:
     """Greedy k-means++: a few points are drawn with weights equal to their squared distance to the nearest centre, and
     the next centre is the drawn point that lowers the sum of these squares most. `draws`: random numbers from 0 to
     1."""
@@ -183,11 +183,13 @@ def _lloyd(start, points, squares, stop) -> _State:
 
     def step(loop):
         state, scores = loop
-        counts = _count(state.labels, num_clusters)
+        counts = _cluster_sizes(state.labels, num_clusters)
         labels = jax.lax.cond(
-            jnp.all(counts > 0), lambda: state.labels, lambda: _fill(state.labels, state.distance, counts)
+            jnp.all(counts > 0),
+            lambda: state.labels,
+            lambda: _fill_empty_clusters(state.labels, state.distance, counts),
         )
-        centres = _means(points, labels, state.centres)
+        centres = _cluster_means(points, labels, state.centres)
         scores = score_moved(scores, centres, jnp.any(centres != state.centres, axis=1))
         labels, distance, inertia = assign(scores)
         settled = jnp.all(labels == state.labels) | (state.inertia - inertia <= tolerance * state.inertia)
@@ -201,7 +203,7 @@ def _lloyd(start, points, squares, stop) -> _State:
     return jax.lax.while_loop(go_on, step, (first, scores))[0]
 
 
-def _fill(labels, distance, counts) -> Int[Array, " n"]:
+def _fill_empty_clusters(labels, distance, counts) -> Int[Array, " n"]:
     """Labels after moving the points farthest from their centres, farthest first, to the empty clusters in order."""
     empty = counts == 0
     spare = jnp.where(counts[labels] > 1, distance, -1)
@@ -210,11 +212,11 @@ def _fill(labels, distance, counts) -> Int[Array, " n"]:
     return labels.at[taken].set(jnp.arange(len(counts)), mode="drop")
 
 
-def _count(labels, num_clusters: int) -> Int[Array, " k"]:
+def _cluster_sizes(labels, num_clusters: int) -> Int[Array, " k"]:
     return jax.ops.segment_sum(jnp.ones_like(labels), labels, num_clusters)
 
 
-def _means(points, labels, otherwise) -> Float[Array, "k d"]:
+def _cluster_means(points, labels, otherwise) -> Float[Array, "k d"]:
     """Mean of the points of each cluster; for empty clusters the rows of `otherwise` (k, d)."""
     num_clusters = len(otherwise)
 
@@ -226,5 +228,5 @@ def _means(points, labels, otherwise) -> Float[Array, "k d"]:
 
     # On a CPU a sum by index costs a fifth of the product; on accelerators its order, and so its rounding, is random.
     totals = jax.lax.platform_dependent(points, labels, cpu=scattered, default=multiplied)
-    counts = _count(labels, num_clusters)[:, None]
+    counts = _cluster_sizes(labels, num_clusters)[:, None]
     return jnp.where(counts > 0, totals / jnp.maximum(counts, 1), otherwise)

@@ -26,8 +26,8 @@ from jaxtyping import Array, Int
 
 # Maximum number of threads that work in NumPy at once: each needs its own memory, and all share the memory bandwidth.
 _MOST_THREADS = 4
-# Prefix of the names of our threads.
-_NAME = "jeit-core"
+# Prefix of the names of the threads of `on_cores`, by which calls from inside a part are recognised.
+_THREAD_NAME = "jeit-core"
 
 
 def number_of_cores() -> int:
@@ -43,17 +43,19 @@ def memory_of_machine() -> float:
         return 8e9
 
 
-def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], number: int, size: int) -> Array:
-    """Rows of `function` for the parts 0 … `number` - 1, computed in groups of `size` parts and concatenated; if the
-    groups do not divide evenly, the rows of the last part are repeated at the end.
+def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: int, group_size: int) -> Array:
+    """Compute `function` for the parts 0 … `num_parts` - 1 on all cores, `group_size` parts at a time, and concatenate
+    the rows that it returns. If `num_parts` is not divisible into equal groups, the rows of the last part are repeated
+    at the end.
 
-    `function`: maps indices of parts (c, s), s at a time, to an array (c s, …); compiled for a single c. The results of
-    a group of s parts must not depend on other groups, so that they do not depend on the number of cores.
+    `function`: maps the indices (c, s) of c groups of s parts to an array (c s, …); it is compiled once, because every
+    core processes the same number c of groups. The results of a group must not depend on other groups; then they do not
+    depend on the number of cores.
     """
-    groups = -(-number // size)
+    groups = -(-num_parts // group_size)
     cores = min(number_of_cores(), groups)
     groups = -(-groups // cores)
-    parts = np.minimum(np.arange(cores * groups * size), number - 1).reshape(cores, groups, size)
+    parts = np.minimum(np.arange(cores * groups * group_size), num_parts - 1).reshape(cores, groups, group_size)
     with ThreadPoolExecutor(cores) as pool:
         results = list(pool.map(lambda part: jax.block_until_ready(function(part)), parts))
     return results[0] if cores == 1 else jnp.concatenate(results)
@@ -71,16 +73,16 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
         with np.errstate(all="ignore"):  # every thread has its own error state
             function(part)
 
-    inside = threading.current_thread().name.startswith(_NAME)
-    if len(parts) <= 1 or inside or not _cores_taken(os.getpid()).acquire(blocking=False):
+    inside = threading.current_thread().name.startswith(_THREAD_NAME)
+    if len(parts) <= 1 or inside or not _pool_lock(os.getpid()).acquire(blocking=False):
         for part in parts:
             quietly(part)
         return
     try:
         with one_thread_of_blas():
-            list(_workers(os.getpid()).map(quietly, parts))
+            list(_thread_pool(os.getpid()).map(quietly, parts))
     finally:
-        _cores_taken(os.getpid()).release()
+        _pool_lock(os.getpid()).release()
 
 
 def parts_for_cores(number: int) -> list[slice]:
@@ -90,21 +92,21 @@ def parts_for_cores(number: int) -> list[slice]:
 
 
 @functools.cache
-def _workers(process: int) -> ThreadPoolExecutor:
+def _thread_pool(process: int) -> ThreadPoolExecutor:
     """Thread pool of a process (a forked process needs a new one). The pool is kept, because memory allocated and freed
     by new threads, about a hundred megabytes, is not returned each time."""
-    return ThreadPoolExecutor(min(number_of_cores(), _MOST_THREADS), _NAME)
+    return ThreadPoolExecutor(min(number_of_cores(), _MOST_THREADS), _THREAD_NAME)
 
 
 @functools.cache
-def _cores_taken(process: int) -> threading.Lock:
+def _pool_lock(process: int) -> threading.Lock:
     """Lock of the thread pool of a process."""
     return threading.Lock()
 
 
 @functools.cache
 def blas() -> threadpoolctl.ThreadpoolController:
-    """Controller of the BLAS libraries of NumPy and of SciPy, which are two."""
+    """Controller of the two BLAS libraries that NumPy and SciPy bring along, one each."""
     importlib.import_module("scipy.linalg.cython_blas")  # loads SciPy's
     return threadpoolctl.ThreadpoolController().select(user_api="blas")
 

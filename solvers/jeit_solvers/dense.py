@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, Inexact
 
 from jeit_solvers.engines import host, namespace
 
-_BLOCK, _BLOCK_OF_LAPACK = 8, 128
-_LARGEST_IN_HALVES = 128
+_BLOCK, _LAPACK_BLOCK = 8, 128
+_LARGEST_RECURSIVE = 128
 _LARGE_BATCH = 16
 
 
@@ -26,10 +26,10 @@ def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "b
     matrices that cannot be factorised.
     """
     if isinstance(matrices, np.ndarray):
-        return _by_halves(matrices)
-    if matrices.shape[-1] > _LARGEST_IN_HALVES:
-        return _by_block_rows(matrices)
-    return _by_halves(matrices)
+        return _inverse_cholesky_recursive(matrices)
+    if matrices.shape[-1] > _LARGEST_RECURSIVE:
+        return _inverse_cholesky_by_block_rows(matrices)
+    return _inverse_cholesky_recursive(matrices)
 
 
 def lower_cholesky(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
@@ -76,7 +76,7 @@ def _symmetric_inverse_jvp(primals, tangents):
     return inverse, -inverse @ tangents[0] @ inverse
 
 
-def _by_lapack(matrices: Any) -> Any:
+def _inverse_cholesky_lapack(matrices: Any) -> Any:
     """`inverse_cholesky` for NumPy arrays, by LAPACK."""
     # Scale the diagonal to order one by powers of two: LAPACK's inverse is less accurate for rows of different orders
     # of magnitude.
@@ -103,29 +103,33 @@ def _inverse_square_root(pivot: Inexact[Array, "batch 1"]) -> Inexact[Array, "ba
     return xp.where(pivot.real > 0, root, xp.nan)
 
 
-def _by_halves(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
+def _inverse_cholesky_recursive(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
     """`inverse_cholesky` by recursion on two by two blocks. Nearly all work is in matrix products, which are three to
     four times faster than LAPACK's inverse of a triangle. The smallest blocks use unrolled code in large batches, and
     in small batches a loop over short vectors, with larger blocks the fewer matrices there are."""
     batch, size, _ = matrices.shape
     on_host = isinstance(matrices, np.ndarray)
     by_lapack = on_host and not np.iscomplexobj(matrices)
-    block = _BLOCK_OF_LAPACK if by_lapack else _BLOCK if batch > 4 else 2 * _BLOCK
+    block = _LAPACK_BLOCK if by_lapack else _BLOCK if batch > 4 else 2 * _BLOCK
     if size <= block:
         if by_lapack:
-            return _by_lapack(matrices)
-        return _unrolled(matrices) if batch > _LARGE_BATCH or on_host else _row_by_row(matrices)
+            return _inverse_cholesky_lapack(matrices)
+        return (
+            _inverse_cholesky_unrolled(matrices)
+            if batch > _LARGE_BATCH or on_host
+            else _inverse_cholesky_by_rows(matrices)
+        )
     half = block * -(-size // (2 * block))
-    first = _by_halves(matrices[:, :half, :half])
+    first = _inverse_cholesky_recursive(matrices[:, :half, :half])
     lower = matrices[:, half:, :half] @ _transposed(first)
-    second = _by_halves(matrices[:, half:, half:] - lower @ _transposed(lower))
+    second = _inverse_cholesky_recursive(matrices[:, half:, half:] - lower @ _transposed(lower))
     corner = -(second @ (lower @ first))
     xp = namespace(matrices)
     top = xp.concatenate([first, xp.zeros((*first.shape[:-1], size - half), matrices.dtype)], axis=-1)
     return xp.concatenate([top, xp.concatenate([corner, second], axis=-1)], axis=-2)
 
 
-def _unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
+def _inverse_cholesky_unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
     """Elimination of [A | 1] to [L^T | W], row by row, in unrolled code."""
     size, xp = matrices.shape[-1], namespace(matrices)
     identity = xp.broadcast_to(xp.eye(size, dtype=matrices.dtype), matrices.shape)
@@ -139,8 +143,9 @@ def _unrolled(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s 
     return xp.stack(rows, axis=1)[..., size:]
 
 
-def _row_by_row(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
-    """The elimination of `_unrolled` in a loop, where each row is reduced by all previous rows in one product."""
+def _inverse_cholesky_by_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
+    """The elimination of `_inverse_cholesky_unrolled` in a loop, where each row is reduced by all previous rows in one
+    product."""
     size = matrices.shape[-1]
     identity = jnp.broadcast_to(jnp.eye(size, dtype=matrices.dtype), matrices.shape)
     augmented = jnp.concatenate([matrices, identity], axis=-1)
@@ -155,7 +160,7 @@ def _row_by_row(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch 
     return done[..., size:]
 
 
-def _by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
+def _inverse_cholesky_by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "batch s s"]:
     """`inverse_cholesky` by a loop over blocks of rows of W. With G = A_k W^T, the new diagonal block satisfies A_kk -
     G G^T = (W_kk^T W_kk)^-1, and the new rows are W_kk (E_k - G W). The compiled loop body does not depend on the
     size."""
@@ -173,7 +178,7 @@ def _by_block_rows(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "bat
         lower = rows @ _transposed(inverse)
         pivot = jax.lax.dynamic_slice_in_dim(rows, start, block, axis=2) - lower @ _transposed(lower)
         remainder = jax.lax.dynamic_slice_in_dim(identity, start, block, axis=0) - lower @ inverse
-        new = _by_halves(pivot) @ remainder
+        new = _inverse_cholesky_recursive(pivot) @ remainder
         return jax.lax.dynamic_update_slice_in_dim(inverse, new, start, axis=1), None
 
     inverse, _ = jax.lax.scan(next_rows, jnp.zeros_like(matrices), jnp.arange((size + padding) // block))
@@ -192,8 +197,8 @@ def ridge_model(
     covariance: Float[Array, "M M"],
     precision: Float[Array, "M M"],
 ) -> QuadraticModel:
-    """The cost ½ rᵀ C⁻¹ r + ½ ‖c‖² at a point c, and its `step` function for `Descent`. `covariance`: C of the data;
-    `precision`: its inverse."""
+    """The cost ½ rᵀ C⁻¹ r + ½ ‖c‖² at a point c, with the `residual` r, and its `step` function for `Descent`.
+    `covariance`: C, of the data; `precision`: its inverse; `jacobian`: derivative of r with respect to c."""
     if not isinstance(jacobian, np.ndarray):
         jacobian = jax.lax.optimization_barrier(jacobian)
     weighted = precision @ residual
@@ -216,7 +221,8 @@ def ridge_step(
     precision: Float[Array, "M M"],
     ridge: Float[Array, ""] | float = 1.0,
 ) -> Float[Array, " n"]:
-    """The solution δ of (JᵀC⁻¹J + ridge · 1) δ = -(JᵀC⁻¹r + c), from a system of min(M, n) unknowns.
+    """Solve (JᵀC⁻¹J + ridge · 1) δ = -(JᵀC⁻¹r + c) for δ, by a linear system of min(M, n) unknowns. J: `jacobian`; r:
+    `residual`; c: `point`; C: `covariance` of the data, with the inverse `precision`.
 
     With fewer data than unknowns, δ = -c / ridge - Jᵀ (JJᵀ + ridge · C)⁻¹ (r - J c / ridge) by Woodbury's identity, in
     a form without cancellation of large terms, however small the ridge is relative to J.

@@ -63,8 +63,8 @@ def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..
     @partial(differentiable.defjvp, symbolic_zeros=True)
     def _(primals, tangents):
         leaves, structure = jax.tree.flatten(primals)
-        directions = jax.tree.leaves(tangents, is_leaf=_is_zero)
-        moving = [number for number, direction in enumerate(directions) if not _is_zero(direction)]
+        directions = jax.tree.leaves(tangents, is_leaf=_is_zero_tangent)
+        moving = [number for number, direction in enumerate(directions) if not _is_zero_tangent(direction)]
 
         def of_what_moves(*values):
             merged = list(leaves)
@@ -77,7 +77,7 @@ def differentiable_batches(function: Callable[..., Any], batch_rule: Callable[..
     return differentiable
 
 
-def _is_zero(tangent: Any) -> bool:
+def _is_zero_tangent(tangent: Any) -> bool:
     return isinstance(tangent, SymbolicZero)
 
 
@@ -116,7 +116,7 @@ host: Any = np
 
 
 def namespace(*trees: Any) -> Any:
-    """`numpy` if no array of these pytrees is one of JAX's, else `jax.numpy`."""
+    """Return `numpy` if these pytrees hold no JAX array, else `jax.numpy`."""
     return jnp if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(trees)) else np
 
 
@@ -140,8 +140,8 @@ def _on_host(leaf: Any) -> Any:
 
 
 def on_device(tree: Any) -> Any:
-    """The pytree with NumPy's arrays converted to JAX's, which keep their values even inside a traced program; arrays
-    of `empty_for_jax` keep their memory, too."""
+    """Convert the NumPy arrays of a pytree to JAX arrays. Inside a function that JAX traces they stay constants with
+    known values. Arrays from `empty_for_jax` are not copied."""
     with jax.ensure_compile_time_eval():
         return jax.tree.map(_on_device, tree)
 
@@ -150,32 +150,32 @@ def _on_device(leaf: Any) -> Any:
     return jax.device_put(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
 
 
-# Bytes from which an array is made in memory that JAX takes over; of smaller ones a copy is faster. JAX takes memory
-# over that is aligned to so many bytes.
-_TAKEN_OVER, _ALIGNED = 1_000_000, 64
+# Size in bytes from which an array is allocated in memory that JAX can use without a copy (copying smaller ones is
+# faster), and alignment in bytes that JAX requires of such memory.
+_MIN_SHARED_BYTES, _JAX_ALIGNMENT = 1_000_000, 64
 
 
-def empty_for_jax(shape: tuple[int, ...], kind: np.dtype) -> np.ndarray:
-    """An array without values, in memory that JAX takes over."""
-    size = math.prod(shape) * kind.itemsize
-    memory = np.empty(size + _ALIGNED, np.uint8)
-    start = -memory.ctypes.data % _ALIGNED
-    return memory[start : start + size].view(kind).reshape(shape)
+def empty_for_jax(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """Return an uninitialised NumPy array whose memory JAX can use without a copy."""
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + _JAX_ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % _JAX_ALIGNMENT
+    return memory[start : start + size].view(dtype).reshape(shape)
 
 
-def product_for_jax(one: Inexact[np.ndarray, "*f k"], other: Inexact[np.ndarray, "k m"]) -> Inexact[Array, "*f m"]:
-    """The product of NumPy's matrices as an array of JAX's. A large one is computed in memory that JAX takes over,
-    because a copy would take longer than the product."""
-    shape, kind = (*one.shape[:-1], other.shape[1]), np.result_type(one, other)
-    if math.prod(shape) * kind.itemsize < _TAKEN_OVER:
-        return _to_jax(one @ other)
-    return jax.device_put(np.matmul(one, other, out=empty_for_jax(shape, kind)))
+def product_for_jax(left: Inexact[np.ndarray, "*f k"], right: Inexact[np.ndarray, "k m"]) -> Inexact[Array, "*f m"]:
+    """Multiply two NumPy matrices and return the product as a JAX array. A large product is computed in memory that JAX
+    can use without a copy, because a copy would take longer than the product."""
+    shape, kind = (*left.shape[:-1], right.shape[1]), np.result_type(left, right)
+    if math.prod(shape) * kind.itemsize < _MIN_SHARED_BYTES:
+        return _to_jax(left @ right)
+    return jax.device_put(np.matmul(left, right, out=empty_for_jax(shape, kind)))
 
 
 @jax.jit
 def _to_jax(array) -> Any:
-    """Convert an array of NumPy's in a quarter of the time of `jax.device_put`. It cannot be used in forked processes,
-    where compiled functions do not run."""
+    """Convert a NumPy array to a JAX array in a quarter of the time of `jax.device_put`. It cannot be used in forked
+    processes, where compiled functions do not run."""
     return array
 
 
@@ -242,7 +242,7 @@ class Recent:
         self._kept: list[tuple[tuple[Any, ...], list[Any], Any, Any]] = []
 
     def __call__(self, *trees: Any) -> Any:
-        """The result of `make` for these arguments, computed or taken from the cache."""
+        """Return the result of `make` for these arguments, computed now or taken from the cache."""
         kept = self._kept[::-1]
         for known, _, _, result in kept:
             if _identical(known, trees):
@@ -284,21 +284,21 @@ def while_loop(condition: Callable[[Any], Any], body: Callable[[Any], Any], stat
     return state
 
 
-def scan(body: Callable[[Any, Any], tuple[Any, Any]], state: Any, each: Any, *, reverse: bool = False) -> Any:
-    """The last state, and the stacked outputs, of `body(state, one)` applied along the first axis of `each`.
+def scan(body: Callable[[Any, Any], tuple[Any, Any]], state: Any, elements: Any, *, reverse: bool = False) -> Any:
+    """The last state, and the stacked outputs, of `body(state, one)` applied along the first axis of `elements`.
     `jax.lax.scan` for JAX's arrays; in NumPy at least one element is needed."""
-    if namespace(state, each) is jnp:
-        return jax.lax.scan(body, state, each, reverse=reverse)
-    given: Any = [None] * len(jax.tree.leaves(each)[0])
+    if namespace(state, elements) is jnp:
+        return jax.lax.scan(body, state, elements, reverse=reverse)
+    given: Any = [None] * len(jax.tree.leaves(elements)[0])
     for k in sorted(range(len(given)), reverse=reverse):
-        state, given[k] = body(state, jax.tree.map(lambda array, k=k: array[k], each))
+        state, given[k] = body(state, jax.tree.map(lambda array, k=k: array[k], elements))
     return state, jax.tree.map(lambda *parts: np.stack(parts), *given)
 
 
-def complex_slope(function: Callable[[Any], Any], x: Any, row: int) -> Any:
+def complex_slope(function: Callable[[Any], Any], x: Any, row_index: int) -> Any:
     """Derivative of `function` with respect to one row of a NumPy array x (n, F), whose columns are independent. See
     `slopes`."""
-    return _complex_step(function, x, row)[1]
+    return _complex_step(function, x, row_index)[1]
 
 
 def _complex_step(function, x, row: int) -> tuple[Any, Any]:
@@ -378,9 +378,9 @@ def call_numpy(function: Callable[..., Any], shape: jax.ShapeDtypeStruct, *argum
     """The array that a `function` of NumPy arrays returns, for arguments whose values need not be known: a compiled
     program calls it.
 
-    Unlike `jax.pure_callback` the function gets views of the program's memory. That copies arguments into arrays of
-    JAX, for which a thread of XLA's has to be free: if as many programs call at once as there are threads, all wait for
-    ever. Under `jax.vmap` the function is called for one element after the other. It is not differentiated.
+    The function gets views of the program's memory. `jax.pure_callback` would copy the arguments into JAX arrays, which
+    needs a free thread of XLA: if as many programs call at once as XLA has threads, all of them wait for ever. Under
+    `jax.vmap` the function is called for one element after the other. It is not differentiated.
     """
     return _numpy_call.bind(*arguments, function=function, shape=tuple(shape.shape), kind=np.dtype(shape.dtype))
 

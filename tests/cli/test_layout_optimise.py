@@ -10,7 +10,7 @@ from rich.console import Console
 
 from jeit.cli.app import as_command
 from jeit.cli.console import Steps
-from jeit.design.commands.layout_optimise import RESULTS, _region
+from jeit.design.commands.layout_optimise import RESULTS, _parse_region
 from jeit.layout import Layout, read_layout, write_layout
 from jeit.mesh import Disk, Rectangle
 
@@ -61,7 +61,7 @@ def test_progress_says_the_step_and_the_best_score(monkeypatch):
     ],
 )
 def test_regions_to_keep_out(text, region):
-    found = _region(text, Rectangle(0.2, 0.2))
+    found = _parse_region(text, Rectangle(0.2, 0.2))
     assert type(found) is type(region)
     np.testing.assert_allclose(found.extent, region.extent, atol=1e-15)
 

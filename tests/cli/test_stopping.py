@@ -79,14 +79,14 @@ def test_while_it_is_made_ready(tank, streamed, tmp_path, monkeypatch):
 def test_while_a_frame_is_imaged_it_is_finished(tank, streamed, tmp_path, monkeypatch):
     from jeit.report import stream as stream_module
 
-    row = stream_module._row
+    row = stream_module._table_row
 
     def signalled(one, *rest):
         if one.number == 1:
             signal.raise_signal(signal.SIGINT)
         return row(one, *rest)
 
-    monkeypatch.setattr(stream_module, "_row", signalled)
+    monkeypatch.setattr(stream_module, "_table_row", signalled)
     status, _, error = streamed(lines(tank, 5))
     assert (status, error) == (130, "jeit: stopped after 2 frames; frames.csv and images.npz have them.\n")
     assert read(tmp_path / "out") == (2, 2)

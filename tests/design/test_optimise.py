@@ -20,7 +20,7 @@ from jeit.design import (
     touches_away_from_the_edge,
 )
 from jeit.design.optimisation.design_space import Constraints, descend
-from jeit.design.optimisation.variables import Variables, Varied, balanced
+from jeit.design.optimisation.variables import Variables, Varied, balanced_score
 from jeit.design.skin.sheet_touches import sheet_touches
 from jeit.electrodes import PointElectrodes
 from jeit.forward import ForwardModel
@@ -67,8 +67,8 @@ def distances(centres):
 def test_optimised_layout_is_better_by_far(found):
     assert found.value > found.start_value + 2
     before = layout_scores(MODEL, 2e-3, TOUCHES, **SETTING)
-    np.testing.assert_allclose(found.start_value, balanced(before), rtol=1e-9)
-    np.testing.assert_allclose(found.value, balanced(found.scores), rtol=1e-9)
+    np.testing.assert_allclose(found.start_value, balanced_score(before), rtol=1e-9)
+    np.testing.assert_allclose(found.value, balanced_score(found.scores), rtol=1e-9)
     assert found.scores.soft_worst > 2 * before.soft_worst
     assert found.scores.mean_variance < 0.7 * before.mean_variance
     assert found.status in ("converged", "step limit")
@@ -172,7 +172,7 @@ def test_contact_impedance_and_thickness_are_varied():
     model = MODEL.with_electrodes(found.layout.sheet_discs())
     touches = sheet_touches(MESH, Bell(deviation=12e-3), PLACES, thickness=thickness)
     scores = layout_scores(model, 2e-3 * thickness / 0.01, touches, **SETTING)
-    np.testing.assert_allclose(found.value, balanced(scores), rtol=1e-6)
+    np.testing.assert_allclose(found.value, balanced_score(scores), rtol=1e-6)
     np.testing.assert_allclose(found.scores.sensitivity, scores.sensitivity, rtol=1e-6)
     fixed = optimise(steps=5)
     assert found.value > fixed.value + 0.3
@@ -307,7 +307,7 @@ def test_starts_that_end_outside_the_constraints_are_reported(monkeypatch):
     def descent(variables, constraints, values):
         return jnp.broadcast_to(variables.start, values.shape)
 
-    monkeypatch.setattr("jeit.design.optimisation.optimise._feasible", descent)
+    monkeypatch.setattr("jeit.design.optimisation.optimise._make_feasible", descent)
     crowded = Layout(0.4 * START.centres, 8e-3, outline=SKIN, name="low")  # for the program of the others
     found = optimise_from_three(layout=crowded, steps=1)
     assert (found.status, found.best) == ("infeasible", None)

@@ -81,7 +81,7 @@ def test_a_layer_knows_the_nodes_that_are_reached():
 def test_no_more_than_fits():
     sheet = made(0)
     everywhere = np.ones(sheet.model.mesh.num_points, bool)
-    assert RestingSkin.create(sheet.model, sheet.model_conductivity, everywhere, most=1e4) is None
+    assert RestingSkin.create(sheet.model, sheet.model_conductivity, everywhere, max_bytes=1e4) is None
 
 
 def test_what_is_not_found():

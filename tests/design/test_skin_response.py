@@ -19,7 +19,7 @@ from jeit.design import (
     touch_grid,
     touches_away_from_the_edge,
 )
-from jeit.design.comparison import comparison
+from jeit.design.comparison import comparison_figures
 from jeit.design.measurements import random_selections
 from jeit.design.skin.protocol import skin_protocol
 from jeit.layout import Layout, grid
@@ -50,7 +50,7 @@ def test_touches_insulate_or_conduct(contrast):
 
 def test_a_comparison_with_itself_has_no_blind_spot():
     _, response = respond()
-    one, other = comparison(response, response)
+    one, other = comparison_figures(response, response)
     assert one == other
     assert one["blind_spot_fraction"] == 0
     theta = np.asarray(response.sensitivity.values)

@@ -123,7 +123,7 @@ def test_titles_tell_what_differs(tmp_path):
         .replace("[touch]", '[scores]\nwanted = "blind_spot"\n[touch]')
     )
     (tmp_path / "study.toml").write_text(varied, "utf-8")
-    titles = pictures.titles_of(read_study(tmp_path / "study.toml"))
+    titles = pictures.point_titles(read_study(tmp_path / "study.toml"))
     assert len(set(titles)) == 16
     assert titles[0] == "0: grid-4x2\n⌀ 8 mm, all pairs\nnoise 1e-06 V"
     assert titles[15] == "15: perimeter-8\n⌀ 10 mm, 9 pairs\nnoise 2e-06 V"

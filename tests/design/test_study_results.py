@@ -144,9 +144,9 @@ def test_a_place_that_cannot_be_told_is_infinite_and_counted(study, store_path, 
 
 def compiled(study, *scores) -> str:
     """The program of two points of a study, for its own scores or others."""
-    shared, skin = batch._shared(study, study.points[0].shape), batch._varied(study.points[0], study.current)
+    shared, skin = batch._shared_data(study, study.points[0].shape), batch._point_data(study.points[0], study.current)
     options = {"num_taxels": study.num_taxels, "threshold": study.threshold, "num_devices": 1}
-    lowered = batch._batch.lower(shared, batch._stacked([skin] * 2), scores=scores or study.scores, **options)
+    lowered = batch._solve_batch.lower(shared, batch._stack_trees([skin] * 2), scores=scores or study.scores, **options)
     return lowered.compile().as_text() or ""
 
 

@@ -10,7 +10,7 @@ import pytest
 from kinds import MODELS, QUICK
 
 from jeit.electrodes import BoundaryElectrodes, CombinedElectrodes, FacePatches, PointElectrodes
-from jeit.forward.changes import Change, solved_fields
+from jeit.forward.changes import ConductivityChange, solved_fields
 from jeit.forward.transfer import electrode_fields
 
 SEED = 7
@@ -127,8 +127,8 @@ def test_changes_of_some_cells_need_no_whole_jacobian(model):
     rng = np.random.default_rng(SEED)
     cells = np.flatnonzero(rng.random(model.mesh.num_cells) < 0.2)
     changes = [
-        Change(None, rng.normal(size=(model.mesh.num_cells, 2))),
-        Change(cells, rng.normal(size=(len(cells), 3))),
+        ConductivityChange(None, rng.normal(size=(model.mesh.num_cells, 2))),
+        ConductivityChange(cells, rng.normal(size=(len(cells), 3))),
     ]
     conductivity = uneven(model)
     solved = solved_fields(model, conductivity)

@@ -121,8 +121,8 @@ def test_a_solver_that_is_asked_for_is_used(parts):
 def test_a_large_jacobian_is_filled_on_all_cores(parts, monkeypatch):
     model = ForwardModel(*parts)
     expected = np.asarray(model.jacobian(1.0))
-    monkeypatch.setattr(forward_model, "_BLOCK", 200)
-    monkeypatch.setattr(forward_model, "_WORTH_A_THREAD", 2)
+    monkeypatch.setattr(forward_model, "_BLOCK_ENTRIES", 200)
+    monkeypatch.setattr(forward_model, "_MIN_PARALLEL_BLOCKS", 2)
     assert_same(model.jacobian(1.0), expected)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.image import Plane, cut_by_plane, isosurface_of, node_values
-from jeit.image.plane import part_above, passed
+from jeit.image.plane import crossed_cells, part_above
 from jeit.mesh import Mesh, box, centroids, cylinder, measures, rectangle
 
 BOX = (0.17, 0.255, 0.17)
@@ -172,7 +172,7 @@ def test_every_way_of_passing_a_tetrahedron():
     points, cell = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2, 3]])
     for number in range(16):
         signs = np.array([1.0 if number >> k & 1 else -1.0 for k in range(4)])
-        pieces = passed(cell, signs)
+        pieces = crossed_cells(cell, signs)
         above = int((signs > 0).sum())
         assert len(pieces.cell) == (above in (1, 2, 3))
         if not len(pieces.cell):

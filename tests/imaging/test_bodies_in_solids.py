@@ -25,7 +25,7 @@ from jeit.imaging import (
 )
 from jeit.inverse import Laplace
 from jeit.inverse.shapes import Ellipsoid, Quantities, ShapeReconstruction
-from jeit.inverse.shapes.quantities import including
+from jeit.inverse.shapes.quantities import include_deviation
 from jeit.mesh import Disk, Rectangle, Solid, centroids
 from jeit.protocol import opposite, skip
 from jeit.report import image as image_report
@@ -264,14 +264,14 @@ def test_where_electrodes_do_not_distinguish_the_kind_of_a_body_it_is_doubted_an
     whole = SimpleNamespace(measurement=frame, reference=frame, mesh=SimpleNamespace(dimension=3))
     image: Any = SimpleNamespace(shapes=shapes, reconstruction=shapes, calibration=calibration, **vars(whole))
     own = Quantities(2.0, (1.7, 2.3), 3e-5, (2e-5, None), 1.5e-5, (1.4e-5, 1.6e-5))
-    known = including(own, body(False, np.log(6)), 0.5)
+    known = include_deviation(own, body(False, np.log(6)), 0.5)
     np.testing.assert_allclose(known.change_interval, (1.7, 6 * np.exp(0.5) - 1))
     assert known.measure_interval == (2e-5, None)
     np.testing.assert_allclose(known.strength_interval, (1.4e-5, 3e-5 * 5 / 8))
-    assert including(own, None, np.nan) == own
+    assert include_deviation(own, None, np.nan) == own
     (doubt,) = ImagedDifference.doubts.fget(image)  # pyright: ignore
     assert "x 12 mm, y -25 mm may as well be no column but an ellipsoid, of 6 times the background and 30 cm³" in doubt
-    told = image_report._shapes(image)["bodies"]  # pyright: ignore
+    told = image_report._shapes_report(image)["bodies"]  # pyright: ignore
     assert told[0]["form"] == "column"
     assert told[0]["or"]["form"] == "ellipsoid"
     np.testing.assert_allclose(told[0]["or"]["conductivity_over_background"], 6)

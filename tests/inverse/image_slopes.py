@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jeit.inverse.nonlinear.problem import as_solution
-from jeit.inverse.nonlinear.solvers import AbstractSolver, Solved
+from jeit.inverse.nonlinear.solvers import AbstractSolver, Solution
 from jeit_solvers import Status
 
 
@@ -27,7 +27,7 @@ class Known(AbstractSolver):
     def minimise(self, inversion, start, box):
         found = as_solution(self.coefficients, inversion, box)
         costs = jnp.stack([inversion.cost(start), inversion.cost(found)])
-        return Solved(found, 0, costs, Status.CONVERGED.number, "")
+        return Solution(found, 0, costs, Status.CONVERGED.number, "")
 
 
 def assert_gradient(function, theta, size, *, equal=1e-8, compiled=False):

@@ -12,7 +12,7 @@ from jeit.inverse import Gaussian, TotalVariation, reconstruct
 from jeit.inverse.nonlinear.problem import independent_data
 from jeit.inverse.shapes import EllipsoidPrior, StarPrior, ellipsoid, reconstruct_shapes, search
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
-from jeit.inverse.shapes.finer import finer
+from jeit.inverse.shapes.finer import refine_at_surfaces
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import box, measures
 from jeit.protocol import opposite
@@ -97,7 +97,7 @@ def test_the_kind_of_bodies_may_be_known(coarse):
     columns, point = bodies.otherwise([0], bodies.of_radii([RADIUS]))
     assert columns.odds == 0
     problem: Any = None
-    assert search._otherwise(problem, Fit(bodies, point, 1.0, ROWS)) is None  # pyright: ignore
+    assert search._alternative_fits(problem, Fit(bodies, point, 1.0, ROWS)) is None  # pyright: ignore
     assert ellipsoid.alternatives(problem, Fit(columns, point, 1.0, ROWS)) == [
         (None, pytest.approx(np.nan, nan_ok=True))
     ]
@@ -298,7 +298,7 @@ def test_on_a_finer_mesh_a_ball_changes_voltages_as_on_one_cut_along_it(coarse, 
     prior = EllipsoidPrior(modes=1, contrast=abs(np.log(factor)))
     balls = Ellipsoids.create(coarse.mesh, prior, [BALL], [1 if factor > 1 else -1])
     fit = Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS)
-    there = finer(shape_problem(coarse), fit, (0.5,))
+    there = refine_at_surfaces(shape_problem(coarse), fit, (0.5,))
     assert coarse.mesh.num_points < there.problem.model.mesh.num_points < 3 * coarse.mesh.num_points
     change = there.change(coarse.protocol, there.bodies.image(fit.coefficients).image, 0.0)
     assert np.linalg.norm(change - wanted) < 0.08 * np.linalg.norm(wanted)
@@ -311,7 +311,7 @@ def test_plates_and_discs_stay_where_they_are_on_a_finer_mesh():
     given = ForwardModel(mesh, electrodes, opposite(18, current=1e-3))
     problem = shape_problem(given)
     balls = Ellipsoids.create(mesh, EllipsoidPrior(), [[0.0, -0.06, 0.05]], [1])  # over the wall
-    there = finer(problem, Fit(balls, balls.of_radii([0.02]), 0.0, ROWS), (0.3,))
+    there = refine_at_surfaces(problem, Fit(balls, balls.of_radii([0.02]), 0.0, ROWS), (0.3,))
     model = there.problem.model
     assert model.mesh.num_points > 2 * mesh.num_points
     area, given_area = (np.asarray(one.electrodes.contact(one.mesh).load).sum(axis=0) for one in (model, given))
@@ -327,7 +327,7 @@ def test_cut_cells_are_harmonic_means_of_conductive_bodies_and_gentler_ones_of_r
 
 def test_finer_cells_know_which_they_come_from(coarse):
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
-    there = finer(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.5,))
+    there = refine_at_surfaces(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.5,))
     volume = np.asarray(measures(there.problem.model.mesh))
     np.testing.assert_allclose(np.bincount(there.cell, volume), np.asarray(measures(coarse.mesh)), rtol=1e-9)
 
@@ -336,10 +336,10 @@ def test_the_first_edges_that_make_a_mesh_grow_little_are_taken():
     coarse = model(400)
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
     fit, problem = Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), shape_problem(coarse)
-    few, many = (finer(problem, fit, (edge,)).problem.model.mesh.num_points for edge in (1.0, 0.3))
+    few, many = (refine_at_surfaces(problem, fit, (edge,)).problem.model.mesh.num_points for edge in (1.0, 0.3))
     assert few < 1.5 * coarse.mesh.num_points < many
-    assert finer(problem, fit, (0.3, 1.0)).problem.model.mesh.num_points == few
-    assert finer(problem, fit, (1.0, 0.3)).problem.model.mesh.num_points == few
+    assert refine_at_surfaces(problem, fit, (0.3, 1.0)).problem.model.mesh.num_points == few
+    assert refine_at_surfaces(problem, fit, (1.0, 0.3)).problem.model.mesh.num_points == few
 
 
 def test_bodies_have_moved_once_their_surfaces_have(ellipsoids):
@@ -366,9 +366,9 @@ def test_of_many_to_start_from_only_those_that_data_ask_for_are_taken(coarse, fi
     change = np.asarray(cut_along.voltages(BATH * np.where(held, 4.0, 1.0))) - rest
     frame, noise = np.asarray(coarse.voltages(BATH)) + change, np.full(len(change), 0.03 * np.sqrt(np.mean(change**2)))
     small, data = independent_data(coarse, frame, np.ones(len(change), bool), noise, at_once=True)  # pyright: ignore
-    setting = search._Setting(ShapeProblem(small, data, np.full(coarse.mesh.num_cells, BATH)), None)
+    setting = search._FitSetting(ShapeProblem(small, data, np.full(coarse.mesh.num_cells, BATH)), None)
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), [BALL + 0.008, [-0.03, 0.04, 0.03]], [1, -1])
-    _, fit, chosen = search._added_one_by_one(setting, balls, balls.of_radii([0.025, 0.02]))
+    _, fit, chosen = search._add_bodies(setting, balls, balls.of_radii([0.025, 0.02]))
     assert chosen == [0]
     assert len(fit.bodies.sign) == 1
 
@@ -386,7 +386,7 @@ def test_those_beyond_doubt_are_fitted_together_before_others_are_tried(coarse):
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), places, [1, 1, -1])
     start: Any = balls.of_radii([0.02, 0.02, 0.02])
     recorded: Any = Recorded()
-    _, _, chosen = search._added_one_by_one(recorded, balls, start, 2)
+    _, _, chosen = search._add_bodies(recorded, balls, start, 2)
     assert chosen == [0, 1]
     assert [signs for signs, _ in fitted] == [[1, 1], [1, 1, -1]]
     np.testing.assert_array_equal(fitted[0][1], balls.without(2, start)[1])

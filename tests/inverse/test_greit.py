@@ -8,7 +8,7 @@ from jeit.electrodes import BoundaryElectrodes, PointElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Raster, figures_of_merit
 from jeit.inverse import greit, one_step
-from jeit.inverse.linear.greit import _desired_images, _targets
+from jeit.inverse.linear.greit import _desired_images, _place_targets
 from jeit.layout import perimeter, ring
 from jeit.mesh import Rectangle, Refine, box, centroids, disk, measures
 from jeit.protocol import adjacent, two_terminal
@@ -86,7 +86,7 @@ def test_matrix_is_the_fit_of_desired_images_to_responses(model):
     found = np.asarray(
         greit(model, 1.0, noise=jnp.asarray(noise), mask=jnp.asarray(mask), hyperparameter=1e-6, num_targets=200).matrix
     )
-    position, covered = _targets(model.mesh, np.zeros(2), 0.05 * body_radius(model.mesh), 200)
+    position, covered = _place_targets(model.mesh, np.zeros(2), 0.05 * body_radius(model.mesh), 200)
     area = covered.T @ np.asarray(measures(model.mesh))
     desired = _desired_images(model.mesh, position, area, 0.25 * body_radius(model.mesh)).toarray()
     jacobian = np.asarray(model.jacobian(1.0))[mask]
@@ -105,7 +105,7 @@ def body_radius(mesh):
 
 def test_targets_are_spread_evenly_within_the_outline():
     mesh = on_a_rectangle(400).mesh
-    position, covered = _targets(mesh, np.zeros(2), 0.007, 500)
+    position, covered = _place_targets(mesh, np.zeros(2), 0.007, 500)
     # A strip half a spacing wide at the edge holds no centre of a target that lies inside.
     assert 420 < len(position) < 520
     assert (np.abs(position) < np.array([0.15, 0.1]) - 0.005).all()

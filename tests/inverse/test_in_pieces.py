@@ -31,8 +31,8 @@ def test_jacobians_are_joined_of_pieces(number, model, monkeypatch):
     """Of more channels than fields have products, and of fewer."""
     weights, channels = RANDOM.normal(size=(3, number)), np.arange(number)
     expected = weights @ np.asarray(model.jacobian(1.0))[:number]
-    monkeypatch.setattr(forward_model, "_CELLS", 70)
-    monkeypatch.setattr(forward_model, "_BLOCK", 70 * number)
+    monkeypatch.setattr(forward_model, "_CELLS_AT_ONCE", 70)
+    monkeypatch.setattr(forward_model, "_BLOCK_ENTRIES", 70 * number)
     assert model.mesh.num_cells > 3 * 70
     assert model.mesh.num_cells % 70
     found = combined_jacobian(model, 1.0, channels, weights)
@@ -89,9 +89,9 @@ def test_samples_far_from_all_of_greits_targets_are_passed_over_unnoticed(monkey
     """Shares of balls are those of all samples; the grid is not that of the body's corner."""
     mesh = box(0.1, 0.13, 0.09, num_points=400)
     middle = np.array([0.003, -0.004, 0.046])
-    position, covered = greit._targets(mesh, middle, 0.012, 60)
-    monkeypatch.setattr(greit, "_CLOSE", 1e6)
-    everywhere, expected = greit._targets(mesh, middle, 0.012, 60)
+    position, covered = greit._place_targets(mesh, middle, 0.012, 60)
+    monkeypatch.setattr(greit, "_SEARCH_RADII", 1e6)
+    everywhere, expected = greit._place_targets(mesh, middle, 0.012, 60)
     np.testing.assert_array_equal(position, everywhere)
     assert len(position) > 5
     np.testing.assert_allclose(covered.toarray(), expected.toarray(), rtol=0, atol=1e-12)

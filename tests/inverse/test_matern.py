@@ -57,7 +57,7 @@ def test_variance_is_even_up_to_the_wall():
 def test_estimated_variances_are_near_the_exact_ones(monkeypatch):
     mesh = disk(1.0, num_points=600)
     exact = Matern(0.25)._field(mesh, 0.0)
-    monkeypatch.setattr("jeit.inverse.prior.matern._FEW", 10)
+    monkeypatch.setattr("jeit.inverse.prior.matern._MAX_EXACT_NODES", 10)
     assert np.asarray(Matern(0.25)._field(mesh, 0.0).scale) == pytest.approx(exact.scale, rel=0.15)
 
 
@@ -111,7 +111,7 @@ def test_of_many_cells_fewer_shapes_make_the_same_image(prior, least, monkeypatc
         return np.asarray(one.conductivity) - 1, np.asarray(bars)
 
     image, deviation = found()
-    monkeypatch.setattr(priors, "_MANY", 10)
+    monkeypatch.setattr(priors, "_LARGE_MESH_CELLS", 10)
     monkeypatch.setattr(GriddedGaussian, "suits", staticmethod(lambda places, length: True))
     few, bars = found()
     assert np.abs(few - image).max() < 0.03 * np.abs(image).max()
@@ -148,7 +148,7 @@ def test_laplace_of_many_cells_is_of_their_nodes(monkeypatch):
     """Γ is symmetric and positive, and smooth: of white rows it keeps a small share of the steps between cells."""
     mesh = box(1.0, 1.0, 1.0, num_points=300)
     rows = np.random.default_rng(1).normal(size=(2, mesh.num_cells))
-    monkeypatch.setattr(priors, "_MANY", 10)
+    monkeypatch.setattr(priors, "_LARGE_MESH_CELLS", 10)
     product = np.asarray(Laplace().covariance_product(mesh, rows))
     inner = rows @ product
     assert inner[0, 1] == pytest.approx(inner[1, 0], rel=1e-9)

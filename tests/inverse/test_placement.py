@@ -10,11 +10,11 @@ from jeit.data import Measurement
 from jeit.data.imageable import rounding_of_difference
 from jeit.electrodes import FaceDiscs, FacePatches, NodeElectrodes, SheetDiscs
 from jeit.electrodes.body_mesh import body_mesh
-from jeit.forward.changes import PlacementSensitivity, shifted
+from jeit.forward.changes import PlacementSensitivity, shift_electrodes
 from jeit.imaging import preparation
 from jeit.imaging.preparation import prepare_difference
 from jeit.inverse import relative_noise
-from jeit.inverse.placement import ModelError, Uncertainty, _Problem, place_electrodes
+from jeit.inverse.placement import ModelError, Uncertainty, _PlacementProblem, place_electrodes
 from jeit.mesh import cylinder
 
 RADIUS, SIGMA, WIDTH = 0.1, 0.02, 0.02
@@ -173,7 +173,7 @@ def test_sensitivity_to_places_and_contacts_is_the_derivative(kind):
 
     def impedance_at(one, step):
         by_shift = (step * (np.arange(number) == one)).reshape(shape)
-        moved = shifted(electrodes, sensitivity.directions, by_shift)
+        moved = shift_electrodes(electrodes, sensitivity.directions, by_shift)
         contact = impedance_of(moved) * np.exp(step * (np.arange(4) == one - number))
         return np.asarray(model.with_electrodes(moved.with_contact_impedance(contact)).transfer_impedance(SIGMA))
 
@@ -214,7 +214,7 @@ def test_the_noise_is_estimated_from_the_residual():
     model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)
     exact = np.asarray(model.voltages(1.0))
     noise = 0.5 * np.asarray(relative_noise(exact)) * np.random.default_rng(0).normal(size=len(exact))
-    problem = _Problem(model, exact + noise, np.ones(len(exact), bool), 1e-6)
+    problem = _PlacementProblem(model, exact + noise, np.ones(len(exact), bool), 1e-6)
     here = problem.at(np.zeros(33))
     assert here is not None
     assert problem.noise_and_covariance(here, 0.5)[0] == pytest.approx(0.5, rel=0.15)

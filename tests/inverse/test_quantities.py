@@ -14,8 +14,8 @@ from jeit.inverse.channels import Data
 from jeit.inverse.placement import ModelError
 from jeit.inverse.shapes import Accuracy, StarPrior, ellipsoid, reconstruct_shapes
 from jeit.inverse.shapes.problem import ShapeProblem, SmoothField
-from jeit.inverse.shapes.quantities import _Held, _summary
-from jeit.inverse.shapes.search import _Setting
+from jeit.inverse.shapes.quantities import _HeldFits, _summary
+from jeit.inverse.shapes.search import _FitSetting
 from jeit.mesh import centroids, measures
 
 RADIUS, SIGMA = 0.1, 0.02
@@ -103,7 +103,7 @@ def test_other_weights_of_the_data_leave_the_smooth_field_as_it_is():
     jacobian, weights = random.normal(size=(4, 3)), (np.ones(4), random.uniform(1, 3, 4))
     data = [Data(np.zeros(4), one, np.eye(4), np.eye(4), 0.0) for one in weights]  # pyright: ignore
     alone = ShapeProblem(None, data[0], np.ones(2))  # pyright: ignore
-    setting = _Setting(alone, SmoothField(None, jacobian, np.ones(2), alone))  # pyright: ignore
+    setting = _FitSetting(alone, SmoothField(None, jacobian, np.ones(2), alone))  # pyright: ignore
     found = setting.weighted(data[1]).problem(0.5).data
     volts = np.asarray(found.covariance) / np.outer(weights[1], weights[1])
     np.testing.assert_allclose(volts, np.diag(1 / weights[1] ** 2) + 0.25 * jacobian @ jacobian.T, rtol=1e-12)
@@ -130,7 +130,7 @@ def test_numbers_are_right_in_a_tank_that_is_not_as_described(change, radius):
 
 
 def held(contrast, unlikely, area=1e-3):
-    return _Held(float(np.log(contrast)), unlikely, float(np.log(area)), 0.05)
+    return _HeldFits(float(np.log(contrast)), unlikely, float(np.log(area)), 0.05)
 
 
 def test_what_the_likelihood_says_is_summed_up():

@@ -110,7 +110,7 @@ HEADER = "x_mm,y_mm,diameter_mm\n"
     [
         ("", "bad.csv: the file is empty; the first line names the columns: x_mm, y_mm, diameter_mm"),
         (HEADER, "no electrode below"),
-        ("x,y_mm,diameter_mm\n0,0,6\n", "'x' does not say its unit; call it x_mm"),
+        ("x,y_mm,diameter_mm\n0,0,6\n", "'x' does not state a unit; call it x_mm"),
         ("0,0,6\n40,0,6\n", "no column '0'"),
         ("x_mm,y_mm\n0,0\n", "no column diameter_mm"),
         ("x_mm,y_mm,diameter_mm,pin\n0,0,6,1\n", "no column 'pin'"),

@@ -22,7 +22,7 @@ from jeit.inverse.shapes import Quantities, Star
 from jeit.layout import perimeter, ring
 from jeit.mesh import Disk, Polygon, Rectangle, Solid, centroids, disk, layer, rectangle
 from jeit.plot import ColourScale, plot_image, plot_mesh
-from jeit.plot.axes import bare, extent_of
+from jeit.plot.axes import extent_of, hide_axes
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions, draw_outlines
 from jeit.plot.imaging.image import plot_raster, plot_sensitivity
 from jeit.plot.imaging.series import plot_series
@@ -175,7 +175,7 @@ def test_numbers_of_rings_lie_beside_their_electrodes(outline, inches, ax):
         quarter = [[0.075, 0.025], [0.075, 0.075], [0.055, 0.1], [0.018, 0.1]]
         level = np.concatenate([np.array(quarter) * side for side in ([1, 1], [-1, 1], [-1, -1], [1, -1])])
     places = np.concatenate([np.column_stack([level, np.full(16, height)]) for height in (0.01, 0.03)])
-    bare(draw_electrodes(tank, FaceDiscs(places, 0.004, 0.1), ax=ax), extent_of(tank.points))
+    hide_axes(draw_electrodes(tank, FaceDiscs(places, 0.004, 0.1), ax=ax), extent_of(tank.points))
     ax.figure.set_size_inches(inches)
     ax.figure.canvas.draw()
     dots, radius = ax.transData.transform(level), np.sqrt(28 / np.pi) * ax.figure.dpi / 72

@@ -15,7 +15,7 @@ from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit.report import write_stream
 from jeit.report.growing import GrowingRows, GrowingTable, Sample
-from jeit.report.stream import _Seen
+from jeit.report.stream import _StreamSummary
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,7 @@ def test_noise_does_not_fill_the_colours(calibrated):
     """Where no frame has changed, the scale ends at 1 % of the background; else at the largest change."""
     noise = 1 + np.full(calibrated.model.mesh.num_cells, 1e-6)
     unchanged = FrameImage(0, noise, FrameStatus.UNCHANGED, "no change", np.ones(40, bool), 0.5, 0, 1e-3)
-    seen = _Seen(calibrated)
+    seen = _StreamSummary(calibrated)
     seen.take(unchanged)
     assert seen.limit == pytest.approx(0.01)
     for one in images(calibrated, 1):

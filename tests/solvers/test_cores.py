@@ -11,7 +11,7 @@ import threadpoolctl
 from jeit_solvers import analyse, factorise, on_cores
 from jeit_solvers.cores import blas, one_thread_of_blas, parts_for_cores
 from jeit_solvers.engines import on_host
-from jeit_solvers.sparse import multifrontal
+from jeit_solvers.sparse import padded_fronts_jax
 
 
 def threads_of_blas():
@@ -108,8 +108,8 @@ def test_a_factor_does_not_depend_on_how_its_fronts_are_shared(case, monkeypatch
     pattern, values, coordinates = case()
     plan, values = on_host((analyse(pattern, coordinates), values))
     alone = factorise(plan, values)
-    monkeypatch.setattr(multifrontal, "_WORTH_A_THREAD", 0)
-    monkeypatch.setattr(multifrontal, "parts_for_cores", lambda number: [slice(k, k + 1) for k in range(number)])
+    monkeypatch.setattr(padded_fronts_jax, "_MIN_PARALLEL_ENTRIES", 0)
+    monkeypatch.setattr(padded_fronts_jax, "parts_for_cores", lambda number: [slice(k, k + 1) for k in range(number)])
     shared = factorise(plan, values)
     for one, other in zip(alone.inverses + alone.lowers, shared.inverses + shared.lowers, strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-14)

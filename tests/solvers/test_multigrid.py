@@ -20,9 +20,9 @@ pytest.importorskip("pyamg", reason="PyAMG, of the extra `large`, is not install
 @pytest.fixture(autouse=True)
 def of_many_levels(monkeypatch):
     """Small problems get three levels, and groups of few columns."""
-    monkeypatch.setattr(multigrid, "_COARSEST", 3)
-    monkeypatch.setattr(multigrid, "_COLUMNS", 2)
-    monkeypatch.setattr(multigrid, "_LAST", multigrid.LastMatrix())
+    monkeypatch.setattr(multigrid, "_MAX_COARSEST_SIZE", 3)
+    monkeypatch.setattr(multigrid, "_MAX_COLUMNS", 2)
+    monkeypatch.setattr(multigrid, "_LAST_HIERARCHY", multigrid.LastMatrix())
 
 
 def problem(case):

@@ -38,7 +38,7 @@ def blocks(inverse, places):
 def all_pairs(strips, inverse, wanted, reach):
     """Pairs of wanted unknowns that lie near enough, and G between them."""
     place = strips.place[wanted]
-    strip = place // strips.wanted
+    strip = place // strips.selected_per_strip
     first, second = np.nonzero(np.abs(strip[:, None] - strip) <= reach)
     found = blocks(inverse, np.stack([place[first], place[second]], axis=1))
     return wanted[first], wanted[second], np.asarray(found)[:, 0, 1]
@@ -72,9 +72,9 @@ def test_strips_are_coupled_to_the_next_only_and_hold_all():
         pattern, _, coordinates = problem()
         strips = Strips.create(pattern, coordinates, np.ones(pattern.size, bool))
         assert len(np.unique(strips.position)) == pattern.size
-        strip = strips.position // strips.size
+        strip = strips.position // strips.strip_size
         assert np.abs(strip[np.asarray(pattern.rows)] - strip[np.asarray(pattern.columns)]).max() <= 1
-        assert len(np.unique(strip)) == strips.number
+        assert len(np.unique(strip)) == strips.num_strips
 
 
 def test_products_are_added():
@@ -102,5 +102,5 @@ def test_what_is_not_positive_definite_is_not_a_number():
 def test_groups_reach_from_their_first_strip_to_their_last():
     pattern, _, coordinates = one_row()
     strips = Strips.create(pattern, coordinates, np.ones(21, bool))
-    assert strips.reach(strips.place[np.array([[0, 0, 1], [4, 9, 6]])]) == 5
-    assert strips.reach(strips.place[np.array([[7, 7]])]) == 1
+    assert strips.max_strip_distance(strips.place[np.array([[0, 0, 1], [4, 9, 6]])]) == 5
+    assert strips.max_strip_distance(strips.place[np.array([[7, 7]])]) == 1

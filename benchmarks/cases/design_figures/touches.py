@@ -105,12 +105,12 @@ def blind(told: dict) -> str:
 
 def comparison_table(setting: Setting, changed: dict[str, Array]) -> Table:
     """Both layouts for several margins, and with all pairs, beside the paper."""
-    from jeit.design.comparison import comparison
+    from jeit.design.comparison import comparison_figures
 
     rows = [["Park et al. 2022", "94", "33 %", "", "12.6 ± 1.4", "41", "30.5 ± 27.3", "112"]]
     for margin, pairs in [*((margin, PAIRS) for margin in setting.margins), (MARGIN, 496)]:
         inner, boundary = (response_of(name, setting, changed[name], margin, pairs) for name in LAYOUTS)
-        one, other = comparison(inner, boundary)
+        one, other = comparison_figures(inner, boundary)
         percentile = np.percentile(np.asarray(inner.sensitivity.values), 1)
         below = f"{100 * float(boundary.sensitivity.blind_spot(percentile)):.1f} %"
         row = [f"here, {1e3 * margin:g} mm", str(pairs), blind(other), below]
@@ -122,7 +122,7 @@ def comparison_table(setting: Setting, changed: dict[str, Array]) -> Table:
 
 def thickness_table(setting: Setting) -> tuple[Table, dict[float, list[SkinResponse]]]:
     """Both layouts on layers of several thicknesses, and what they feel."""
-    from jeit.design.comparison import comparison
+    from jeit.design.comparison import comparison_figures
 
     rows, studied = [], {}
     for thickness, num_layers in (*setting.study, *setting.check):
@@ -130,7 +130,7 @@ def thickness_table(setting: Setting) -> tuple[Table, dict[float, list[SkinRespo
         mesh = setting.study_cell, num_layers
         both = [response_of(name, setting, changes(name, setting.places, mesh, thickness)) for name in LAYOUTS]
         studied.setdefault(thickness, both)
-        for name, told in zip(LAYOUTS, comparison(*both), strict=True):
+        for name, told in zip(LAYOUTS, comparison_figures(*both), strict=True):
             row = [f"{1e3 * thickness:g}", str(num_layers), name]
             row += [f"{1e3 * told['sensitivity_min_V']:.3g}", f"{1e3 * told['sensitivity_mean_V']:.3g}"]
             row += [f"{told['sensitivity_uniformity']:.2f}", blind(told), area(told), largest(told)]
@@ -142,7 +142,7 @@ def thickness_table(setting: Setting) -> tuple[Table, dict[float, list[SkinRespo
 def kinds_table(setting: Setting, changed: dict[str, Array]) -> Table:
     """Both layouts for a bell and a hemisphere, insulating and conducting ten times as well as the skin."""
     from jeit.design import Bell, Hemisphere
-    from jeit.design.comparison import comparison
+    from jeit.design.comparison import comparison_figures
 
     rows = []
     for shape in setting.shapes:
@@ -156,7 +156,7 @@ def kinds_table(setting: Setting, changed: dict[str, Array]) -> Table:
                     options = {"indentation": indentation, "contrast": contrast}
                     known = changes(name, setting.places, setting.mesh, **options)
                 both.append(response_of(name, setting, known))
-            one, other = comparison(*both)
+            one, other = comparison_figures(*both)
             least = [f"{1e3 * told['sensitivity_min_V']:.3g}" for told in (one, other)]
             row = [f"{kind} {shape}", *least, blind(other), blind(one), area(one), f"{one['two_point_mm']:.0f}"]
             rows.append([*row, area(other), largest(other)])

@@ -16,7 +16,7 @@ from scipy.special import chdtri
 from jeit.acoustic import Calibration, MicrophoneArray
 from jeit.acoustic.surface import AbstractSurface, bounding_box, make_surface
 from jeit.mesh import Domain
-from jeit.plot.axes import INK, SOFT, bare, draw_scale_bar, extent_of
+from jeit.plot.axes import INK, SOFT, draw_scale_bar, extent_of, hide_axes
 from jeit_solvers.engines import host, on_host, slopes
 
 MICROPHONE, FOUND = "#1f6fb4", "#c8102e"
@@ -114,7 +114,7 @@ def draw_surface(ax: Axes, view: View, *, microphones: bool = True, faint: bool 
     shown = np.concatenate([np.reshape(view.extent, (2, 2)).T, view.microphones])
     x_min, x_max, y_min, y_max = extent_of(shown)
     room = 0.06 * max(x_max - x_min, y_max - y_min)
-    bare(ax, (x_min, x_max, y_min, y_max))
+    hide_axes(ax, (x_min, x_max, y_min, y_max))
     # The scale bar is closer to the outline than in plots of electrodes, since no labels are drawn outside the outline.
     draw_scale_bar(ax, (x_min + room, x_max, y_min + room, y_max))
     ax.set_xlim(x_min - 0.5 * room, x_max + 0.5 * room)

@@ -21,9 +21,9 @@ layout.command()(optimise)
 
 _FILES = ("report.json", "comparison.png")
 # Maximum number of touched positions along a side: 65,536 touches in total.
-_MOST_PLACES = 256
+_MAX_POSITIONS = 256
 # Option name for each argument name that error messages of the called functions mention.
-_OPTIONS = {
+_OPTION_NAMES = {
     "thickness": "--thickness-mm",
     "cell_size": "--cell-mm",
     "num_pairs": "--pairs",
@@ -95,14 +95,14 @@ def compare(
 
     skins.check_layer(thickness, conductivity)
     check_positive({"--cell-mm": cell})
-    check_within("--places", places, 2, _MOST_PLACES)
+    check_within("--places", places, 2, _MAX_POSITIONS)
     check_at_least({"--pairs": (pairs, 0), "--taxels": (taxels, 1), "--seed": (seed, 0)})
     if not 0 <= margin < float("inf"):
         raise ValueError(f"--margin-mm must not be negative; it is {margin:g}.")
     both = [skins.read_with_outline(name, width, height) for name in (first, second)]
     make_folder(output, _FILES)
     console = plain_console()
-    with naming_options(_OPTIONS), Steps(console, quiet=quiet) as step:
+    with naming_options(_OPTION_NAMES), Steps(console, quiet=quiet) as step:
         check_same_outline(*both)
         step("mesh")
         protocols = [skin_protocol(one, num_pairs=pairs) for one in both]
@@ -121,11 +121,11 @@ def compare(
         step("write")
         write_layout_comparison(result, output)
     if not quiet:
-        _show(console, result)
+        _print_comparison(console, result)
         say_written(console, output / "report.json", "comparison.png")
 
 
-def _show(console, result: "LayoutComparison") -> None:
+def _print_comparison(console, result: "LayoutComparison") -> None:
     from rich.table import Table
 
     from jeit.design.reports.layouts import distinct_names

@@ -83,7 +83,7 @@ def optimise(
         raise ValueError(f"--minimum-spacing-mm must not be negative; it is {minimum_spacing:g}.")
     check_within("--num-points", num_points, _LEAST_NODES, _MOST_NODES)
     start = skins.read_with_outline(layout, width, height)
-    free = [_region(text, start.known_outline) for text in keep_out or ()]
+    free = [_parse_region(text, start.known_outline) for text in keep_out or ()]
     make_folder(output, RESULTS)
     space = DesignSpace(minimum_spacing=1e-3 * minimum_spacing, keep_out=free, symmetry=symmetry, sizes=sizes)
     search = {"noise": noise, "steps": steps, "starts": starts, "seed": seed, "num_points": num_points}
@@ -98,11 +98,11 @@ def optimise(
         step("write")
         write_improved_layout(result, output)
     if not quiet:
-        _show(console, result)
+        _print_improvement(console, result)
         say_written(console, output / RESULTS[0], *RESULTS[1:])
 
 
-def _show(console, result: "ImprovedLayout") -> None:
+def _print_improvement(console, result: "ImprovedLayout") -> None:
     from jeit.cli.console import pairs
     from jeit.design.reports import report_improved_layout
 
@@ -117,7 +117,7 @@ def _show(console, result: "ImprovedLayout") -> None:
     console.print(f"  {report['status']}: {report['reason']}", soft_wrap=True)
 
 
-def _region(text: str, outline: "Domain") -> "Disk | Rectangle":
+def _parse_region(text: str, outline: "Domain") -> "Disk | Rectangle":
     """A disc "x,y,radius" or rectangle "x1,y1,x2,y2" in mm. Raises `ValueError` if it is none or off the skin."""
     from jeit.mesh import Disk, Rectangle
 

@@ -38,14 +38,14 @@ def run(
     """Run a study from its beginning, and report."""
     from jeit.design.study.lock import locked
 
-    sweep, store = _read(file, output)
+    sweep, store = _read_study_and_path(file, output)
     if store.exists() and not (store / "zarr.json").is_file():
         raise ValueError(f"--output {store}: there is something else already; choose another name.")
     if store.exists():
         with locked(store, "study"):  # reports a process that is still writing, before the user deletes the store
             pass
         raise ValueError(f"{store} is there already: 'jeit study resume {file}' goes on with it; or delete it.")
-    _run(sweep, file, store, page, scheduler, quiet)
+    _run_with_progress(sweep, file, store, page, scheduler, quiet)
 
 
 @study.command()
@@ -55,11 +55,11 @@ def resume(
     """Go on with a study that was stopped; finished chunks are not computed again."""
     from jeit.design.study.store import Store
 
-    sweep, store = _read(file, output)
+    sweep, store = _read_study_and_path(file, output)
     if not store.exists():
         raise ValueError(f"there is no {store} to go on with: begin with 'jeit study run {file}'.")
     Store(sweep, store, create=False)  # checks that the path is a store of this study
-    _run(sweep, file, store, page, scheduler, quiet)
+    _run_with_progress(sweep, file, store, page, scheduler, quiet)
 
 
 @study.command()
@@ -68,7 +68,7 @@ def status(file: File, output: Output = None) -> None:
     from jeit.arguments import counted
     from jeit.design.study import study_progress
 
-    sweep, store = _read(file, output)
+    sweep, store = _read_study_and_path(file, output)
     if not store.exists():
         points, chunks = counted(len(sweep.points), "point"), counted(len(sweep.chunks), "chunk")
         typer.echo(f"{sweep.name}: not begun; {points} in {chunks}.")
@@ -84,20 +84,21 @@ def report(file: File, output: Output = None, page: Page = None) -> None:
     """Write one HTML page of what is finished."""
     from jeit.design.reports import write_study_report
 
-    sweep, store = _read(file, output)
-    where = _page(file, store, page)
+    sweep, store = _read_study_and_path(file, output)
+    where = _report_path(file, store, page)
     write_study_report(sweep, store, where)
     typer.echo(f"Written: {where}")
 
 
-def _read(file: Path, output: Path | None) -> "tuple[Study, Path]":
+def _read_study_and_path(file: Path, output: Path | None) -> "tuple[Study, Path]":
+    """Read the study from its TOML file, and return it with the path of its store of results."""
     from jeit.design.study import read_study
 
     with naming_options({"path": "study"}):
         return read_study(file), output or file.with_suffix(".zarr")
 
 
-def _page(file: Path, store: Path, page: Path | None) -> Path:
+def _report_path(file: Path, store: Path, page: Path | None) -> Path:
     """Where the report goes. Raises `ValueError` for a folder that is not there, and where something else would go."""
     where = page or file.with_suffix(".html")
     if not where.parent.is_dir():
@@ -107,7 +108,9 @@ def _page(file: Path, store: Path, page: Path | None) -> Path:
     return where
 
 
-def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: str | None, quiet: bool) -> None:
+def _run_with_progress(
+    sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: str | None, quiet: bool
+) -> None:
     from contextlib import ExitStack
 
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
@@ -118,7 +121,7 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
     from jeit.design.reports import write_study_report
     from jeit.design.study import run_study
 
-    where = _page(file, store, page)
+    where = _report_path(file, store, page)
     need_extra("cluster", "a study")  # before the progress bar starts
     console = plain_console()
     done, left = (TextColumn(f"{{{said}}}", markup=False) for said in ("task.description", "task.fields[left]"))
@@ -130,7 +133,7 @@ def _run(sweep: "Study", file: Path, store: Path, page: Path | None, scheduler: 
             task = bar.add_task("points", total=len(sweep.points), left="")
 
             def show(now: "Progress") -> None:
-                left = "" if now.seconds_left is None else f"{_duration(now.seconds_left)} left"
+                left = "" if now.seconds_left is None else f"{_format_duration(now.seconds_left)} left"
                 bar.update(task, completed=now.points, left=left)
 
             run_study(sweep, store, client=client, progress=show)
@@ -154,7 +157,7 @@ def connected(scheduler: str):
         raise ValueError(f"--scheduler {scheduler} does not answer: {error}") from None
 
 
-def _duration(seconds: float) -> str:
+def _format_duration(seconds: float) -> str:
     """As hours, minutes and seconds: 1:02:03."""
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)

@@ -26,15 +26,15 @@ from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Domain
 
 # Stages of the optimisation: weight of the penalty, and fraction of all steps after which the stage ends.
-_STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
+_PENALTY_STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
 # Safety margin of the constraints, metres, so that a layout rounded to whole nanometres still satisfies them.
-_SPARE = 2e-7
+_CONSTRAINT_MARGIN = 2e-7
 # Maximum distance by which the outline may extend beyond the mesh, relative to the size of the skin.
-_OFF = 0.01
+_MAX_OVERHANG = 0.01
 # Minimum relative improvement of the score for a layout to count as better.
-_ROUNDING = 1e-9
+_MIN_IMPROVEMENT = 1e-9
 # Number of random positions drawn for a start; the first ones inside the allowed region are used.
-_DRAWS = 20_000
+_NUM_DRAWS = 20_000
 
 
 class Optimisation(eqx.Module):
@@ -98,18 +98,18 @@ def optimise_layout(
     thickness, and for constraints that cannot be satisfied.
     """
     space = DesignSpace() if space is None else space
-    _check(skin, objective, space, steps, starts, key)
+    _check_arguments(skin, objective, space, steps, starts, key)
     constraints = space.constraints(skin)
     variables = space.variables(skin, constraints, objective.touches.depth)
     _check_outline(constraints.outline, skin)
     begin = np.stack([variables.start, *_random_starts(variables, constraints, starts - 1, key)])
     # The given layout is used unchanged, unless it violates the symmetry or the constraints.
-    begin = _feasible(variables, constraints, jnp.asarray(np.array(begin)))
+    begin = _make_feasible(variables, constraints, jnp.asarray(np.array(begin)))
     given = objective.scores_of_varied(skin, varied_of(skin))
     start_value = float(objective.score(given))
     if not np.isfinite(start_value):
         raise ValueError("score is not finite for the layout given; does some touch change no voltage?")
-    search = _Search(skin, objective, constraints, variables)
+    search = _LayoutSearch(skin, objective, constraints, variables)
     ended, record, status = search.run(jnp.asarray(np.array(begin)), steps, callback)
     ends = jax.tree.map(np.asarray, _varied(variables, ended))
     values = np.asarray(search.cost(ended, 0.0)[1])
@@ -135,7 +135,7 @@ def optimise_layout(
     )
 
 
-class _Search(eqx.Module):
+class _LayoutSearch(eqx.Module):
     """The optimisation from S starts, and its result."""
 
     skin: Skin
@@ -145,20 +145,20 @@ class _Search(eqx.Module):
 
     def cost(self, values, weight):
         """Penalised cost of each start (S,), its score (S,) and the gradient of the cost (S, v)."""
-        return _cost(values, jnp.asarray(weight), self)
+        return _penalised_cost(values, jnp.asarray(weight), self)
 
     def run(self, begin: Float[Array, "S v"], steps: int, callback) -> tuple[Float[Array, "S v"], Record, str]:
         """Run the optimisation. Returns the final variables of the starts, their history, and the status of the last
         stage."""
         record = Record(callback)
         values, status, done = begin, "step limit", 0
-        record.add(values, self.cost(values, _STAGES[0][0])[1])
-        for weight, share in _STAGES:
+        record.add(values, self.cost(values, _PENALTY_STAGES[0][0])[1])
+        for weight, share in _PENALTY_STAGES:
             budget = round(share * steps) - done
             done += budget
             if budget:
                 values, status = descend(partial(self.cost, weight=weight), values, budget, record)
-        return _feasible(self.variables, self.constraints, values), record, status
+        return _make_feasible(self.variables, self.constraints, values), record, status
 
     def judge(self, ends: Varied, values, lacking, start_value: float, status: str) -> tuple[int | None, str, str]:
         """Choose the best start. Returns its index, or None if none is better than the given layout, the status, and
@@ -175,7 +175,7 @@ class _Search(eqx.Module):
             reason = f"no start satisfies the constraints: {worst}= lacks {least:.3g} mm at best; ask for less."
             return None, "infeasible", reason
         best = int(np.where(good, values, -np.inf).argmax())
-        if fits and values[best] <= start_value + _ROUNDING * abs(start_value):
+        if fits and values[best] <= start_value + _MIN_IMPROVEMENT * abs(start_value):
             return None, status, "no start is better than the layout given."
         reason = f"start {best + 1} of {len(values)} is best; the constraints are satisfied by {good.sum()}."
         if not fits:
@@ -203,7 +203,7 @@ def _random_starts(variables: Variables, constraints: Constraints, count: int, k
     domains."""
     starts, number = [], variables.num_generators
     for one in jax.random.split(key, count) if count else ():
-        drawn = jax.random.uniform(one, (_DRAWS, 2))
+        drawn = jax.random.uniform(one, (_NUM_DRAWS, 2))
         place = drawn * variables.size + variables.low
         free = constraints.outline.contains(place)
         for domain in constraints.keep_out:
@@ -226,7 +226,7 @@ def _largest_violation(constraints: Constraints, centres, radii) -> float:
     return float(jnp.max(constraints.shortfall(jnp.asarray(centres), jnp.asarray(radii))))
 
 
-def _feasible(variables: Variables, constraints: Constraints, values):
+def _make_feasible(variables: Variables, constraints: Constraints, values):
     """Move the starts (S, v) until they satisfy the constraints, as far as minimisation of the penalty succeeds."""
 
     def cost(values):
@@ -240,11 +240,13 @@ def _feasible(variables: Variables, constraints: Constraints, values):
 def _penalty_and_gradient(values, variables: Variables, constraints: Constraints):
     """Penalty of each start (S,) and its gradient (S, v), scaled by a large factor so that the minimisation ends at
     zero and not near it."""
-    return jax.vmap(jax.value_and_grad(lambda own: 1e6 * _penalty(variables, constraints, own, _SPARE)))(values)
+    return jax.vmap(jax.value_and_grad(lambda own: 1e6 * _penalty(variables, constraints, own, _CONSTRAINT_MARGIN)))(
+        values
+    )
 
 
 @eqx.filter_jit
-def _cost(values, weight, search: _Search):
+def _penalised_cost(values, weight, search: _LayoutSearch):
     variables, constraints, objective = search.variables, search.constraints, search.objective
 
     def one(own):
@@ -264,7 +266,7 @@ def _varied(variables: Variables, values) -> Varied:
     return jax.vmap(variables.varied)(values)
 
 
-def _check(skin: Skin, objective: Objective, space: DesignSpace, steps: int, starts: int, key) -> None:
+def _check_arguments(skin: Skin, objective: Objective, space: DesignSpace, steps: int, starts: int, key) -> None:
     check_skin("skin", skin)
     check_kind("objective", objective, Objective, "an Objective, as of Objective.create(skin, places)")
     check_kind("space", space, DesignSpace, "a DesignSpace, such as DesignSpace(minimum_spacing=0.01)")
@@ -287,5 +289,5 @@ def _check_outline(outline: Domain, skin: Skin) -> None:
     points = np.asarray(skin.model.mesh.points)
     off = max(*(points.min(axis=0) - (low_x, low_y)), *((high_x, high_y) - points.max(axis=0)))
     # The mesh of a disk is a polygon inside it.
-    if off > _OFF * max(high_x - low_x, high_y - low_y):
+    if off > _MAX_OVERHANG * max(high_x - low_x, high_y - low_y):
         raise ValueError(f"outline: it reaches {1e3 * off:.3g} mm beyond the model's mesh; give the skin's own.")

@@ -88,7 +88,7 @@ def optimise_surface_layout(
         moved = None
         while steepest > 0 and length > _SHORTEST * pitch:
             tried = surface.nearest(position + length / steepest * along).points
-            if _fits(tried, apart, surface, radii + margin):
+            if _is_feasible(tried, apart, surface, radii + margin):
                 new, new_slope = value_and_slope(tried)
                 if new > value:
                     moved = tried, new, new_slope
@@ -126,7 +126,7 @@ def _cost(skin: Skin, objective: Objective):
     return value_and_slope
 
 
-def _fits(position, apart, surface: Triangles, room) -> bool:
+def _is_feasible(position, apart, surface: Triangles, room) -> bool:
     """Whether the centres are at least `apart` metres from each other, in a straight line, and at least `room` metres
     from the edge."""
     distance = np.linalg.norm(position[:, None] - position, axis=-1)

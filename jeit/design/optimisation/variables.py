@@ -102,7 +102,7 @@ class Variables(eqx.Module):
         if symmetry == "rotate-4" and not np.isclose(x_max - x_min, y_max - y_min):
             raise ValueError("symmetry: a quarter turn maps only a square onto itself, and the outline's box is none.")
         middle = np.array([x_min + x_max, y_min + y_max]) / 2
-        first = _first_part(centres - middle, symmetry)
+        first = _is_in_first_part(centres - middle, symmetry)
         _check_shares(first.sum(), len(images), len(centres), symmetry)
         size_range = contact_range = None
         if sizes is True:
@@ -172,7 +172,7 @@ class Variables(eqx.Module):
         return jnp.tile(values, len(self.images))[self.order]
 
 
-def _first_part(offset: np.ndarray, symmetry: str | None) -> np.ndarray:
+def _is_in_first_part(offset: np.ndarray, symmetry: str | None) -> np.ndarray:
     x, y = offset.T
     if symmetry == "mirror-x":
         return x < 0
@@ -197,7 +197,7 @@ def _check_shares(number: int, parts: int, total: int, symmetry: str | None) -> 
     )
 
 
-def balanced(scores: Scores) -> Float[Array, ""]:
+def balanced_score(scores: Scores) -> Float[Array, ""]:
     """Default score of an `Objective`: log of the smooth minimum of the sensitivity minus log of the mean variance, so
     that a change of either by one per cent counts the same."""
     return jnp.log(scores.soft_worst) - jnp.log(scores.mean_variance)
@@ -215,7 +215,7 @@ class Objective(eqx.Module):
     touches: SheetTouches
     prior: TouchPrior
     noise: Float[Array, "..."] = eqx.field(default=NOISE, converter=lambda noise: jnp.asarray(noise, float))
-    score: Score = eqx.field(default=balanced, static=True)
+    score: Score = eqx.field(default=balanced_score, static=True)
     temperature: float = TEMPERATURE
 
     def __check_init__(self):

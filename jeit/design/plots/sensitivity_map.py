@@ -15,10 +15,10 @@ from jeit.plot.axes import (
     SEQUENTIAL,
     SOFT,
     axes_or_new,
-    bare,
     draw_colour_bar,
     draw_legend_above,
     draw_scale_bar,
+    hide_axes,
     soften_axes,
 )
 
@@ -38,7 +38,7 @@ def plot_sensitivity_map(
     `electrodes`: positions (L, 2) to be marked, metres; `limit`: upper end of the colour bar, volts, by default the
     maximum of Θ. Raises `ValueError` if `theta` is not a `SensitivityMap`.
     """
-    _check_map("theta", theta)
+    _check_is_sensitivity_map("theta", theta)
     ax = axes_or_new(ax)
     grid = theta.grid
     rows, columns = grid.shape
@@ -53,7 +53,7 @@ def plot_sensitivity_map(
     if electrodes is not None:
         x, y = np.asarray(electrodes).T[:2]
         ax.plot(x, y, "o", markersize=4, markerfacecolor="white", markeredgecolor=INK, markeredgewidth=0.8)
-    bare(ax, extent, numbered=False)
+    hide_axes(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     if title:
         ax.set_title(title)
@@ -69,15 +69,15 @@ def plot_sensitivity_histograms(
     Raises `ValueError` if `maps` is not a mapping to sensitivity maps.
     """
     check_kind("maps", maps, Mapping, "{name: map}")
-    for name, theta in maps.items():
-        _check_map(f"maps['{name}']", theta)
+    for name, sensitivity in maps.items():
+        _check_is_sensitivity_map(f"maps['{name}']", sensitivity)
     ax = axes_or_new(ax)
-    top = max(float(np.max(np.asarray(theta.values))) for theta in maps.values())
+    top = max(float(np.max(np.asarray(sensitivity.values))) for sensitivity in maps.values())
     edges = np.linspace(0, top, bins + 1)
-    for colour, (name, theta) in zip(_COLOURS, maps.items(), strict=False):
-        ax.stairs(100 * theta.histogram(edges)[0], 1e3 * edges, color=colour, label=name, linewidth=1.4)
-    first, theta = next(iter(maps.items()))
-    ax.axvline(1e3 * float(theta.minimum), color=SOFT, linewidth=1, linestyle="--", label=f"least of {first}")
+    for colour, (name, sensitivity) in zip(_COLOURS, maps.items(), strict=False):
+        ax.stairs(100 * sensitivity.histogram(edges)[0], 1e3 * edges, color=colour, label=name, linewidth=1.4)
+    first, sensitivity = next(iter(maps.items()))
+    ax.axvline(1e3 * float(sensitivity.minimum), color=SOFT, linewidth=1, linestyle="--", label=f"least of {first}")
     ax.set_xlabel("Sensitivity (mV)", color=INK)
     ax.set_ylabel("Share of the area (%)", color=INK)
     soften_axes(ax)
@@ -87,5 +87,5 @@ def plot_sensitivity_histograms(
     return ax
 
 
-def _check_map(name: str, theta: SensitivityMap) -> None:
-    check_kind(name, theta, SensitivityMap, "a SensitivityMap, as of jeit.design.sensitivity_map")
+def _check_is_sensitivity_map(argument_name: str, sensitivity_map: SensitivityMap) -> None:
+    check_kind(argument_name, sensitivity_map, SensitivityMap, "a SensitivityMap, as of jeit.design.sensitivity_map")

@@ -17,11 +17,11 @@ from jeit.plot.axes import (
     INK,
     SEQUENTIAL,
     axes_or_new,
-    bare,
     draw_colour_bar,
     draw_legend_above,
     draw_scale_bar,
     extent_of,
+    hide_axes,
     soften_axes,
 )
 
@@ -65,7 +65,7 @@ def plot_taxels(
     if outlines:
         style = {"colour": INK if colour == "label" else "white", "width": 0.7}
         _draw_outlines(ax, taxels, range(len(taxels.similarity)), **style)
-    _dress(ax, taxels, electrodes, title)
+    _finish_axes(ax, taxels, electrodes, title)
     return ax
 
 
@@ -122,7 +122,7 @@ def plot_similarity(
     # Negative similarities are drawn as 0.
     cells.set_clim(0, 1)
     _draw_outlines(ax, taxels, [index], colour="white", width=1.6)
-    _dress(ax, taxels, electrodes, f"{1e4 * float(taxels.areas[index]):.1f} cm²" if title is None else title)
+    _finish_axes(ax, taxels, electrodes, f"{1e4 * float(taxels.areas[index]):.1f} cm²" if title is None else title)
     if colour_bar:
         draw_colour_bar(ax, cells, "Cosine similarity")
     return ax
@@ -137,7 +137,7 @@ def _check_single(taxels: Taxels) -> None:
         )
 
 
-def _sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
+def _cell_sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
     """Width and height (n,) of the drawn cells, metres: the spacings of the grid, or squares of the given area if the
     positions form no grid."""
     gaps = [np.diff(np.unique(axis.round(9))) for axis in np.asarray(taxels.places).T]
@@ -148,7 +148,7 @@ def _sides(taxels: Taxels) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw_cells(ax: Axes, taxels: Taxels, values: np.ndarray, *, colour_map: str) -> PolyCollection:
-    half = np.stack(_sides(taxels), axis=1)[:, None] / 2
+    half = np.stack(_cell_sides(taxels), axis=1)[:, None] / 2
     corners = np.asarray(taxels.places)[:, None] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     # Edges in the colour of the cell hide the gaps between cells.
     cells = PolyCollection(list(corners), array=values, cmap=colormaps[colour_map], edgecolors="face", linewidth=0.4)
@@ -159,7 +159,7 @@ def _draw_cells(ax: Axes, taxels: Taxels, values: np.ndarray, *, colour_map: str
 def _map_colours(taxels: Taxels) -> np.ndarray:
     """Index of the colour (k,) of each cluster: the first colour of the palette that none of its neighbours has."""
     labels, count = np.asarray(taxels.labels), len(taxels.similarity)
-    first, second = labels[_triangles(taxels).edges].T
+    first, second = labels[_triangulate(taxels).edges].T
     neighbours = np.zeros((count, count), bool)
     neighbours[first, second] = neighbours[second, first] = True
     np.fill_diagonal(neighbours, False)
@@ -170,27 +170,27 @@ def _map_colours(taxels: Taxels) -> np.ndarray:
     return chosen
 
 
-def _triangles(taxels: Taxels) -> Triangulation:
+def _triangulate(taxels: Taxels) -> Triangulation:
     return Triangulation(*np.asarray(taxels.places).T)
 
 
 def _draw_outlines(ax: Axes, taxels: Taxels, indices: Iterable[int], *, colour: str, width: float) -> None:
-    triangles = _triangles(taxels)
+    triangles = _triangulate(taxels)
     for surface in np.asarray(taxels.similarity)[list(indices)]:
         if surface.min() < taxels.threshold <= surface.max():
             ax.tricontour(triangles, surface, levels=[taxels.threshold], colors=[colour], linewidths=width)
 
 
-def _dress(ax: Axes, taxels: Taxels, electrodes: ArrayLike | None, title: str | None) -> None:
+def _finish_axes(ax: Axes, taxels: Taxels, electrodes: ArrayLike | None, title: str | None) -> None:
     if electrodes is not None:
         position = np.asarray(electrodes, float)
         if position.ndim != 2 or position.shape[1] not in (2, 3):
             raise ValueError(f"electrodes has shape {position.shape}; give positions (L, 2) or (L, 3) in metres.")
         style = {"markersize": 4.5, "markerfacecolor": "white", "markeredgecolor": INK, "markeredgewidth": 0.8}
         ax.plot(*position[:, :2].T, marker="o", linestyle="none", **style)
-    half = np.stack(_sides(taxels), axis=1) / 2
+    half = np.stack(_cell_sides(taxels), axis=1) / 2
     places = np.asarray(taxels.places)
     extent = extent_of(np.concatenate([places - half, places + half]))
-    bare(ax, extent, numbered=False)
+    hide_axes(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     ax.set_title(title or "")

@@ -14,10 +14,10 @@ from jeit.arguments import check_kind
 from jeit.design.optimisation.optimise import Optimisation
 from jeit.layout.surface_layout import flat_layout
 from jeit.mesh import Domain
-from jeit.plot.axes import INK, SOFT, axes_or_new, bare, draw_scale_bar
+from jeit.plot.axes import INK, SOFT, axes_or_new, draw_scale_bar, hide_axes
 from jeit.plot.imaging.electrodes import METAL
 
-_FREE = {"facecolor": "none", "edgecolor": SOFT, "hatch": "////", "linewidth": 0.5, "zorder": 1}
+_KEEP_OUT_STYLE = {"facecolor": "none", "edgecolor": SOFT, "hatch": "////", "linewidth": 0.5, "zorder": 1}
 
 
 def plot_travel(
@@ -46,22 +46,22 @@ def plot_travel(
     if outline is not None:
         ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9, zorder=2))
         extent = outline.extent
-        bare(ax, extent, numbered=False)
+        hide_axes(ax, extent, numbered=False)
         draw_scale_bar(ax, extent)
     for domain in keep_out:
-        ax.add_patch(PathPatch(outline_path(domain), **_FREE))
+        ax.add_patch(PathPatch(outline_path(domain), **_KEEP_OUT_STYLE))
     began = [Circle((x, y), r) for (x, y), r in zip(ways[0], radii, strict=True)]
     ended = [Circle((x, y), r) for (x, y), r in zip(ends, radii, strict=True)]
     ax.add_collection(PatchCollection(began, facecolor="none", edgecolor=SOFT, linewidth=1.0, zorder=3))
     ax.add_collection(LineCollection(list(ways.swapaxes(0, 1)), colors=SOFT, linewidths=1.2, zorder=3))
     ax.add_collection(PatchCollection(ended, facecolor=METAL, edgecolor=INK, linewidth=0.6, zorder=4))
-    _explain(ax, kept_free=bool(keep_out))
+    _draw_legend(ax, kept_free=bool(keep_out))
     travelled = np.linalg.norm(ends - ways[0], axis=1)
     ax.set_title(f"Moved {1e3 * travelled.mean():.0f} mm on average" if title is None else title, color=INK)
     return ax
 
 
-def _explain(ax: Axes, *, kept_free: bool) -> None:
+def _draw_legend(ax: Axes, *, kept_free: bool) -> None:
     """Draw a legend below the plot, beside the scale bar."""
     disc = {"marker": "o", "markersize": 8, "linestyle": "none"}
     handles: list[Artist] = [

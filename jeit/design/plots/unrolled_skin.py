@@ -23,14 +23,14 @@ from jeit.plot.axes import (
     SOFT,
     ColourScale,
     axes_or_new,
-    bare,
     check_scale,
     draw_scale_bar,
     extent_of,
+    hide_axes,
 )
 
 # The plot states the distortion of lengths if its mean exceeds this relative value.
-_STATED_FROM = 0.005
+_MIN_STATED_DISTORTION = 0.005
 
 
 def plot_unrolled(
@@ -76,11 +76,11 @@ def plot_unrolled(
         at = unrolled.flat(np.atleast_2d(np.asarray(places, float)))
         ax.plot(at[:, 0], at[:, 1], "o", color=colour, markersize=5, markeredgecolor="white", label=name, zorder=5)
     extent = extent_of(points)
-    bare(ax, extent, numbered=False)
+    hide_axes(ax, extent, numbered=False)
     draw_scale_bar(ax, extent)
     if marks:
         ax.legend(loc="lower right", frameon=False, labelcolor=INK, ncols=len(marks), borderaxespad=0)
-    if unrolled.mean_distortion > _STATED_FROM:
+    if unrolled.mean_distortion > _MIN_STATED_DISTORTION:
         mean, most = 100 * unrolled.mean_distortion, 100 * unrolled.distortion
         text = f"lengths off by {mean:.2g} % on average, {most:.2g} % at most"
         ax.text(0.5, 0.02, text, transform=ax.transAxes, ha="center", color=SOFT, fontsize=8)

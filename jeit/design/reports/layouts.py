@@ -10,10 +10,10 @@ from jeit.design.improvement import ImprovedLayout
 from jeit.design.scores import Scores
 from jeit.layout import write_layout
 from jeit.mesh import Disk, Domain, Rectangle
-from jeit.report.folder import describe_domain, plain, results, write_json
+from jeit.report.folder import as_plain_values, describe_domain, results, write_json
 
 # Maximum number of characters of a layout's name in a plot.
-_LONGEST = 32
+_MAX_NAME_LENGTH = 32
 
 
 def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> None:
@@ -41,7 +41,7 @@ def report_layout_comparison(result: LayoutComparison) -> dict[str, Any]:
         "cell_mm": None if skin.cell_size is None else 1e3 * skin.cell_size,
         "seed": result.seed,
     }
-    return plain({"layouts": result.figures, "options": options})
+    return as_plain_values({"layouts": result.figures, "options": options})
 
 
 def draw_layout_comparison(result: LayoutComparison):
@@ -55,7 +55,7 @@ def draw_layout_comparison(result: LayoutComparison):
     from jeit.design.plots import plot_sensitivity_histograms, plot_sensitivity_map, plot_taxel_areas, plot_taxels
     from jeit.design.plots.travel import outline_path
     from jeit.layout.surface_layout import flat_layout
-    from jeit.plot.axes import INK, bare, draw_scale_bar
+    from jeit.plot.axes import INK, draw_scale_bar, hide_axes
 
     figure = Figure(figsize=(14.4, 8.8), layout="constrained")
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12)
@@ -77,7 +77,7 @@ def draw_layout_comparison(result: LayoutComparison):
         draw_scale_bar(row[1], outline.extent)
         for ax in row[:2]:
             ax.add_patch(PathPatch(outline_path(outline), facecolor="none", edgecolor=INK, linewidth=0.9))
-            bare(ax, outline.extent, numbered=False)
+            hide_axes(ax, outline.extent, numbered=False)
     plot_sensitivity_histograms({name: one.sensitivity for name, one in zip(names, both, strict=True)}, ax=axes[0, 2])
     plot_taxel_areas({name: one.taxels for name, one in zip(names, both, strict=True)}, ax=axes[1, 2])
     disc: dict[str, Any] = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": INK}
@@ -96,7 +96,7 @@ def distinct_names(names: list[str]) -> list[str]:
 
 def _shorten_name(name: str) -> str:
     """A layout's name, shortened to fit above a map."""
-    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"
+    return name if len(name) <= _MAX_NAME_LENGTH else f"{name[: _MAX_NAME_LENGTH - 1]}…"
 
 
 def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
@@ -131,8 +131,8 @@ def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
         "layout": result.start.name,
         "status": found.status,
         "reason": found.reason,
-        "start": _figures(result.before),
-        "optimised": _figures(result.after),
+        "start": _score_figures(result.before),
+        "optimised": _score_figures(result.after),
         "starts": found.values,
         "steps": found.history.shape[1] - 1,
         "seed": result.seed,
@@ -141,16 +141,16 @@ def report_improved_layout(result: ImprovedLayout) -> dict[str, Any]:
             "conductivity_S_per_m": skin.conductivity,
             "noise_V": result.noise,
             "minimum_spacing_mm": 1e3 * space.minimum_spacing,
-            "keep_out_mm": [_region(domain) for domain in space.keep_out],
+            "keep_out_mm": [_format_region(domain) for domain in space.keep_out],
             "symmetry": space.symmetry,
             "sizes": space.sizes,
             "num_points": result.num_points,
         },
     }
-    return plain(content)
+    return as_plain_values(content)
 
 
-def _figures(scores: Scores) -> dict[str, Any]:
+def _score_figures(scores: Scores) -> dict[str, Any]:
     return {
         "worst_sensitivity_V": scores.worst,
         "mean_sensitivity_V": scores.mean,
@@ -162,7 +162,7 @@ def _figures(scores: Scores) -> dict[str, Any]:
     }
 
 
-def _region(domain: Domain) -> str | dict[str, Any]:
+def _format_region(domain: Domain) -> str | dict[str, Any]:
     """Region in the format of the option --keep-out, a disc "x,y,radius" or a rectangle "x1,y1,x2,y2" in millimetres; a
     description for other regions."""
     if isinstance(domain, Disk):

@@ -23,9 +23,9 @@ from jeit.mesh import Rectangle
 from jeit.mesh.geodesic import Geodesics, Triangles, unroll
 
 # Maximum number of maps in a report, and of plots side by side.
-_MAPS, _COLUMNS = 24, 4
+_MAX_MAPS, _NUM_COLUMNS = 24, 4
 # The mesh of an unrolled map is refined until it has this many nodes, so that they cannot be distinguished.
-_NODES = 3000
+_MIN_MAP_NODES = 3000
 # Text that gives the value of a swept parameter above a map; the layout is given by its name.
 _LABELS = {
     "diameter_mm": "⌀ {:g} mm",
@@ -53,7 +53,7 @@ def draw_scatter(data):
     least, mean = data.sensitivity.min("place"), data.sensitivity.mean("place")
     for layout in dict.fromkeys(data.layout.values.tolist()):
         these = data.layout.values == layout
-        axes.plot(1e3 * least[these], 1e3 * mean[these], "o", label=_plain(layout), alpha=0.8)
+        axes.plot(1e3 * least[these], 1e3 * mean[these], "o", label=_escape_for_matplotlib(layout), alpha=0.8)
     axes.set(xlabel="Least sensitivity (mV)", ylabel="Mean sensitivity (mV)", xscale="log", yscale="log")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(LogLocator(subs=_TICKS))
@@ -64,7 +64,7 @@ def draw_scatter(data):
     return figure
 
 
-def scores_of(data) -> list[str]:
+def stored_score_names(data) -> list[str]:
     """Names of the scores, that is of the arrays with one value for each point."""
     return [name for name in data.data_vars if data[name].dims == ("point",)]
 
@@ -81,8 +81,8 @@ def draw_scores(data):
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    names = scores_of(data)
-    columns = min(_COLUMNS, len(names))
+    names = stored_score_names(data)
+    columns = min(_NUM_COLUMNS, len(names))
     rows = -(-len(names) // columns)
     figure = Figure(figsize=(2.8 * columns + 1.8, 2.2 * rows + 0.3), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
@@ -92,7 +92,9 @@ def draw_scores(data):
         for number, layout in enumerate(dict.fromkeys(data.layout.values.tolist())):
             these = data.layout.values == layout
             finite, infinite = these & np.isfinite(values), these & np.isinf(values)
-            axes.plot(point[finite], values[finite], "o", ms=4, color=f"C{number}", label=_plain(layout))
+            axes.plot(
+                point[finite], values[finite], "o", ms=4, color=f"C{number}", label=_escape_for_matplotlib(layout)
+            )
             top = np.ones(infinite.sum())
             axes.plot(point[infinite], top, "^", ms=5, color=f"C{number}", transform=axes.get_xaxis_transform())
         axes.set_title(_TITLES.get(name, name.replace("_", " ")) + ("" if unit == "1" else f" ({unit})"), fontsize=9)
@@ -107,33 +109,35 @@ def draw_scores(data):
     return figure
 
 
-def shown(data) -> np.ndarray:
-    """Indices of the finished points whose maps are drawn: all of them, or an evenly spaced selection if there are too
-    many."""
+def map_points(data) -> np.ndarray:
+    """Indices of the finished points whose maps are drawn in the report: all of them, or an evenly spaced selection if
+    there are more than the report shows."""
     finished = np.flatnonzero(data.finished.values)
-    chosen = np.linspace(0, len(finished) - 1, min(len(finished), _MAPS)).round().astype(int)
+    chosen = np.linspace(0, len(finished) - 1, min(len(finished), _MAX_MAPS)).round().astype(int)
     return finished[chosen]
 
 
 def draw_maps(study: Study, data):
-    """Plot the sensitivity maps of the points chosen by `shown`, with the same colour scale and the electrodes."""
+    """Plot the sensitivity maps of the points chosen by `map_points`, with the same colour scale and the electrodes."""
     from matplotlib.collections import EllipseCollection
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
     grid = study_grid(study)
-    numbers = shown(data)
-    titles = titles_of(study)
+    numbers = map_points(data)
+    titles = point_titles(study)
     values = 1e3 * data.sensitivity.values[numbers]
     positive = values[values > 0]
     scale = LogNorm(positive.min(), positive.max())
-    columns = min(_COLUMNS, len(numbers))
+    columns = min(_NUM_COLUMNS, len(numbers))
     rows = -(-len(numbers) // columns)
     height = 2.4 + 0.15 * max(title.count("\n") for title in titles)
     figure = Figure(figsize=(max(2.6 * columns, 4.0) + 0.8, height * rows + 0.3), layout="constrained")
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    view = _Unrolled(study.outline, grid) if isinstance(study.outline, Triangles) else _Flat(study.outline, grid)
+    view = (
+        _UnrolledMaps(study.outline, grid) if isinstance(study.outline, Triangles) else _FlatMaps(study.outline, grid)
+    )
     image = None
     for axes, number, map_values in zip(panels, numbers, values, strict=False):
         layout = study.points[number].layout
@@ -166,7 +170,7 @@ def draw_maps(study: Study, data):
     return figure
 
 
-class _Flat:
+class _FlatMaps:
     """Drawing of maps of flat skins, in millimetres."""
 
     def __init__(self, outline: Rectangle, grid: TouchGrid):
@@ -179,13 +183,13 @@ class _Flat:
         return np.asarray(centres)
 
 
-class _Unrolled:
+class _UnrolledMaps:
     """Drawing of maps of curved skins, unrolled, in millimetres. Every node has the value of the touched position that
     is nearest along the surface."""
 
     def __init__(self, outline: Triangles, grid: TouchGrid):
         fine = outline
-        while len(fine.points) < _NODES:
+        while len(fine.points) < _MIN_MAP_NODES:
             fine = fine.finer()
         self.flat = unroll(fine)
         self.owners = Geodesics.create(fine).owners(grid.places)[0][self.flat.nodes]
@@ -199,24 +203,24 @@ class _Unrolled:
         return self.flat.flat(np.asarray(centres))
 
 
-def titles_of(study: Study) -> list[str]:
+def point_titles(study: Study) -> list[str]:
     """Title of every point: its number and layout, followed by the other parameters that differ between points, two per
     line."""
     coordinates = [point.coordinates for point in study.points]
     varying = [name for name in _LABELS if len({values[name] for values in coordinates}) > 1]
     titles = []
     for number, values in enumerate(coordinates):
-        labels = [_label(name, values[name]) for name in varying]
+        labels = [_parameter_text(name, values[name]) for name in varying]
         lines = [", ".join(labels[start : start + 2]) for start in range(0, len(labels), 2)]
-        titles.append("\n".join([f"{number}: {_plain(str(values['layout']))}", *lines]))
+        titles.append("\n".join([f"{number}: {_escape_for_matplotlib(str(values['layout']))}", *lines]))
     return titles
 
 
-def _label(name: str, value) -> str:
+def _parameter_text(name: str, value) -> str:
     return "all pairs" if name == "pairs" and not value else _LABELS[name].format(value)
 
 
-def _plain(text: str) -> str:
+def _escape_for_matplotlib(text: str) -> str:
     """Escape a text so that matplotlib shows it unchanged: dollar signs start no formula, and a leading underscore does
     not hide a label."""
     return " " * text.startswith("_") + text.replace("$", r"\$")
@@ -250,21 +254,30 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
         f"<p>{progress.points} of {progress.all_points} points finished, in {progress.chunks} of {progress.all_chunks} "
         f"chunks. Sensitivity: ‖Δv‖₂ of all channels to one touch, {'exact' if study.exact else 'linearised'}, on "
         f"{'a layer' if study.points[0].layers else 'a sheet'}.</p>",
-        *([_picture(draw_scatter(data), "Mean and least sensitivity of every point")] if len(study.points) > 1 else []),
-        *([_picture(draw_scores(data), "Scores of every point; triangles are infinite")] if scores_of(data) else []),
-        _picture(
+        *(
+            [_figure_html(draw_scatter(data), "Mean and least sensitivity of every point")]
+            if len(study.points) > 1
+            else []
+        ),
+        *(
+            [_figure_html(draw_scores(data), "Scores of every point; triangles are infinite")]
+            if stored_score_names(data)
+            else []
+        ),
+        _figure_html(
             draw_maps(study, data),
-            f"Sensitivity maps of {len(shown(data))} points, electrodes as circles, axes in millimetres"
+            f"Sensitivity maps of {len(map_points(data))} points, electrodes as circles, axes in millimetres"
             f"{', of the skin unrolled' if study.surface else ''}",
         ),
         "<h2>Points</h2>",
-        _table(study, data),
+        _points_table(study, data),
         "<h2>Configuration</h2>",
         f"<pre>{escape(study.text)}</pre>",
         f"<p>Fingerprint {study.fingerprint}</p>",
         "<h2>Versions</h2>",
-        f"<p>Computed with {_list_text(made_by)}.</p>",
-        f"<p>Reported with {_list_text(now)}, Python {platform.python_version()}, {escape(platform.platform())}.</p>",
+        f"<p>Computed with {_versions_text(made_by)}.</p>",
+        f"<p>Reported with {_versions_text(now)}, Python {platform.python_version()}, "
+        f"{escape(platform.platform())}.</p>",
     ]
     page = (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(study.name)}</title>'
@@ -282,7 +295,7 @@ def write_study_report(study: Study, store: str | Path, path: str | Path) -> Non
             temporary.unlink()
 
 
-def _picture(figure: Any, caption: str) -> str:
+def _figure_html(figure: Any, caption: str) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     encoded = base64.b64encode(buffer.getvalue()).decode()
@@ -291,19 +304,19 @@ def _picture(figure: Any, caption: str) -> str:
     )
 
 
-def _table(study: Study, data) -> str:
+def _points_table(study: Study, data) -> str:
     """HTML table with a row for every point: the swept parameters, then the scores."""
     swept = list(study.points[0].coordinates)
-    found = {name: values_and_unit(data, name) for name in scores_of(data)}
+    found = {name: values_and_unit(data, name) for name in stored_score_names(data)}
     heads = ["point", *swept, *(name if unit == "1" else f"{name} / {unit}" for name, (_, unit) in found.items())]
     lines = ["".join(f'<th class="{"text" if head in _TEXT else "number"}">{escape(head)}</th>' for head in heads)]
     columns = [data[name].values.tolist() for name in swept] + [values.tolist() for values, _ in found.values()]
     for number, row in enumerate(zip(*columns, strict=True)):
-        lines.append("".join(_cell(value) for value in (number, *row)))
+        lines.append("".join(_cell_text(value) for value in (number, *row)))
     return '<div class="wide"><table>' + "\n".join(f"<tr>{line}</tr>" for line in lines) + "</table></div>"
 
 
-def _cell(value) -> str:
+def _cell_text(value) -> str:
     if isinstance(value, str):
         return f'<td class="text">{escape(value)}</td>'
     if math.isinf(value):
@@ -311,5 +324,5 @@ def _cell(value) -> str:
     return f"<td>{'–' if math.isnan(value) else f'{value:.4g}'}</td>"
 
 
-def _list_text(versions: dict[str, str]) -> str:
+def _versions_text(versions: dict[str, str]) -> str:
     return ", ".join(f"{escape(name)} {escape(version)}" for name, version in versions.items())

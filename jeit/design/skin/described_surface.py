@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 _UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": 0.0254}
 # Typical extent of a skin, metres, from which the likely unit of a file is determined.
-_USUAL = 0.15
+_TYPICAL_EXTENT = 0.15
 # Side of an equilateral triangle divided by the square root of its area.
-_SIDE = 2 / 3**0.25
+_SIDE_RANGE = 2 / 3**0.25
 
 
 def described_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:
@@ -48,7 +48,7 @@ def _check_unit(table: SurfaceTable, surface: Mesh) -> None:
     if not isinstance(table, ScanTable) or SMALLEST <= extent <= LARGEST:
         return
     across = {unit: extent * one / _UNITS[table.unit] for unit, one in _UNITS.items()}
-    likely = min(across, key=lambda unit: abs(np.log(across[unit] / _USUAL)))
+    likely = min(across, key=lambda unit: abs(np.log(across[unit] / _TYPICAL_EXTENT)))
     hint = (
         f'give "{likely}", in which it is {_length_text(across[likely])}'
         if likely != table.unit
@@ -71,7 +71,7 @@ def surface_identity(table: SurfaceTable, folder: Path) -> str:
 
 def typical_cell(surface: Mesh) -> float:
     """Typical cell size of a surface, metres: side of an equilateral triangle with the mean area of its triangles."""
-    return _SIDE * float(np.sqrt(np.mean(np.asarray(measures(surface)))))
+    return _SIDE_RANGE * float(np.sqrt(np.mean(np.asarray(measures(surface)))))
 
 
 def _create_surface(table: SurfaceTable, folder: Path, cell_size: float) -> Mesh:

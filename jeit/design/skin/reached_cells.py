@@ -13,7 +13,7 @@ from jeit.mesh.geodesic import Geodesics, Triangles
 
 # Maximum distance of positions from the surface of a curved skin, relative to its thickness, or to the size of the
 # cells of a sheet.
-_OFF = 0.5
+_MAX_OFF_SURFACE = 0.5
 
 
 class ReachedCells(NamedTuple):
@@ -41,45 +41,46 @@ def touched_surface(mesh: Mesh, face: str = "outer") -> Triangles:
 
 
 def reached_cells(
-    mesh: Mesh, places: Float[np.ndarray, "n d"], reach: float, deepest: float, face: str = "outer"
+    mesh: Mesh, places: Float[np.ndarray, "n d"], radius: float, max_depth: float, face: str = "outer"
 ) -> ReachedCells:
-    """Find the cells whose centroids lie within `reach` metres of `places` along the surface, and less than `deepest`
-    metres below it.
+    """Find the cells whose centroids lie within `radius` metres of `places` along the surface, and less than
+    `max_depth` metres below it.
 
     In a flat layer, depth is measured from its top, at the maximum z; in a shell, from its `face` along the inward
     normal. Raises `ValueError` for positions that are not on a curved surface.
     """
     middle = np.asarray(centroids(mesh))
     if is_curved(mesh):
-        return _on_surface(mesh, middle, places, reach, deepest, face)
+        return _reached_on_surface(mesh, middle, places, radius, max_depth, face)
     below, thickness = np.zeros(len(middle)), None
     if mesh.dimension == 3:
         height = np.asarray(mesh.points)[:, 2]
         below, thickness = height.max() - middle[:, 2], float(np.ptp(height))
-    candidates = np.flatnonzero(below < deepest)
-    found = KDTree(middle[candidates, :2]).query_ball_point(places, reach, return_sorted=True)
+    candidates = np.flatnonzero(below < max_depth)
+    found = KDTree(middle[candidates, :2]).query_ball_point(places, radius, return_sorted=True)
     near = [candidates[np.asarray(index, int)] for index in found]
     distance = [np.linalg.norm(middle[own, :2] - place, axis=-1) for own, place in zip(near, places, strict=True)]
     return ReachedCells(near, distance, below, thickness)
 
 
-def _on_surface(mesh: Mesh, middle, places, reach: float, deepest: float, face: str) -> ReachedCells:
+def _reached_on_surface(mesh: Mesh, centroids, places, radius: float, max_depth: float, face: str) -> ReachedCells:
     surface = touched_surface(mesh, face)
     thickness = None if mesh.is_surface else shell_thickness(mesh)
-    allowed = _OFF * (np.sqrt(surface.areas.max()) if thickness is None else thickness)
+    allowed = _MAX_OFF_SURFACE * (np.sqrt(surface.areas.max()) if thickness is None else thickness)
     off = surface.nearest(places).away
     lost = np.flatnonzero(off > allowed)
     if lost.size:
         raise ValueError(
-            f"places: {lost.size} of {len(places)} lie off the skin's surface, the first, at {said(places[lost[0]])} "
+            f"places: {lost.size} of {len(places)} lie off the skin's surface, the first, at "
+            f"{millimetre_text(places[lost[0]])} "
             f"mm, by {1e3 * off[lost[0]]:.3g} mm; give places on the touched face, in metres, such as "
             "touch_grid(skin.outline).places."
         )
-    at = surface.nearest(middle)
-    below = np.zeros(len(middle)) if mesh.is_surface else at.away
-    candidates = np.flatnonzero(below < deepest)
+    at = surface.nearest(centroids)
+    below = np.zeros(len(centroids)) if mesh.is_surface else at.away
+    candidates = np.flatnonzero(below < max_depth)
     feet = type(at)(at.triangle[candidates], at.weights[candidates], at.points[candidates], at.away[candidates])
-    found = Geodesics.create(surface).near(places, feet, reach)
+    found = Geodesics.create(surface).near(places, feet, radius)
     return ReachedCells([candidates[index] for index, _ in found], [length for _, length in found], below, thickness)
 
 
@@ -89,6 +90,6 @@ def shell_thickness(mesh: Mesh) -> float:
     return float(np.median(Triangles.of(mesh, "outer").nearest(inner).away))
 
 
-def said(place) -> str:
+def millimetre_text(place) -> str:
     """Text of a position in millimetres: "(12, 3.5)"."""
     return "(" + ", ".join(f"{1e3 * value:.4g}" for value in place) + ")"

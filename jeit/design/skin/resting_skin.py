@@ -20,7 +20,7 @@ from jeit_solvers.engines import on_device
 # Number of touches per call of a compiled program, and ratios of successive sizes to which the numbers of nodes and of
 # cells are padded. One program is compiled for each size, and the cost of a touch grows with the square of its number
 # of nodes.
-_TOGETHER, _NODES, _CELLS = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
+_TOUCHES_PER_CALL, _NODE_SIZE_RATIO, _CELL_SIZE_RATIO = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
 
 
 class RestingSkin(eqx.Module):
@@ -44,22 +44,22 @@ class RestingSkin(eqx.Module):
 
     @classmethod
     def create(
-        cls, model: ForwardModel, conductivity, touchable: Bool[np.ndarray, " n"], *, most: float = 2**31
+        cls, model: ForwardModel, conductivity, touchable: Bool[np.ndarray, " n"], *, max_bytes: float = 2**31
     ) -> "RestingSkin | None":
         """Precompute the quantities of a model with a `conductivity`, S/m (2-D: S).
 
         `touchable`: mask (n,) of the nodes that touches may reach. Returns None if the inverse would take more than
-        `most` bytes; it takes slightly more than 8 bytes for each pair of these nodes. Raises `ValueError` if `model`
-        is not a forward model, and for an invalid conductivity.
+        `max_bytes` bytes; it takes slightly more than 8 bytes for each pair of these nodes. Raises `ValueError` if
+        `model` is not a forward model, and for an invalid conductivity.
         """
         check_model(model)
         conductivity = cell_conductivity(model.mesh, check_conductivity(model.mesh, conductivity))
         strips = Strips.create(model.system.pattern, np.asarray(model.mesh.points), np.asarray(touchable))
-        if 8 * float(strips.number * strips.wanted) ** 2 > most:
+        if 8 * float(strips.num_strips * strips.selected_per_strip) ** 2 > max_bytes:
             return None
         solved = evaluate(model, solved_system_of, conductivity)
         rest = channel_voltages(model.protocol, solved.impedance())
-        known = fields_and_inverse(solved, strips, max(strips.number - 1, 1))
+        known = fields_and_inverse(solved, strips, max(strips.num_strips - 1, 1))
         return cls(model, rest, cell_stiffness(model, conductivity), strips, *known)
 
     def changes(self, touched: TouchedCells) -> Float[np.ndarray, "n M"]:
@@ -69,7 +69,11 @@ class RestingSkin(eqx.Module):
         cells, change = np.asarray(touched.cells), np.asarray(touched.change)
         used = np.count_nonzero(change, axis=1)
         sizes = np.stack(
-            [_padded_size((at.nodes < at.nodes[:, -1:]).sum(axis=1) + 1, _NODES), _padded_size(used, _CELLS)], axis=1
+            [
+                _padded_size((at.nodes < at.nodes[:, -1:]).sum(axis=1) + 1, _NODE_SIZE_RATIO),
+                _padded_size(used, _CELL_SIZE_RATIO),
+            ],
+            axis=1,
         )
         found = np.zeros((len(cells), self.model.protocol.num_measurements))
         known = self.fields, self.inverse
@@ -78,22 +82,22 @@ class RestingSkin(eqx.Module):
             nodes = _pad_rows(at.nodes, size[0], "edge")
             arrays = (_pad_rows(one, size[1], "constant") for one in (cells, change, at.corners))
             cells_of, change_of, corners = arrays
-            for some in np.split(alike, range(_TOGETHER, len(alike), _TOGETHER)):
-                rows = some[np.minimum(np.arange(_TOGETHER), len(some) - 1)]
+            for some in np.split(alike, range(_TOUCHES_PER_CALL, len(alike), _TOUCHES_PER_CALL)):
+                rows = some[np.minimum(np.arange(_TOUCHES_PER_CALL), len(some) - 1)]
                 touches = on_device((cells_of[rows], change_of[rows], nodes[rows], corners[rows]))
                 work = partial(changes_between, self.model.protocol, self.element, known, touches)
-                found[some] = np.asarray(over_cores(work, _TOGETHER, EXACT_AT_ONCE))[: len(some)]
+                found[some] = np.asarray(over_cores(work, _TOUCHES_PER_CALL, EXACT_AT_ONCE))[: len(some)]
         check_found(found, np.asarray(touched.places))
         return found
 
 
-def _padded_size(number, factor: float):
-    """Round a number up to the next of a series of multiples of 16, each about `factor` times the previous one."""
-    power = np.ceil(np.log(np.maximum(number, 16) / 16) / np.log(factor) - 1e-9)
-    return (np.ceil(factor**power - 1e-9) * 16).astype(int)
+def _padded_size(count, ratio: float):
+    """Round a count up to the next of a series of multiples of 16, each about `ratio` times the previous one."""
+    power = np.ceil(np.log(np.maximum(count, 16) / 16) / np.log(ratio) - 1e-9)
+    return (np.ceil(ratio**power - 1e-9) * 16).astype(int)
 
 
-def _pad_rows(rows: np.ndarray, size: int, mode) -> np.ndarray:
-    """Truncate or pad rows (n, k, …) to `size` entries."""
-    missing = max(size - rows.shape[1], 0)
-    return np.pad(rows[:, :size], [(0, 0), (0, missing), *[(0, 0)] * (rows.ndim - 2)], mode)
+def _pad_rows(rows: np.ndarray, length: int, mode) -> np.ndarray:
+    """Truncate or pad rows (n, k, …) to `length` entries."""
+    missing = max(length - rows.shape[1], 0)
+    return np.pad(rows[:, :length], [(0, 0), (0, missing), *[(0, 0)] * (rows.ndim - 2)], mode)

@@ -32,13 +32,13 @@ from jeit_solvers.engines import host
 
 # Number of nodes of a plane mesh, multiplied by (cell size)² / area: 1.155 for equilateral cells, and slightly more due
 # to the nodes on the edge.
-_NODES = 1.2
+_NODES_PER_CELL_AREA = 1.2
 # Maximum cell size, relative to the smallest diameter of the electrodes.
-_COARSEST = 1.5
+_MAX_CELL_RATIO = 1.5
 
 # Maximum thickness of a layer of cells, relative to the depth of a touch: the uppermost centroids are at a quarter of
 # the thickness of their layer.
-_THICKEST = 3.0
+_MAX_LAYER_RATIO = 3.0
 
 
 class Skin(eqx.Module):
@@ -211,7 +211,7 @@ class Skin(eqx.Module):
                 self.model.mesh, indentation, places, thickness=float(self.thickness), contrast=contrast
             )
         deepest = float(indentation.depth_at(host.zeros(())))
-        most = _THICKEST * self.num_layers * deepest
+        most = _MAX_LAYER_RATIO * self.num_layers * deepest
         said = (
             f"thickness is {1e3 * self.thickness:g} mm; give more than the {1e3 * deepest:g} mm that a touch is deep, "
             f"and no more than {1e3 * most:g} mm, where {self.num_layers} layers of cells become too coarse for it"
@@ -257,22 +257,22 @@ def _can_share_mesh(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
     """Whether the mesh of a skin can be used for another layout."""
     if isinstance(layout, SurfaceLayout):
         own = skin.layout
-        if not isinstance(own, SurfaceLayout) or own.outward != layout.outward or not _same_number(skin, layout):
+        if not isinstance(own, SurfaceLayout) or own.outward != layout.outward or not _have_same_number(skin, layout):
             return False
         return bool(eqx.tree_equal(own.surface, layout.surface))
     if isinstance(skin.layout, SurfaceLayout):
         return False
     same = eqx.tree_equal(skin.outline, plain_outline(layout.known_outline))
-    return bool(same) and _same_number(skin, layout)
+    return bool(same) and _have_same_number(skin, layout)
 
 
-def _same_number(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
+def _have_same_number(skin: Skin, layout: Layout | SurfaceLayout) -> bool:
     return layout.num_electrodes == skin.layout.num_electrodes
 
 
-def check_skin(name: str, given) -> None:
-    """Raise `ValueError`, about the argument `name`, unless `given` is a `Skin`."""
-    check_kind(name, given, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
+def check_skin(name: str, skin) -> None:
+    """Raise `ValueError`, about the argument `name`, unless `skin` is a `Skin`."""
+    check_kind(name, skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
 
 
 def longer_side(outline: Domain | Triangles) -> float:
@@ -355,14 +355,14 @@ def check_cell_size(
     """
     check_metres(name, cell_size)
     smallest = smallest_diameter(layout)
-    most = _COARSEST * smallest
+    most = _MAX_CELL_RATIO * smallest
     if cell_size > (1 + 1e-9) * most:
         end = f"; {IN_MILLIMETRES}" if cell_size**2 > area else "."
         raise ValueError(
             f"{name} is {1e3 * cell_size:g} mm; give no more than {1e3 * most:.3g} mm, as electrodes of "
             f"'{layout.name}' are {1e3 * smallest:.3g} mm across{end}"
         )
-    plane = _NODES * area * (num_layers + 1)
+    plane = _NODES_PER_CELL_AREA * area * (num_layers + 1)
     number = plane / cell_size**2
     if number > MOST_POINTS:
         least = 1.05e3 * math.sqrt(plane / MOST_POINTS)

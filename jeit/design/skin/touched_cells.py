@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from jeit.arguments import check_kind
 from jeit.design.defaults import CONTRAST, MOST_CONTRAST
 from jeit.design.skin.indentation import AbstractIndentation
-from jeit.design.skin.reached_cells import is_curved, reached_cells, said
+from jeit.design.skin.reached_cells import is_curved, millimetre_text, reached_cells
 from jeit.design.skin.touch_grid import check_places
 from jeit.electrodes.discs import smooth_step
 from jeit.forward import ForwardModel
@@ -81,7 +81,7 @@ def touched_cells(
         raise ValueError(
             f"the indentation is {1e3 * deepest:.3g} mm deep, and the skin {1e3 * thickness:.3g} mm thick; press less."
         )
-    cells, there = padded(reached.near)
+    cells, there = pad_rows(reached.near)
     distance = np.full(cells.shape, np.inf)
     distance[there] = np.concatenate(reached.distance)
     depth, below = np.asarray(indentation.depth_at(as_array(distance))), reached.below
@@ -95,24 +95,25 @@ def touched_cells(
     empty = np.flatnonzero(~changed.any(axis=1))
     if empty.size:
         raise ValueError(
-            f"{empty.size} of {len(places)} touches change no cell, the first at {said(places[empty[0]])} mm: they lie "
+            f"{empty.size} of {len(places)} touches change no cell, the first at {millimetre_text(places[empty[0]])} "
+            "mm: they lie "
             "off the skin (places are in metres), or its cells are too coarse for so shallow an indentation; refine "
             "the mesh, in a layer upwards."
         )
-    kept, there = padded([one[used] for one, used in zip(cells, changed, strict=True)])
+    kept, there = pad_rows([one[used] for one, used in zip(cells, changed, strict=True)])
     change = np.zeros(kept.shape)
     change[there] = (contrast - 1) * share[changed]
     return TouchedCells(as_array(places), as_array(kept), as_array(change), mesh.num_cells)
 
 
-def padded(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def pad_rows(rows: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Join rows of integers of different lengths to one array, padded with zeros. Returns the array and a mask of the
     entries that are not padding."""
     length = np.array([len(row) for row in rows])
     there = np.arange(max(length.max(), 1)) < length[:, None]
-    padded = np.zeros(there.shape, np.int32)
-    padded[there] = np.concatenate(rows)
-    return padded, there
+    pad_rows = np.zeros(there.shape, np.int32)
+    pad_rows[there] = np.concatenate(rows)
+    return pad_rows, there
 
 
 def _check_values(contrast: float, edge: float) -> None:
@@ -127,7 +128,7 @@ def _check_values(contrast: float, edge: float) -> None:
 
 # Number of touches processed at once, and multiple to which the number of nodes is padded, since a program is compiled
 # for each number.
-_AT_ONCE, _MULTIPLE = 64, 16
+_TOUCHES_AT_ONCE, _PADDING_MULTIPLE = 64, 16
 
 
 class TouchedNodes(eqx.Module):
@@ -154,32 +155,32 @@ def touched_nodes(model: ForwardModel, touches: TouchedCells, strips: Strips | N
     touched[np.asarray(mesh.cells)[cells[real]]] = True
     if strips is None:
         strips = Strips.create(model.system.pattern, np.asarray(mesh.points), touched)
-    nowhere = strips.number * strips.wanted  # one entry for all untouched nodes
+    nowhere = strips.num_strips * strips.selected_per_strip  # one entry for all untouched nodes
     place = np.where(touched, strips.place, nowhere).astype(np.int32)[np.asarray(mesh.cells)]
     corners, found = np.zeros((*cells.shape, mesh.cells.shape[1]), np.int32), []
-    for start in range(0, len(cells), _AT_ONCE):
-        some = slice(start, start + _AT_ONCE)
+    for start in range(0, len(cells), _TOUCHES_AT_ONCE):
+        some = slice(start, start + _TOUCHES_AT_ONCE)
         places = np.where(real[some, :, None], place[cells[some]], nowhere)
-        corners[some], (touch, number, node) = _number_places(places, nowhere)
+        corners[some], (touch, number, node) = _number_nodes(places, nowhere)
         found.append((start + touch, number, node))
     corners[~real] = 0
     touch, number, node = (np.concatenate(part) for part in zip(*found, strict=True))
-    nodes = np.zeros((len(cells), -(-(number.max(initial=0) + 1) // _MULTIPLE) * _MULTIPLE), np.int32)
+    nodes = np.zeros((len(cells), -(-(number.max(initial=0) + 1) // _PADDING_MULTIPLE) * _PADDING_MULTIPLE), np.int32)
     nodes[touch, number] = node
     final = np.minimum(np.arange(nodes.shape[1]), np.bincount(touch, minlength=len(cells))[:, None] - 1)
     return TouchedNodes(strips, np.take_along_axis(nodes, final, axis=1), corners)
 
 
-def _number_places(places: Int[np.ndarray, "b c q"], nowhere: int):
-    """Number the distinct places of each of b touches from 0, without the place `nowhere`. Returns the number of every
+def _number_nodes(places: Int[np.ndarray, "b c q"], no_node: int):
+    """Number the distinct places of each of b touches from 0, without the place `no_node`. Returns the number of every
     entry of `places` (b, c, q), and touch, number and place of every distinct place."""
-    first = (nowhere + 1) * np.arange(len(places), dtype=np.int32)
+    first = (no_node + 1) * np.arange(len(places), dtype=np.int32)
     keys = places + first[:, None, None]
-    reached = np.zeros(len(places) * (nowhere + 1), bool)
+    reached = np.zeros(len(places) * (no_node + 1), bool)
     reached[keys] = True
-    reached[first + nowhere] = False
+    reached[first + no_node] = False
     distinct = np.flatnonzero(reached)
-    touch, place = np.divmod(distinct, nowhere + 1)
+    touch, place = np.divmod(distinct, no_node + 1)
     number = np.arange(len(distinct)) - np.searchsorted(distinct, first)[touch]
     numbers = np.zeros(len(reached), np.int32)
     numbers[distinct] = number

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.arguments import check_kind
-from jeit.design.skin.reached_cells import said
+from jeit.design.skin.reached_cells import millimetre_text
 from jeit.design.skin.touched_cells import TouchedCells, touched_nodes
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model, evaluate, select_channels, solved_system_of
@@ -33,18 +33,18 @@ from jeit.protocol import Protocol
 from jeit_solvers import over_cores
 from jeit_solvers.engines import has_values, on_device
 
-# Tolerance of the error bound, relative to the voltages, and maximum number of steps.
-_TOLERANCE, _MOST_STEPS = 1e-8, 200
+# Tolerance of the error bound, relative to the voltages, and maximum number of conjugate-gradient steps.
+_TOLERANCE, _MAX_STEPS = 1e-8, 200
 # Factor by which an insulating touch is assumed to lower the energy of a field, which depends on the shape of the
 # touched part, and maximum of this factor for touched parts with a very low remaining conductivity.
-_CUT_OFF, _MOST_WEAKENED = 10.0, 1e6
+_INSULATING_FACTOR, _MAX_FACTOR = 10.0, 1e6
 # Voltages below this, relative to the energy of the load D F, are rounding errors.
-_SMALLEST = 1e-12
+_MIN_RELATIVE_VOLTAGE = 1e-12
 # Number of touches processed at once for exact and linearised changes, so that their blocks of the inverse or of the
 # Jacobian fit into the cache.
-EXACT_AT_ONCE, _LINEAR = 2, 8
+EXACT_AT_ONCE, _LINEAR_AT_ONCE = 2, 8
 # Multiple to which the number of strips that a touch spans is padded, since a program is compiled for each number.
-_STRIPS = 3
+_STRIP_MULTIPLE = 3
 
 
 def touch_changes(
@@ -74,12 +74,12 @@ def touch_changes(
     if not linear and not has_values(model, conductivity, touched):
         raise ValueError("exact changes cannot be traced by jit, grad or vmap; take linear=True there.")
     if linear:
-        return _linear(model, cell_conductivity(model.mesh, conductivity), touched)
-    return _exact(model, cell_conductivity(model.mesh, conductivity), touched)
+        return _linear_changes(model, cell_conductivity(model.mesh, conductivity), touched)
+    return _exact_changes(model, cell_conductivity(model.mesh, conductivity), touched)
 
 
 @jax.jit
-def _linear(model: ForwardModel, conductivity, touched: TouchedCells):
+def _linear_changes(model: ForwardModel, conductivity, touched: TouchedCells):
     jacobian = model.jacobian(conductivity).T  # (m, M)
     changed = touched.change * conductivity[touched.cells]
 
@@ -87,18 +87,20 @@ def _linear(model: ForwardModel, conductivity, touched: TouchedCells):
         return jnp.einsum("bc,bcm->bm", changed[index], jacobian[touched.cells[index]])
 
     number = len(changed)
-    index = jnp.minimum(jnp.arange(-(-number // _LINEAR) * _LINEAR), number - 1).reshape(-1, _LINEAR)
+    index = jnp.minimum(jnp.arange(-(-number // _LINEAR_AT_ONCE) * _LINEAR_AT_ONCE), number - 1).reshape(
+        -1, _LINEAR_AT_ONCE
+    )
     return _join_chunks(jax.lax.map(some, index))[:number]
 
 
-def _exact(model: ForwardModel, conductivity, touched: TouchedCells):
+def _exact_changes(model: ForwardModel, conductivity, touched: TouchedCells):
     touched_at = touched_nodes(model, touched)
-    reach = -(-touched_at.strips.reach(touched_at.nodes) // _STRIPS) * _STRIPS
+    max_distance = -(-touched_at.strips.max_strip_distance(touched_at.nodes) // _STRIP_MULTIPLE) * _STRIP_MULTIPLE
     solved = evaluate(model, solved_system_of, conductivity)
-    known = fields_and_inverse(solved, touched_at.strips, reach)
+    fields_and_inverse_of_skin = fields_and_inverse(solved, touched_at.strips, max_distance)
     touches = on_device((touched.cells, touched.change, touched_at.nodes, touched_at.corners))
     number, element = len(touched.cells), cell_stiffness(model, conductivity)
-    work = partial(changes_between, model.protocol, element, known, touches)
+    work = partial(changes_between, model.protocol, element, fields_and_inverse_of_skin, touches)
     found = over_cores(work, number, EXACT_AT_ONCE)[:number]
     check_found(found, np.asarray(touched.places))
     return found
@@ -109,8 +111,9 @@ def check_found(changes, places: Float[np.ndarray, "n d"]) -> None:
     lost = np.flatnonzero(~np.isfinite(np.asarray(changes)).all(axis=1))
     if lost.size:
         raise RuntimeError(
-            f"the changes by {lost.size} of {len(places)} touches were not found in {_MOST_STEPS} steps, the first at "
-            f"{said(places[lost[0]])} mm; does it cut an electrode off, or are conductivities many orders of "
+            f"the changes by {lost.size} of {len(places)} touches were not found in {_MAX_STEPS} steps, the first at "
+            f"{millimetre_text(places[lost[0]])} mm; does it cut an electrode off, or are conductivities many orders "
+            "of "
             "magnitude apart?"
         )
 
@@ -122,17 +125,17 @@ def cell_stiffness(model: ForwardModel, conductivity) -> Float[Array, "m q q"]:
 
 
 @jax.jit
-def changes_between(protocol: Protocol, element, known, touches, index):
+def changes_between(protocol: Protocol, element_matrices, fields_and_inverse, touches, index):
     """Compute the voltage changes due to the touches with indices `index` (c, s), s touches at a time.
 
-    `element`: from `cell_stiffness`; `known`: from `fields_and_inverse`; `touches`: cells and changes of all touches,
-    from `TouchedCells`, and their nodes and corners, from `touched_nodes`."""
-    fields, inverse = known
+    `element_matrices`: from `cell_stiffness`; `fields_and_inverse`: from `fields_and_inverse`; `touches`: cells and
+    changes of all touches, from `TouchedCells`, and their nodes and corners, from `touched_nodes`."""
+    fields, inverse = fields_and_inverse
     select = jax.vmap(lambda change: select_channels(protocol, change))
 
     def some(index):
         cells, change, nodes, corners = (array[index] for array in touches)
-        blocks = element[cells] * change[..., None, None]
+        blocks = element_matrices[cells] * change[..., None, None]
         return select(
             _impedance_changes(blocks, corners, inverse.blocks(nodes), fields[nodes], _weakening_factor(change))
         )
@@ -146,28 +149,36 @@ def _join_chunks(chunks: Float[Array, "c s *m"]) -> Float[Array, "cs *m"]:
 
 def _weakening_factor(change: Float[Array, "b c"]) -> Float[Array, " b"]:
     """Largest factor (b,) by which each touch lowers the energy of a field."""
-    left = 1 + change
-    return jnp.clip(jnp.where(left > 0, 1 / jnp.where(left > 0, left, 1.0), _CUT_OFF).max(axis=1), 1, _MOST_WEAKENED)
+    remaining = 1 + change
+    return jnp.clip(
+        jnp.where(remaining > 0, 1 / jnp.where(remaining > 0, remaining, 1.0), _INSULATING_FACTOR).max(axis=1),
+        1,
+        _MAX_FACTOR,
+    )
 
 
-def _impedance_changes(blocks, corners, inverse, fields, weakened):
+def _impedance_changes(blocks, corners, inverse, fields, weakening_factor):
     """Change ΔZ (b, L, L) of the transfer impedance due to b touches.
 
-    D is given by its `blocks` (b, c, q, q) for cells with nodes `corners` (b, c, q), G by `inverse` (b, k, k), and F by
-    `fields` (b, k, L). All touches are iterated together until the last one has converged.
+    ΔZ = −Fᵀ D F + (D F)ᵀ Y, where Y solves (G⁻¹ + D) Y = D F. D, the change of the system matrix by a touch, is
+    assembled from `blocks` (b, c, q, q), siemens, for its c cells with nodes `corners` (b, c, q), indices among the k
+    nodes of the touch. G: `inverse` (b, k, k), ohms, the inverse of the system matrix between these nodes. F: `fields`
+    (b, k, L), ohms, the potentials of these nodes for unit currents into the electrodes. `weakening_factor` (b,): see
+    `_weakening_factor`. The b systems are solved together, by conjugate gradients, until the last one has converged; R
+    is the residual of Y.
     """
     touch = jnp.arange(len(fields))[:, None, None]
     size = fields.shape[1]
-    added = jnp.zeros((len(fields), size, size))
-    added = added.at[touch[..., None], corners[..., :, None], corners[..., None, :]].add(blocks)
-    load = added @ fields
+    touch_matrix = jnp.zeros((len(fields), size, size))
+    touch_matrix = touch_matrix.at[touch[..., None], corners[..., :, None], corners[..., None, :]].add(blocks)
+    right_hand_side = touch_matrix @ fields
 
     def step(state):
         solution, residual, scaled_residual, direction, scaled, energy, ratio, number = state
         direction = scaled_residual + ratio * direction
         # G⁻¹ times the direction, without a solve: the same combination of the residuals.
         scaled = residual + ratio * scaled
-        product = scaled + added @ direction
+        product = scaled + touch_matrix @ direction
         curvature = jnp.sum(direction * product, axis=1, keepdims=True)
         # Converged touches are not changed any more, since their residual and curvature are rounding errors.
         going = (energy > enough) & (curvature > 0)
@@ -180,22 +191,22 @@ def _impedance_changes(blocks, corners, inverse, fields, weakened):
 
     def unfinished(state):
         *_, energy, _, number = state
-        return (number < _MOST_STEPS) & jnp.any(energy > enough)
+        return (number < _MAX_STEPS) & jnp.any(energy > enough)
 
-    scaled_load, blank = inverse @ load, jnp.zeros_like(load)
-    first = jnp.sum(load * scaled_load, axis=1, keepdims=True)
+    scaled_load, blank = inverse @ right_hand_side, jnp.zeros_like(right_hand_side)
+    first = jnp.sum(right_hand_side * scaled_load, axis=1, keepdims=True)
     # The remaining error is at most the energy Rᵀ G R times the factor `weakened`. The voltages change by at least
     # Fᵀ D F due to insulators, and by at least the square of this divided by the energy of the load due to conductors.
-    linear = jnp.abs(jnp.sum(fields * load, axis=1, keepdims=True))
+    linear = jnp.abs(jnp.sum(fields * right_hand_side, axis=1, keepdims=True))
     voltages = jnp.minimum(linear, linear**2 / jnp.where(first > 0, first, 1.0))
-    enough = _TOLERANCE * jnp.maximum(voltages, _SMALLEST * first) / weakened[:, None, None]
-    start = blank, load, scaled_load, blank, blank, first, jnp.zeros_like(first), jnp.zeros((), int)
+    enough = _TOLERANCE * jnp.maximum(voltages, _MIN_RELATIVE_VOLTAGE * first) / weakening_factor[:, None, None]
+    start = blank, right_hand_side, scaled_load, blank, blank, first, jnp.zeros_like(first), jnp.zeros((), int)
     solution, residual, scaled_residual, *_, energy, _, _ = jax.lax.while_loop(unfinished, step, start)
-    change = _transpose(solution) @ (load + residual) + _transpose(residual) @ scaled_residual
-    change -= _transpose(fields) @ load
+    change = _transpose(solution) @ (right_hand_side + residual) + _transpose(residual) @ scaled_residual
+    change -= _transpose(fields) @ right_hand_side
     # Voltages that are so small compared with the load consist of its rounding errors.
-    drowned = jnp.sum(voltages, axis=(1, 2)) < _SMALLEST * jnp.sum(first, axis=(1, 2))
-    converged = jnp.all(energy <= enough, axis=(1, 2)) & ~drowned
+    is_rounding = jnp.sum(voltages, axis=(1, 2)) < _MIN_RELATIVE_VOLTAGE * jnp.sum(first, axis=(1, 2))
+    converged = jnp.all(energy <= enough, axis=(1, 2)) & ~is_rounding
     return jnp.where(converged[:, None, None], (change + _transpose(change)) / 2, jnp.nan)
 
 

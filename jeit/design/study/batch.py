@@ -32,7 +32,7 @@ from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit.protocol import Protocol
 
 
-class _Shared(eqx.Module):
+class _SharedData(eqx.Module):
     """Data shared by all points of one shape.
 
     **Fields**: `model`: the forward model; `touched`: the touched cells on a skin of `thickness` metres; `touches`: the
@@ -49,7 +49,7 @@ class _Shared(eqx.Module):
     key: Array
 
 
-class _Varied(eqx.Module):
+class _PointData(eqx.Module):
     """Data that differ between points of one shape. `conductivity` is that of the forward model, S/m (2-D: S), and
     `noise` is in volts. In a batch of k points, every array has a leading axis of length k."""
 
@@ -74,11 +74,11 @@ def check_points(study: Study) -> None:
         where = f"mesh.cell_mm = {1e3 * point.cell_size:g}{layers}"
         if isinstance(point.layout, SurfaceLayout):
             try:
-                _skin(study, point.shape)
+                _first_skin(study, point.shape)
             except ValueError as error:
                 raise ValueError(f"skin.thickness_mm = {1e3 * point.thickness:g}, {where}: {error}") from None
         try:
-            _skin(study, point.shape).with_layout(point.layout)
+            _first_skin(study, point.shape).with_layout(point.layout)
         except ValueError:
             smallest = 1e3 * smallest_diameter(point.layout)
             raise ValueError(
@@ -86,7 +86,7 @@ def check_points(study: Study) -> None:
                 "smaller."
             ) from None
         try:
-            _shared(study, point.shape)
+            _shared_data(study, point.shape)
         except ValueError as error:
             raise ValueError(f"{where}: {error}") from None
 
@@ -99,17 +99,19 @@ def solve_chunk(study: Study, number: int, solved: Callable[[int], None] | None 
     called with the number of finished maps.
     """
     points = [study.points[index] for index in study.chunks[number]]
-    shared = _shared(study, points[0].shape)
+    shared = _shared_data(study, points[0].shape)
     options = {"scores": study.scores, "num_taxels": study.num_taxels, "threshold": study.threshold}
     if study.exact:
-        results = _stacked(_exact(shared, [_varied(point, study.current) for point in points], options, solved))
+        results = _stack_trees(
+            _solve_exactly(shared, [_point_data(point, study.current) for point in points], options, solved)
+        )
     else:
         devices = jax.devices()
         same = sum(point.shape == points[0].shape for point in study.points)
         size = -(-min(study.chunk_points, same) // len(devices)) * len(devices)
-        varied = [_varied(point, study.current) for point in points]
-        results = _batch(
-            shared, _stacked(varied + varied[-1:] * (size - len(varied))), **options, num_devices=len(devices)
+        varied = [_point_data(point, study.current) for point in points]
+        results = _solve_batch(
+            shared, _stack_trees(varied + varied[-1:] * (size - len(varied))), **options, num_devices=len(devices)
         )
     return {name: np.asarray(values)[: len(points)] for name, values in results.items()}
 
@@ -121,7 +123,7 @@ def study_grid(study: Study) -> TouchGrid:
 
 
 @lru_cache(maxsize=4)
-def _skin(study: Study, shape: Shape) -> Skin:
+def _first_skin(study: Study, shape: Shape) -> Skin:
     """Skin of the first point of a shape; all points of a shape have the same mesh."""
     point = next(point for point in study.points if point.shape == shape)
     return Skin.create(
@@ -135,8 +137,8 @@ def _skin(study: Study, shape: Shape) -> Skin:
 
 
 @lru_cache(maxsize=4)
-def _shared(study: Study, shape: Shape) -> _Shared:
-    skin, grid, touches, prior, lengths = _skin(study, shape), study_grid(study), None, None, None
+def _shared_data(study: Study, shape: Shape) -> _SharedData:
+    skin, grid, touches, prior, lengths = _first_skin(study, shape), study_grid(study), None, None, None
     if isinstance(grid, SurfaceGrid) and isinstance(skin.layout, SurfaceLayout):
         touched_face = touched_surface(skin.model.mesh, skin.touched_face)
         if not eqx.tree_equal(touched_face, study.outline):
@@ -149,11 +151,11 @@ def _shared(study: Study, shape: Shape) -> _Shared:
         prior = TouchPrior.create(grid.places, correlation=study.correlation, lengths=lengths)
     else:
         touched = skin.touched_cells(grid.places, study.indentation, contrast=study.contrast)
-    return _Shared(skin.model, touched, touches, prior, grid, skin.thickness, jax.random.key(study.seed))
+    return _SharedData(skin.model, touched, touches, prior, grid, skin.thickness, jax.random.key(study.seed))
 
 
-def _varied(point: Point, current: float) -> _Varied:
-    return _Varied(
+def _point_data(point: Point, current: float) -> _PointData:
+    return _PointData(
         electrodes=point.electrodes,
         protocol=point.measured(current),
         thickness=jnp.asarray(point.thickness),
@@ -162,19 +164,25 @@ def _varied(point: Point, current: float) -> _Varied:
     )
 
 
-def _stacked(trees):
+def _stack_trees(trees):
     """Stack trees of arrays along a new leading axis."""
     return jax.tree.map(lambda *arrays: jnp.stack(arrays), *trees)
 
 
 @partial(jax.jit, static_argnames=("scores", "num_taxels", "threshold", "num_devices"))
-def _batch(
-    shared: _Shared, varied: _Varied, *, scores: tuple[str, ...], num_taxels: int, threshold: float, num_devices: int
+def _solve_batch(
+    shared: _SharedData,
+    varied: _PointData,
+    *,
+    scores: tuple[str, ...],
+    num_taxels: int,
+    threshold: float,
+    num_devices: int,
 ) -> dict[str, Array]:
-    def one(shared: _Shared, varied: _Varied) -> dict[str, Array]:
-        model, touched = _touched(shared, varied)
+    def one(shared: _SharedData, varied: _PointData) -> dict[str, Array]:
+        model, touched = _model_and_touched_cells(shared, varied)
         changes = touch_changes(model, varied.conductivity, touched, linear=True)
-        return _results(shared, varied, changes, scores=scores, num_taxels=num_taxels, threshold=threshold)
+        return _compute_results(shared, varied, changes, scores=scores, num_taxels=num_taxels, threshold=threshold)
 
     batch = jax.vmap(one, in_axes=(None, 0))
     if num_devices == 1:
@@ -186,18 +194,18 @@ def _batch(
     )
 
 
-def _exact(
-    shared: _Shared, varied: list[_Varied], options: dict, solved: Callable[[int], None] | None
+def _solve_exactly(
+    shared: _SharedData, varied: list[_PointData], options: dict, solved: Callable[[int], None] | None
 ) -> Iterator[dict[str, Array]]:
     """Yield the results of each skin, with exact maps; `solved` as in `solve_chunk`."""
     for number, one in enumerate(varied, 1):
-        model, touched = _touched(shared, one)
-        yield _results(shared, one, touch_changes(model, one.conductivity, touched), **options)
+        model, touched = _model_and_touched_cells(shared, one)
+        yield _compute_results(shared, one, touch_changes(model, one.conductivity, touched), **options)
         if solved is not None and number < len(varied):
             solved(number)
 
 
-def _touched(shared: _Shared, varied: _Varied) -> tuple[ForwardModel, TouchedCells]:
+def _model_and_touched_cells(shared: _SharedData, varied: _PointData) -> tuple[ForwardModel, TouchedCells]:
     """The forward model of a skin, and its touched cells."""
     model = shared.model.with_electrodes(varied.electrodes).with_protocol(varied.protocol)
     touched = eqx.tree_at(
@@ -210,8 +218,8 @@ def _touched(shared: _Shared, varied: _Varied) -> tuple[ForwardModel, TouchedCel
 
 
 @partial(jax.jit, static_argnames=("scores", "num_taxels", "threshold"))
-def _results(
-    shared: _Shared, varied: _Varied, changes: Float[Array, "n M"], *, scores, num_taxels: int, threshold: float
+def _compute_results(
+    shared: _SharedData, varied: _PointData, changes: Float[Array, "n M"], *, scores, num_taxels: int, threshold: float
 ) -> dict[str, Array]:
     """Compute the results of one skin from the voltage changes due to its touches, volts."""
     found = SensitivityMap(shared.grid, changes)
@@ -235,16 +243,16 @@ def _results(
         results["taxel_area_std"] = 1e4 * taxels.std_area
         results["taxel_area_max"] = 1e4 * taxels.max_area
     if shared.touches is not None and shared.prior is not None:
-        results |= _optimality(shared, varied, shared.touches, shared.prior, scores)
+        results |= _optimality_scores(shared, varied, shared.touches, shared.prior, scores)
     return results
 
 
-def _optimality(
-    shared: _Shared, varied: _Varied, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
+def _optimality_scores(
+    shared: _SharedData, varied: _PointData, touches: SheetTouches, prior: TouchPrior, scores: tuple[str, ...]
 ) -> dict[str, Array]:
     """Compute the optimality scores from linearised changes. In a batch, the Jacobian has been computed already, and
     XLA reuses it."""
-    model, _ = _touched(shared, varied)
+    model, _ = _model_and_touched_cells(shared, varied)
     touches = touches.at_thickness(varied.thickness)
     found = layout_scores(model, varied.conductivity, touches, prior=prior, noise=varied.noise)
     results = {}

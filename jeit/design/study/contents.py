@@ -10,7 +10,7 @@ import numpy as np
 from jeit.design.study.batch import study_grid
 from jeit.design.study.spec import Study
 
-_SCORES = {
+_SCORE_ARRAYS = {
     "minimum": {"minimum": ("V", "least sensitivity")},
     "mean": {"mean": ("V", "mean sensitivity")},
     "uniformity": {"uniformity": ("1", "mean sensitivity over its root mean square")},
@@ -60,19 +60,19 @@ def study_contents(study: Study) -> Contents:
     """Contents of the store of a study. Each row of an array belongs to one point and is stored in a separate file."""
     coordinates = [point.coordinates for point in study.points]
     along = {name: [values[name] for values in coordinates] for name in coordinates[0]}
-    arrays = _arrays(study)
+    arrays = _result_arrays(study)
     axes = ("x_mm", "y_mm", "z_mm") if study.surface else ("x_mm", "y_mm")
 
-    def fill(group: Any) -> None:
+    def fill_zarr_group(zarr_group: Any) -> None:
         grid = study_grid(study)
         for name, values in along.items():
-            _write_whole(group, name, "point", values)
+            _write_array(zarr_group, name, "point", values)
         for axis, values in enumerate(np.asarray(grid.places).T):
-            _write_whole(group, axes[axis], "place", np.round(1e3 * values, 9).tolist())
+            _write_array(zarr_group, axes[axis], "place", np.round(1e3 * values, 9).tolist())
         number, places = len(study.points), len(grid.places)
         for name, (unit, meaning) in arrays.items():
             wide = name == "sensitivity"
-            group.create_array(
+            zarr_group.create_array(
                 name,
                 shape=(number, places) if wide else (number,),
                 chunks=(1, places) if wide else (1,),
@@ -83,22 +83,24 @@ def study_contents(study: Study) -> Contents:
             )
 
     attributes = {"coordinates": " ".join([*along, *axes]), "name": study.name, "study": study.text}
-    return Contents("study", "'jeit study run'", study.fingerprint, study.chunks, [*arrays], attributes, fill)
+    return Contents(
+        "study", "'jeit study run'", study.fingerprint, study.chunks, [*arrays], attributes, fill_zarr_group
+    )
 
 
-def _arrays(study: Study) -> dict[str, tuple[str, str]]:
+def _result_arrays(study: Study) -> dict[str, tuple[str, str]]:
     """Unit and description of every result of `study`."""
     arrays = {"sensitivity": ("V", "sensitivity ‖Δv‖ to a touch")}
-    for score, some in _SCORES.items():
+    for score, some in _SCORE_ARRAYS.items():
         if score in study.scores:
             arrays |= some
     return arrays
 
 
-def _write_whole(group, name: str, dimension: str, values: list) -> None:
+def _write_array(zarr_group, name: str, dimension: str, values: list) -> None:
     text = isinstance(values[0], str)
     array = np.array(values, dtype=object if text else None)
-    written = group.create_array(
+    written = zarr_group.create_array(
         name, shape=array.shape, chunks=array.shape, dtype=str if text else array.dtype, dimension_names=(dimension,)
     )
     written[:] = array

@@ -32,7 +32,7 @@ def curved_layout(
     the surface, and gaps below `minimum_gap`.
     """
     try:
-        layout = _make_curved(name, folder, surface, outward, diameter)
+        layout = _create_curved(name, folder, surface, outward, diameter)
     except (ValueError, OSError) as error:
         raise ValueError(f"electrodes.layouts: {describe(name)}: {error}") from None
     if minimum_gap > 0:
@@ -47,8 +47,8 @@ def curved_layout(
     )
 
 
-def _make_curved(name: str, folder: Path, surface: Mesh, outward: bool, diameter: float) -> SurfaceLayout:
-    if is_file(name):
+def _create_curved(name: str, folder: Path, surface: Mesh, outward: bool, diameter: float) -> SurfaceLayout:
+    if is_layout_file(name):
         return read_surface_layout(folder / name, surface, outward=outward)
     made = re.fullmatch(r"inner-(\d{1,4})", name)
     if made is None:
@@ -73,7 +73,7 @@ def study_layout(
     `minimum_gap`.
     """
     try:
-        layout = _make(name, folder, outline, diameter)
+        layout = _create_flat(name, folder, outline, diameter)
     except (ValueError, OSError) as error:
         raise ValueError(f"electrodes.layouts: {describe(name)}: {str(error).removeprefix('name: ')}") from None
     centres = np.asarray(layout.centres)
@@ -85,13 +85,13 @@ def study_layout(
     return Layout(layout.centres, layout.diameters, contact_impedance=impedance, outline=outline, name=name)
 
 
-def is_file(name: str) -> bool:
+def is_layout_file(name: str) -> bool:
     """Whether the name of a layout is that of a file."""
     return Path(name).suffix.lower() in _SUFFIXES
 
 
-def _make(name: str, folder: Path, outline: Rectangle, diameter: float) -> Layout:
-    if not is_file(name):
+def _create_flat(name: str, folder: Path, outline: Rectangle, diameter: float) -> Layout:
+    if not is_layout_file(name):
         layout = named_layout(name, outline, diameter=DIAMETER if math.isnan(diameter) else diameter)
         check_number(layout.num_electrodes)
         return layout
@@ -113,13 +113,14 @@ def check_number(number: int) -> None:
         raise ValueError(f"it has {number} electrodes; give 4 to 1024.")
 
 
-def check_spacing(layout: Layout | SurfaceLayout, lengths: Float[np.ndarray, "L L"], least: float) -> None:
-    """Raise `ValueError` for gaps below `least` between electrodes; `lengths`: distances of their centres, metres."""
+def check_spacing(layout: Layout | SurfaceLayout, lengths: Float[np.ndarray, "L L"], minimum_gap: float) -> None:
+    """Raise `ValueError` for gaps below `minimum_gap` between electrodes; `lengths`: distances of their centres,
+    metres."""
     radii = np.asarray(layout.diameters) / 2
     gap = lengths - radii[:, None] - radii
     np.fill_diagonal(gap, np.inf)
-    if gap.min() < least - 1e-9:
+    if gap.min() < minimum_gap - 1e-9:
         raise ValueError(
-            f"electrodes.minimum_gap_mm is {1e3 * least:g}, and electrodes of {layout.name!r} are "
+            f"electrodes.minimum_gap_mm is {1e3 * minimum_gap:g}, and electrodes of {layout.name!r} are "
             f"{1e3 * gap.min():.3g} mm apart: an impossible spacing; ask for less, or for fewer or smaller electrodes."
         )

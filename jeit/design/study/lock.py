@@ -19,13 +19,13 @@ try:
 except ImportError:
     fcntl = None  # not POSIX
 
-_LONGEST = 4096
+_MAX_BYTES = 4096
 
 
 @contextlib.contextmanager
-def locked(path: Path, kind: str) -> Iterator[None]:
-    """Context in which no other process writes the store at `path`. `kind`: one word for the contents of the store, for
-    messages.
+def locked(path: Path, contents: str) -> Iterator[None]:
+    """Context in which no other process writes the store at `path`. `contents`: one word for the contents of the store,
+    for messages.
 
     The lock is the file `.NAME.lock` beside the store, held by `flock`, which the system releases when the process ends
     for any reason. Its content names the owner. If the owner is on another machine, whose processes cannot be checked,
@@ -33,53 +33,55 @@ def locked(path: Path, kind: str) -> Iterator[None]:
     this process, writes the store, and `OSError` if no file can be written beside it.
     """
     path = path.resolve()  # the same lock, whichever link leads to the store
-    place = path.with_name(f".{path.name}.lock")
+    lock_path = path.with_name(f".{path.name}.lock")
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        handle = _acquire(place, path, kind)
+        lock_path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = _acquire(lock_path, path, contents)
     except OSError as error:
-        done = "written" if path.exists() else "made"
-        reason = f"the {kind}'s store cannot be {done} ({error.strerror})"
+        verb = "written" if path.exists() else "made"
+        reason = f"the {contents}'s store cannot be {verb} ({error.strerror})"
         raise OSError(error.errno, reason, str(path)) from error
     try:
         yield
     finally:
         with contextlib.suppress(OSError):
-            place.unlink()
-        os.close(handle)
+            lock_path.unlink()
+        os.close(descriptor)
 
 
-def _acquire(place: Path, path: Path, kind: str) -> int:
+def _acquire(lock_path: Path, store_path: Path, contents: str) -> int:
     """Open the file of the lock and acquire the lock; returns the file descriptor."""
     while True:
-        handle = os.open(place, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
-            held = _hold(handle)
-            if held and not _is_at(handle, place):  # the previous owner has just ended and removed the file
-                os.close(handle)
+            is_locked = _try_to_lock(descriptor)
+            if is_locked and not _is_file_at(
+                descriptor, lock_path
+            ):  # the previous owner has just ended and removed the file
+                os.close(descriptor)
                 continue
-            owner = _owner(handle)
-            if held is False or (owner and not _has_ended(owner, certain=held is True)):
-                raise ValueError(_refusal(owner, place, path, kind))
+            owner = _read_owner(descriptor)
+            if is_locked is False or (owner and not _has_ended(owner, certain=is_locked is True)):
+                raise ValueError(_refusal_message(owner, lock_path, store_path, contents))
             try:
-                _sign(handle)
+                _write_owner(descriptor)
             except OSError:  # a full disk
-                place.unlink()
+                lock_path.unlink()
                 raise
         except BaseException:
             with contextlib.suppress(OSError):
-                os.close(handle)
+                os.close(descriptor)
             raise
-        return handle
+        return descriptor
 
 
-def _hold(handle: int) -> bool | None:
+def _try_to_lock(descriptor: int) -> bool | None:
     """Try to lock the file. Returns whether this process holds the lock now; None if the system or the file system does
     not support locks."""
     if fcntl is None:
         return None
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:
@@ -87,25 +89,27 @@ def _hold(handle: int) -> bool | None:
     return True
 
 
-def _is_at(handle: int, place: Path) -> bool:
+def _is_file_at(descriptor: int, lock_path: Path) -> bool:
+    """Whether the open file is still the one at the path of the lock."""
     try:
-        return os.path.samestat(os.fstat(handle), place.stat())
+        return os.path.samestat(os.fstat(descriptor), lock_path.stat())
     except FileNotFoundError:
         return False
 
 
-def _sign(handle: int) -> None:
+def _write_owner(descriptor: int) -> None:
+    """Write the process, the machine and the time into the lock file as JSON, so that others can name its owner."""
     owner = {"pid": os.getpid(), "host": platform.node(), "boot": boot()}
     owner["since"] = datetime.now().astimezone().isoformat(sep=" ", timespec="seconds")
-    os.ftruncate(handle, 0)
-    os.pwrite(handle, json.dumps(owner).encode(), 0)
-    os.fsync(handle)
+    os.ftruncate(descriptor, 0)
+    os.pwrite(descriptor, json.dumps(owner).encode(), 0)
+    os.fsync(descriptor)
 
 
-def _owner(handle: int) -> dict:
+def _read_owner(descriptor: int) -> dict:
     """Read the owner from the file; empty if the owner ended before the file was written."""
     try:
-        owner = json.loads(os.pread(handle, _LONGEST, 0))
+        owner = json.loads(os.pread(descriptor, _MAX_BYTES, 0))
     except (ValueError, RecursionError):
         return {}
     return owner if isinstance(owner, dict) else {}
@@ -114,21 +118,24 @@ def _owner(handle: int) -> dict:
 def _has_ended(owner: dict, *, certain: bool) -> bool:
     """Whether the owner has ended. `certain`: it is known not to hold the lock of the file any more, which is
     conclusive for an owner on this machine only."""
-    return _is_here(owner) and (certain or not is_alive(owner.get("pid")))
+    return _is_on_this_machine(owner) and (certain or not is_alive(owner.get("pid")))
 
 
-def _is_here(owner: dict) -> bool:
+def _is_on_this_machine(owner: dict) -> bool:
+    """Whether the owner runs, or ran, on this machine, by its name or its boot identifier."""
     return owner.get("host") == platform.node() or (bool(boot()) and owner.get("boot") == boot())
 
 
-def _refusal(owner: dict, place: Path, path: Path, kind: str) -> str:
-    who = f"process {describe(owner['pid'])}" if "pid" in owner else "another process"
+def _refusal_message(owner: dict, lock_path: Path, store_path: Path, contents: str) -> str:
+    owner_text = f"process {describe(owner['pid'])}" if "pid" in owner else "another process"
     since = f" since {describe(owner['since']).strip(chr(39))}" if "since" in owner else ""
-    if not owner or (_is_here(owner) and fcntl is not None):
-        who = "this process" if owner.get("pid") == os.getpid() else who
-        return f"{path} is being written by {who}{since}; wait until it ends, or stop it, then resume the {kind}."
-    where = "this machine" if _is_here(owner) else describe(owner.get("host"))
+    if not owner or (_is_on_this_machine(owner) and fcntl is not None):
+        owner_text = "this process" if owner.get("pid") == os.getpid() else owner_text
+        remedy = f"wait until it ends, or stop it, then resume the {contents}."
+        return f"{store_path} is being written by {owner_text}{since}; {remedy}"
+    where = "this machine" if _is_on_this_machine(owner) else describe(owner.get("host"))
     return (
-        f"{path} is being written by {who} on {where}{since}, or was when that was killed: from here this cannot be "
-        f"seen. Where it still runs, wait; where it does not, delete {place} and resume the {kind}."
+        f"{store_path} is being written by {owner_text} on {where}{since}, or was when that was killed: from here "
+        f"this cannot be seen. Where it still runs, wait; where it "
+        f"does not, delete {lock_path} and resume the {contents}."
     )

@@ -76,7 +76,7 @@ def over_cluster(
     # would be lost in this case, and sending it with every chunk would transfer a layer of 70 MB a thousand times.
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sending large graph")
-        sent = client.submit(_identity, work, pure=False)
+        sent = client.submit(_return_unchanged, work, pure=False)
     futures = {client.submit(solve, sent, number, pure=False, retries=2): number for number in numbers}
     try:
         for future, results in distributed.as_completed(futures, with_results=True):
@@ -86,7 +86,7 @@ def over_cluster(
         client.cancel([sent, *futures])
 
 
-def _identity(work: Any) -> Any:
+def _return_unchanged(work: Any) -> Any:
     return work
 
 
@@ -115,7 +115,7 @@ def run_study(
         done = set(store.sound())
         left = [number for number in range(len(study.chunks)) if number not in done]
         report = ProgressReporter(study.chunks, done, progress)
-        for number, results in _solved(study, left, client, report.solved):
+        for number, results in _solve_chunks(study, left, client, report.solved):
             store.write(number, results)
             report.finished(number)
     return open_results(study, path)
@@ -129,7 +129,7 @@ def study_progress(study: Study, path: str | Path) -> Progress:
     return Progress(points, len(study.points), len(finished), len(study.chunks), None)
 
 
-def _solved(
+def _solve_chunks(
     study: Study, numbers: list[int], client: Any, solved: Callable[[int], None]
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Yield the number of each chunk with its results, in the order in which they are solved; `solved` as in

@@ -19,7 +19,7 @@ from jeit.design.skin.described_surface import described_surface, surface_identi
 from jeit.design.skin.indentation import AbstractIndentation, Bell, Hemisphere
 from jeit.design.skin.protocol import ProtocolName, skin_protocol
 from jeit.design.skin.skin import check_cell_size, longer_side, skin_electrodes
-from jeit.design.study.layouts import curved_layout, is_file, study_layout
+from jeit.design.study.layouts import curved_layout, is_layout_file, study_layout
 from jeit.electrodes import FaceDiscs, SheetDiscs, SurfaceDiscs
 from jeit.files import check_memory, read_text
 from jeit.files.limits import parsed_toml
@@ -37,9 +37,9 @@ Maker = Callable[[str, float, float, float], Layout | SurfaceLayout]
 # Version of the results: increase it if the same study would give different results.
 _VERSION = 2
 # Minimum number of electrodes of each protocol.
-_FEWEST = {"adjacent": 4, "opposite": 4, "two-terminal": 2}
+_MIN_ELECTRODES = {"adjacent": 4, "opposite": 4, "two-terminal": 2}
 # Maximum size of a study file, and of its store of results, bytes.
-_LONGEST, _MOST_STORED = 2**22, 20e9
+_MAX_FILE_BYTES, _MAX_STORE_BYTES = 2**22, 20e9
 
 
 class Shape(NamedTuple):
@@ -92,14 +92,14 @@ class Point:
         return {
             "layout": self.layout.name,
             "electrodes": self.layout.num_electrodes,
-            "diameter_mm": _tidy(1e3 * np.mean(self.layout.diameters)),
-            "contact_impedance_ohm_m2": _tidy(np.mean(np.asarray(self.layout.contact_impedance))),
-            "thickness_mm": _tidy(1e3 * self.thickness),
+            "diameter_mm": _without_rounding(1e3 * np.mean(self.layout.diameters)),
+            "contact_impedance_ohm_m2": _without_rounding(np.mean(np.asarray(self.layout.contact_impedance))),
+            "thickness_mm": _without_rounding(1e3 * self.thickness),
             "conductivity_S_per_m": self.conductivity,
             "protocol": self.protocol,
             "pairs": self.pairs,
             "noise_V": self.noise,
-            "cell_mm": _tidy(1e3 * self.cell_size),
+            "cell_mm": _without_rounding(1e3 * self.cell_size),
         }
 
 
@@ -161,7 +161,7 @@ class Study:
         for point in self.points:
             content += [point.coordinates, point.layers]
             # Positions of built-in layouts are left out, since their last digits depend on the compilation.
-            if is_file(point.layout.name):
+            if is_layout_file(point.layout.name):
                 arrays = (point.layout.centres, point.layout.diameters, point.layout.contact_impedance)
                 content += [(np.round(array, 12) + 0.0).tolist() for array in map(np.asarray, arrays)]
         return hashlib.sha256(json.dumps(content).encode()).hexdigest()
@@ -224,27 +224,27 @@ def read_study(path: str | Path) -> Study:
     from jeit.files.limits import faults_message
     from jeit.files.schema import validated
 
-    text = read_text(path, most=_LONGEST)
+    text = read_text(path, most=_MAX_FILE_BYTES)
     table = validated(StudyTable, parsed_toml(text, path.name), path.name)
     try:
-        return _study(text, table, path.parent)
+        return _study_from_table(text, table, path.parent)
     except ValueError as error:
         raise ValueError(faults_message(path.name, [str(error)])) from None
 
 
-def _study(text: str, table: StudyTable, folder: Path) -> Study:
+def _study_from_table(text: str, table: StudyTable, folder: Path) -> Study:
     skin, measurement, scores = table.skin, table.measurement, table.scores
-    indentation = _indentation(table)
+    indentation = _create_indentation(table)
     _check_touches(table)
     layers = table.mesh.layers if skin.model == "layer" else 0
     electrodes = table.electrodes
     gap = 1e-3 * electrodes.minimum_gap_mm
-    cells, outline, makers = _meshes_of(table, folder)
+    cells, outline, makers = _surface_meshes(table, folder)
     # Every layout is created once for each mesh; on flat skins, a single one serves all meshes.
     layouts = [
         [make(name, diameter, impedance, gap) for make in makers]
         for name, diameter, impedance in itertools.product(
-            electrodes.layouts, _metres(electrodes.diameter_mm), electrodes.contact_impedance_ohm_m2
+            electrodes.layouts, _to_metres(electrodes.diameter_mm), electrodes.contact_impedance_ohm_m2
         )
     ]
     for on_meshes in layouts:
@@ -256,14 +256,14 @@ def _study(text: str, table: StudyTable, folder: Path) -> Study:
             thickness,
             conductivity,
             protocol,
-            _pairs(on_meshes[0], protocol, pairs),
+            _num_pairs(on_meshes[0], protocol, pairs),
             noise,
             cells[k],
             layers,
         )
         for on_meshes, thickness, conductivity, protocol, pairs, noise, k in itertools.product(
             layouts,
-            _metres(skin.thickness_mm),
+            _to_metres(skin.thickness_mm),
             skin.conductivity_S_per_m,
             measurement.protocol,
             measurement.pairs or [None],
@@ -292,7 +292,7 @@ def _study(text: str, table: StudyTable, folder: Path) -> Study:
     )
 
 
-def _indentation(table: StudyTable) -> AbstractIndentation:
+def _create_indentation(table: StudyTable) -> AbstractIndentation:
     touch, thinnest = table.touch, min(table.skin.thickness_mm)
     if touch.depth_mm >= thinnest:
         raise ValueError(f"touch.depth_mm is {touch.depth_mm:g}, and the skin {thinnest:g} mm thick; press less.")
@@ -315,10 +315,10 @@ def _check_touches(table: StudyTable) -> None:
     scores, touches = table.scores, table.touch.columns * table.touch.rows
     of_sheets = [score for score in OPTIMALITY if score in scores.wanted]
     stored = 8.0 * table.num_points * touches
-    if stored > _MOST_STORED:
+    if stored > _MAX_STORE_BYTES:
         raise ValueError(
             f"touch.columns × touch.rows × {table.num_points:,} points are {stored / 1e9:.3g} GB of results, more than "
-            f"the {_MOST_STORED / 1e9:g} GB of a study; ask for fewer, or split the study."
+            f"the {_MAX_STORE_BYTES / 1e9:g} GB of a study; ask for fewer, or split the study."
         )
     if "taxels" in scores.wanted:
         if scores.num_taxels > touches:
@@ -347,10 +347,10 @@ def _check_layout(
     touches = table.touch.columns * table.touch.rows
     for protocol in table.measurement.protocol:
         for pairs in table.measurement.pairs or [None]:
-            number = _pairs(layout, protocol, pairs)
+            number = _num_pairs(layout, protocol, pairs)
             _check_measurement(layout, protocol, number)
             if protocol == "two-terminal":
-                patterns = number or _all_pairs(layout)
+                patterns = number or _num_all_pairs(layout)
                 size = 8.0 * patterns * (4 * layout.num_electrodes + touches)
                 check_memory(
                     f"measurement.pairs: {patterns:,} of {layout.name!r}, touched at {touches:,} places,", size
@@ -358,24 +358,24 @@ def _check_layout(
     if isinstance(outline, Triangles) and "cell_mm" not in table.mesh.model_fields_set:
         return
     area = float(outline.areas.sum()) if isinstance(outline, Triangles) else outline.area
-    for cell_size in _metres(table.mesh.cell_mm):
+    for cell_size in _to_metres(table.mesh.cell_mm):
         check_cell_size("mesh.cell_mm", cell_size, layout, area, layers)
 
 
-def _pairs(layout: Layout | SurfaceLayout, protocol: str, pairs: int | None) -> int:
+def _num_pairs(layout: Layout | SurfaceLayout, protocol: str, pairs: int | None) -> int:
     """Number of pairs for `Point`, 0 for all pairs: the given number, or by default 94, or all if there are fewer."""
     if pairs is not None:
         return pairs
-    return defaults.NUM_PAIRS if protocol == "two-terminal" and _all_pairs(layout) > defaults.NUM_PAIRS else 0
+    return defaults.NUM_PAIRS if protocol == "two-terminal" and _num_all_pairs(layout) > defaults.NUM_PAIRS else 0
 
 
-def _all_pairs(layout: Layout | SurfaceLayout) -> int:
+def _num_all_pairs(layout: Layout | SurfaceLayout) -> int:
     return layout.num_electrodes * (layout.num_electrodes - 1) // 2
 
 
 def _check_measurement(layout: Layout | SurfaceLayout, protocol: str, pairs: int) -> None:
     """Check that a layout has enough electrodes for its protocol and number of pairs."""
-    name, number, fewest = layout.name, layout.num_electrodes, _FEWEST[protocol]
+    name, number, fewest = layout.name, layout.num_electrodes, _MIN_ELECTRODES[protocol]
     if number < fewest:
         raise ValueError(
             f"measurement.protocol: {name!r} has {number} electrodes, and {protocol!r} needs {fewest} at least."
@@ -389,24 +389,25 @@ def _check_measurement(layout: Layout | SurfaceLayout, protocol: str, pairs: int
             f"measurement.pairs is {pairs}, and measurement.protocol {protocol!r}: only 'two-terminal' has pairs; put "
             "other protocols into a study of their own."
         )
-    if pairs > _all_pairs(layout):
+    if pairs > _num_all_pairs(layout):
         raise ValueError(
-            f"measurement.pairs is {pairs}, and {name!r} has {_all_pairs(layout)} pairs of electrodes; ask for fewer, "
+            f"measurement.pairs is {pairs}, and {name!r} has {_num_all_pairs(layout)} pairs of electrodes; ask for "
+            "fewer, "
             "or for 0: all."
         )
 
 
-def _metres(lengths: list[float]) -> list[float]:
+def _to_metres(lengths: list[float]) -> list[float]:
     """Convert millimetres to metres."""
     return [1e-3 * length for length in lengths]
 
 
-def _tidy(value) -> float:
+def _without_rounding(value) -> float:
     """Round to 12 digits, which removes rounding errors of unit conversion."""
     return float(f"{float(value):.12g}")
 
 
-def _meshes_of(table: StudyTable, folder: Path) -> tuple[list[float], Rectangle | Triangles, Sequence[Maker]]:
+def _surface_meshes(table: StudyTable, folder: Path) -> tuple[list[float], Rectangle | Triangles, Sequence[Maker]]:
     """Returns the cell sizes, metres; the outline, or for curved skins the surface for the first cell size; and the
     functions that create layouts: a single one for flat skins, and one for each cell size for curved skins."""
     from jeit.design.skin.surface_tables import ScanTable  # imported already when the table was read

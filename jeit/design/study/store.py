@@ -37,13 +37,13 @@ from jeit.design.study.spec import Study
 # Allowed codecs: they only pack bytes. Sharding is excluded, since it contains further codecs.
 CODECS = frozenset({"blosc", "bytes", "crc32c", "transpose", "vlen-utf8", "zstd"})
 # Maximum unpacked size of a chunk of text, and maximum overhead of a chunk of numbers, bytes.
-_LARGEST, _BESIDE = 2**24, 2**12
+_MAX_TEXT_CHUNK, _MAX_CHUNK_OVERHEAD = 2**24, 2**12
 
-_NUMBERS = tuple(f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64))
-_TYPES = frozenset({"bool", "string", *_NUMBERS})
-_FORMAT_2 = (".zarray", ".zattrs", ".zgroup", ".zmetadata")
-_METADATA = "zarr.json"
-_UNREADABLE = f"has a {_METADATA} that is no JSON object, or nested too deep"
+_NUMBER_TYPES = tuple(f"{kind}{bits}" for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64))
+_ALLOWED_TYPES = frozenset({"bool", "string", *_NUMBER_TYPES})
+_FORMAT_2_FILES = (".zarray", ".zattrs", ".zgroup", ".zmetadata")
+_METADATA_FILE = "zarr.json"
+_UNREADABLE_TEXT = f"has a {_METADATA_FILE} that is no JSON object, or nested too deep"
 
 
 class ArrayShape(NamedTuple):
@@ -55,7 +55,7 @@ class ArrayShape(NamedTuple):
     data_type: str
 
 
-def danger(path: Path) -> str | None:
+def find_danger(path: Path) -> str | None:
     """Reason why a store must not be opened; None if nothing in it can run code or link to other paths. Raises
     `OSError` for files that cannot be read."""
     for folder, folders, files in os.walk(path):
@@ -63,23 +63,23 @@ def danger(path: Path) -> str | None:
             place = Path(folder, name)
             if place.is_symlink():
                 return f"'{place.relative_to(path)}' is a link to another place"
-            if name in _FORMAT_2:
+            if name in _FORMAT_2_FILES:
                 return f"'{place.relative_to(path)}' is of Zarr's format 2, which jeit does not write"
-    for file in path.rglob(_METADATA):
-        content = _read(file)  # a file that Zarr cannot read is damaged, but not dangerous
-        for where, node in [] if content is None else _nodes(content, str(file.relative_to(path))):
-            reason = _node_danger(node)
+    for file in path.rglob(_METADATA_FILE):
+        content = _read_bytes(file)  # a file that Zarr cannot read is damaged, but not dangerous
+        for where, node in [] if content is None else _metadata_nodes(content, str(file.relative_to(path))):
+            reason = _find_node_danger(node)
             if reason:
                 return f"{where} {reason}"
     return None
 
 
-def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
+def find_damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
     """Description of the first difference from a store with the arrays `expected`, by name; None if there is none.
     Raises `OSError` for files that cannot be read."""
-    content = _read(path / _METADATA)
+    content = _read_bytes(path / _METADATA_FILE)
     if content is None:
-        return _UNREADABLE
+        return _UNREADABLE_TEXT
     found = {folder.name for folder in path.iterdir() if folder.is_dir()}
     if found != set(expected):
         return f"its arrays are not those of its contents: {_short_text(found ^ set(expected))}"
@@ -90,10 +90,12 @@ def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
     if not isinstance(named, dict) or set(named) != set(expected):
         return "it does not name the arrays of its contents"
     for name, array in expected.items():
-        if [*(path / name).rglob(_METADATA)] != [path / name / _METADATA]:
-            return f"array '{name}' has not one {_METADATA}"
-        own = _read(path / name / _METADATA)
-        reason = _UNREADABLE if own is None else _node_damage(named[name], array) or _node_damage(own, array)
+        if [*(path / name).rglob(_METADATA_FILE)] != [path / name / _METADATA_FILE]:
+            return f"array '{name}' has not one {_METADATA_FILE}"
+        own = _read_bytes(path / name / _METADATA_FILE)
+        reason = (
+            _UNREADABLE_TEXT if own is None else _find_node_damage(named[name], array) or _find_node_damage(own, array)
+        )
         reason = reason or _chunk_damage(path / name, array)
         if reason:
             return f"array '{name}' {reason}"
@@ -103,9 +105,9 @@ def damage(path: Path, expected: Mapping[str, ArrayShape]) -> str | None:
 def _chunk_damage(folder: Path, array: ArrayShape) -> str | None:
     """Description of the first chunk whose unpacked size is unknown or larger than a chunk of the array can be; None if
     there is none."""
-    most = _LARGEST if array.data_type == "string" else 8 * math.prod(array.chunks) + _BESIDE
+    most = _MAX_TEXT_CHUNK if array.data_type == "string" else 8 * math.prod(array.chunks) + _MAX_CHUNK_OVERHEAD
     for file in folder.rglob("*"):
-        if file.is_file() and file.name != _METADATA:
+        if file.is_file() and file.name != _METADATA_FILE:
             with file.open("rb") as opened:
                 size = _unpacked_size(opened.read(18), file.stat().st_size)
             if size is None or size > most:
@@ -128,17 +130,17 @@ def _unpacked_size(beginning: bytes, size: int) -> int | None:
     return size
 
 
-def _nodes(content: Any, where: str) -> Iterator[tuple[str, Any]]:
+def _metadata_nodes(content: Any, where: str) -> Iterator[tuple[str, Any]]:
     """Yield the location and the metadata of every group and array that `content` describes, including consolidated
     metadata at any depth."""
     yield f"'{where}'", content
     consolidated = content.get("consolidated_metadata") if isinstance(content, dict) else None
     inner = consolidated.get("metadata") if isinstance(consolidated, dict) else None
     for name, node in (inner if isinstance(inner, dict) else {}).items():
-        yield from _nodes(node, f"{where}: {name}")
+        yield from _metadata_nodes(node, f"{where}: {name}")
 
 
-def _node_danger(node: Any) -> str | None:
+def _find_node_danger(node: Any) -> str | None:
     if not isinstance(node, dict):
         return "describes neither a group nor an array"
     if any(name in node for name in ("dtype", "filters", "compressor")) or node.get("zarr_format") == 2:
@@ -146,7 +148,7 @@ def _node_danger(node: Any) -> str | None:
     if node.get("storage_transformers"):
         return "asks for storage transformers"
     data_type = node.get("data_type")
-    if "data_type" in node and not (isinstance(data_type, str) and data_type in _TYPES):
+    if "data_type" in node and not (isinstance(data_type, str) and data_type in _ALLOWED_TYPES):
         return f"holds neither numbers nor text but {_short_text([data_type])}"
     codecs = node.get("codecs", [])
     names = [codec.get("name") if isinstance(codec, dict) else codec for codec in _as_list(codecs)]
@@ -154,7 +156,7 @@ def _node_danger(node: Any) -> str | None:
     return f"asks for {_short_text(strange)}, and not only for codecs that pack bytes" if strange else None
 
 
-def _node_damage(node: Any, expected: ArrayShape) -> str | None:
+def _find_node_damage(node: Any, expected: ArrayShape) -> str | None:
     grid = node.get("chunk_grid")
     configuration = grid.get("configuration") if isinstance(grid, dict) and grid.get("name") == "regular" else None
     chunks = configuration.get("chunk_shape") if isinstance(configuration, dict) else None
@@ -167,7 +169,7 @@ def _node_damage(node: Any, expected: ArrayShape) -> str | None:
     return None
 
 
-def _read(file: Path) -> dict[str, Any] | None:
+def _read_bytes(file: Path) -> dict[str, Any] | None:
     """Read the JSON object in a file; None if the file contains anything else. Raises `OSError`."""
     try:
         content = json.loads(file.read_bytes())
@@ -213,7 +215,7 @@ class Store:
             if not create:
                 raise FileNotFoundError(f"path: there is no {kind} at {self.path}; run it first.")
             try:
-                _create(zarr, self.contents, self.path)
+                _create_store(zarr, self.contents, self.path)
             except OSError as error:
                 raise OSError(
                     error.errno, f"the {kind}'s store cannot be made ({error.strerror})", str(path)
@@ -229,7 +231,7 @@ class Store:
                 f"{self.path} holds the results of another {kind}, or of this one before it was changed; move it away "
                 "or choose another path."
             )
-        self._check(_shapes(zarr, self.contents))
+        self._check(_store_shapes(zarr, self.contents))
         try:
             self._group = zarr.open_group(str(self.path), mode="r+" if create else "r", zarr_format=3)
         except (OSError, ValueError, TypeError, KeyError) as error:
@@ -267,7 +269,7 @@ class Store:
     def write_array(self, name: str, points: Sequence[int], values: np.ndarray) -> None:
         """Write `values` (k, …) of the array `name` for k points."""
         array, first = self._group[name], 0
-        for rows in _runs(points):
+        for rows in _consecutive_runs(points):
             last = first + rows.stop - rows.start
             array[rows] = values[first:last]  # pyright: ignore[reportIndexIssue]
             first = last
@@ -288,7 +290,7 @@ class Store:
             temporary.unlink(missing_ok=True)
 
     def _checksum(self, number: int) -> str | None:
-        runs = _runs(self.contents.chunks[number])
+        runs = _consecutive_runs(self.contents.chunks[number])
         try:
             return _checksum(
                 {name: np.concatenate([self._group[name][rows] for rows in runs]) for name in self.contents.arrays}
@@ -303,8 +305,8 @@ class Store:
     def _check(self, expected: Mapping[str, ArrayShape]) -> None:
         """Check the metadata of the store before Zarr opens it. Raises `ValueError` if it is dangerous or damaged."""
         try:
-            reason = danger(self.path)
-            wrong = None if reason else damage(self.path, expected)
+            reason = find_danger(self.path)
+            wrong = None if reason else find_damage(self.path, expected)
         except OSError as error:
             raise self._damaged(error) from None
         if reason:
@@ -353,7 +355,7 @@ def writing(work: Study | Contents, path: str | Path) -> Iterator[Store]:
     contents = work if isinstance(work, Contents) else study_contents(work)
     path = Path(path)
     with locked(path, contents.kind):
-        _clear_beside(path)
+        _remove_temporary_stores(path)
         store = Store(contents, path)
         for left in path.rglob("*.partial"):  # temporary files of Zarr
             left.unlink(missing_ok=True)
@@ -382,7 +384,7 @@ def open_results(study: Study, path: str | Path):
         return xarray.Dataset(variables, {**coordinates, "finished": ("point", done)}, found.attrs)
 
 
-def _shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
+def _store_shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
     """Sizes of the arrays of `contents`, by name, from a store in memory that has no values."""
     group = zarr.open_group(zarr.storage.MemoryStore(), mode="w", zarr_format=3)
     contents.fill(group)
@@ -392,14 +394,14 @@ def _shapes(zarr: ModuleType, contents: Contents) -> dict[str, ArrayShape]:
     }
 
 
-def _runs(points: Sequence[int]) -> list[slice]:
+def _consecutive_runs(points: Sequence[int]) -> list[slice]:
     """Group consecutive numbers of points to slices."""
     places = np.asarray(points)
     ends = np.flatnonzero(np.diff(places) != 1) + 1
     return [slice(int(run[0]), int(run[-1]) + 1) for run in np.split(places, ends)]
 
 
-def _create(zarr: ModuleType, contents: Contents, path: Path) -> None:
+def _create_store(zarr: ModuleType, contents: Contents, path: Path) -> None:
     """Create the store atomically: under a temporary name, which is then changed."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
     shutil.rmtree(temporary, ignore_errors=True)
@@ -420,7 +422,7 @@ def _create(zarr: ModuleType, contents: Contents, path: Path) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _clear_beside(path: Path) -> None:
+def _remove_temporary_stores(path: Path) -> None:
     """Remove temporary files beside the store that killed runs have left."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*"):
         pid, _, kind = left.name.removeprefix(f".{path.name}.").partition(".")

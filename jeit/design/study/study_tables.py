@@ -26,7 +26,7 @@ from jeit.files.schema import Number, Several, Table, Word, fault
 
 # Maximum numbers of layouts and of points: they are created before anything runs and take milliseconds and kilobytes
 # each.
-_MOST_LAYOUTS, _MOST_POINTS = 2000, 100_000
+_MAX_LAYOUTS, _MAX_POINTS = 2000, 100_000
 
 
 class MaterialSweep(Table):
@@ -149,15 +149,15 @@ class StudyTable(Table):
     @model_validator(mode="after")
     def _few_enough(self) -> "StudyTable":
         layouts, points = self.num_layouts, self.num_points
-        if layouts > _MOST_LAYOUTS:
+        if layouts > _MAX_LAYOUTS:
             raise fault(
-                f"makes {layouts:,} layouts with diameters and contact impedances, more than the {_MOST_LAYOUTS:,} of "
+                f"makes {layouts:,} layouts with diameters and contact impedances, more than the {_MAX_LAYOUTS:,} of "
                 "a study; split it into several.",
                 "electrodes.layouts",
             )
-        if points > _MOST_POINTS:
+        if points > _MAX_POINTS:
             raise fault(
-                f"makes {points:,} points with the other lists, more than the {_MOST_POINTS:,} of a study; split it "
+                f"makes {points:,} points with the other lists, more than the {_MAX_POINTS:,} of a study; split it "
                 "into several.",
                 "electrodes.layouts",
             )

@@ -266,7 +266,7 @@ def disc_transfer_impedance(
 
 
 # Distance in radii beyond which images are negligible in double precision.
-_FARTHEST = 45.0
+_IMAGE_CUTOFF = 45.0
 
 
 def sphere_sheet_impedance(positions: np.ndarray, conductivity: complex) -> np.ndarray:
@@ -293,7 +293,7 @@ def sleeve_sheet_impedance(
     """
     around = angles[:, None] - angles
     z, source = heights[:, None], heights
-    number = int(np.ceil(_FARTHEST * radius / (2 * height))) + 1
+    number = int(np.ceil(_IMAGE_CUTOFF * radius / (2 * height))) + 1
     potential = np.zeros(around.shape)
     for k in range(-number, number + 1):
         for apart in (z - source + 2 * k * height, z + source + 2 * k * height):

@@ -91,11 +91,11 @@ def blur_radius(
     return (covered / area.sum()) ** (1 / mesh.dimension)
 
 
-def spread_cells(mesh: Mesh, number: int) -> Int[np.ndarray, " T"]:
-    """About `number` cells spread evenly through the body: the cells nearest to the points of a regular lattice."""
+def spread_cells(mesh: Mesh, num_cells: int) -> Int[np.ndarray, " T"]:
+    """About `num_cells` cells spread evenly through the body: the cells nearest to the points of a regular lattice."""
     centre, size = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
     low, high = np.asarray(mesh.points).min(axis=0), np.asarray(mesh.points).max(axis=0)
-    spacing = (size.sum() / number) ** (1 / mesh.dimension)
+    spacing = (size.sum() / num_cells) ** (1 / mesh.dimension)
     counts = np.maximum(np.round((high - low) / spacing).astype(int), 1)
     steps = [a + (np.arange(n) + 0.5) * (b - a) / n for a, b, n in zip(low, high, counts, strict=True)]
     lattice = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, mesh.space_dimension)
@@ -269,13 +269,13 @@ def _curvature(spectrum: Spectrum, data, candidates) -> Float[np.ndarray, " K"]:
     image = squared * eigenvalues / (eigenvalues + candidates[:, None] ** 2) ** 2  # its sum is the penalty
     rest = squared * left**2  # its sum is ‖r‖²
     # The derivatives with respect to t are 4 rest (1 - f) and -4 image f.
-    first = _log_derivatives(rest, 4 * (1 - left), 8 * (1 - left) * (2 - 3 * left))
-    second = _log_derivatives(image, -4 * left, -8 * left * (1 - 3 * left))
+    first = _second_log_derivative(rest, 4 * (1 - left), 8 * (1 - left) * (2 - 3 * left))
+    second = _second_log_derivative(image, -4 * left, -8 * left * (1 - 3 * left))
     with np.errstate(divide="ignore", invalid="ignore"):
         return (first[0] * second[1] - second[0] * first[1]) / (first[0] ** 2 + second[0] ** 2) ** 1.5
 
 
-def _log_derivatives(terms, once, twice):
+def _second_log_derivative(terms, once, twice):
     """First and second derivative of ½ log Σ terms, where the derivatives of the terms are terms · once and
     terms · twice."""
     total = terms.sum(axis=1)

@@ -25,18 +25,18 @@ from jeit.inverse.linearisation import combined_blocks, data_directions, used_ch
 from jeit.mesh import Mesh, centroids, check_flat, measures
 
 # Half width of the edge of a desired image, relative to its radius.
-_EDGE = 0.25
+_EDGE_HALF_WIDTH = 0.25
 # Sampling points along the radius of a target, by dimension: about 50 points in a disc, about 60 in a ball.
-_SAMPLED = {2: 4.0, 3: 2.5}
+_SAMPLES_PER_RADIUS = {2: 4.0, 3: 2.5}
 # Number of sampling points processed at a time; search distance around the centre of a ball, in radii, slightly above 1
 # so that rounding excludes no point of the ball.
-_AT_ONCE, _CLOSE = 500_000, 1 + 1e-9
+_SAMPLES_AT_ONCE, _SEARCH_RADII = 500_000, 1 + 1e-9
 # Minimum fraction of a training target that must lie in the body.
-_INSIDE = 0.9
+_MIN_INSIDE_FRACTION = 0.9
 # Approximate number of cells over which means for the noise figure are taken.
-_ENOUGH = 10_000
+_NUM_MEAN_CELLS = 10_000
 # Minimum target radius: smaller targets give the same result in a linear model but need more sampling points.
-_LEAST = 0.01
+_MIN_TARGET_RADIUS = 0.01
 
 
 def greit(
@@ -80,15 +80,15 @@ def greit(
     mesh = model.mesh
     check_flat(mesh, "GREIT's targets")
     radius = float(model.electrodes.num_electrodes**-0.5) if radius is None else radius
-    _check(radius, target_radius, num_targets, hyperparameter, noise_figure)
+    _check_options(radius, target_radius, num_targets, hyperparameter, noise_figure)
     channels, root_weight = used_channels(model, noise, mask)
     if jnp.iscomplexobj(conductivity):
         raise ValueError("conductivity is complex; linear images are of real ones: give its real part.")
     if np.shape(conductivity) not in ((), (mesh.num_cells,)):
         raise ValueError("conductivity: give one number, or one value per cell: the image has a value per cell.")
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    body_radius, middle = _radius(float(measure.sum()), mesh.dimension), measure @ centre / measure.sum()
-    position, covered = _targets(mesh, middle, target_radius * body_radius, num_targets)
+    body_radius, middle = _ball_radius(float(measure.sum()), mesh.dimension), measure @ centre / measure.sum()
+    position, covered = _place_targets(mesh, middle, target_radius * body_radius, num_targets)
     desired = _desired_images(mesh, position, covered.T @ measure, radius * body_radius)
     # Responses are computed for the directions in which a body can change the data; they are fewer than the channels.
     directions = data_directions(model.protocol, channels, root_weight)
@@ -102,7 +102,7 @@ def greit(
     if isinstance(hyperparameter, str):
         central = response[:, np.argmin(np.linalg.norm(position - middle, axis=1))]
         level = float(np.abs(directions @ central).mean())
-        some = slice(None, None, max(1, len(measure) // _ENOUGH))
+        some = slice(None, None, max(1, len(measure) // _NUM_MEAN_CELLS))
         signal = vectors.T @ central
         chosen = greit_noise_figure(noise_figure, eigenvalues, signal, level, painted[some], measure[some])
     else:
@@ -113,38 +113,38 @@ def greit(
     return LinearReconstruction.of_factors(model, (painted, weights), chosen, rule, "GREIT")
 
 
-def _radius(measure: float, dimension: int) -> float:
+def _ball_radius(measure: float, dimension: int) -> float:
     """Radius of the disc of a given area or the ball of a given volume."""
     return float(np.sqrt(measure / np.pi) if dimension == 2 else np.cbrt(3 * measure / (4 * np.pi)))
 
 
-def _ball(radius: float, dimension: int) -> float:
+def _ball_measure(radius: float, dimension: int) -> float:
     """Area of a disc or volume of a ball."""
     return np.pi * radius**2 if dimension == 2 else 4 / 3 * np.pi * radius**3
 
 
-def _targets(mesh: Mesh, middle, radius: float, number: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
+def _place_targets(mesh: Mesh, middle, radius: float, num_targets: int) -> tuple[np.ndarray, scipy.sparse.csc_array]:
     """Centres (K, d) of the targets that lie in the body, and the fraction (m, K) of every cell that each covers."""
     measure, points = np.asarray(measures(mesh)), np.asarray(mesh.points)
     low, high = points.min(axis=0), points.max(axis=0)
     if mesh.dimension == 2:
-        spacing = np.sqrt(2 / np.sqrt(3) * measure.sum() / number)
-        grid = _hexagonal(low, high, middle, spacing)
+        spacing = np.sqrt(2 / np.sqrt(3) * measure.sum() / num_targets)
+        grid = _hexagonal_lattice(low, high, middle, spacing)
     else:
-        spacing = np.cbrt(measure.sum() / number)
-        grid = _cubic(low, high, middle, spacing)
+        spacing = np.cbrt(measure.sum() / num_targets)
+        grid = _cubic_lattice(low, high, middle, spacing)
     tree, parts = KDTree(grid), []
-    for samples, cell, share in _samples(mesh, radius / _SAMPLED[mesh.dimension]):
+    for samples, cell, share in _sample_points(mesh, radius / _SAMPLES_PER_RADIUS[mesh.dimension]):
         if mesh.dimension == 3:
             place = (samples - middle) / spacing
             place -= np.rint(place)  # offset from the nearest centre; only part of the points lie within a ball
-            near = np.flatnonzero(np.einsum("qi,qi->q", place, place) < (_CLOSE * radius / spacing) ** 2)
+            near = np.flatnonzero(np.einsum("qi,qi->q", place, place) < (_SEARCH_RADII * radius / spacing) ** 2)
             samples, cell, share = samples[near], cell[near], share[near]
         pairs = tree.sparse_distance_matrix(KDTree(samples), radius, output_type="ndarray")
         parts.append((share[pairs["j"]], cell[pairs["j"]], pairs["i"]))
     shares, cells, targets = (np.concatenate(part) for part in zip(*parts, strict=True))
     covered = scipy.sparse.coo_array((shares, (cells, targets)), shape=(mesh.num_cells, len(grid))).tocsc()
-    inside = np.flatnonzero(covered.T @ measure > _INSIDE * _ball(radius, mesh.dimension))
+    inside = np.flatnonzero(covered.T @ measure > _MIN_INSIDE_FRACTION * _ball_measure(radius, mesh.dimension))
     if inside.size == 0:
         raise ValueError(
             f"target_radius: no {'disc' if mesh.dimension == 2 else 'ball'} of {1e3 * radius:.3g} mm radius fits into "
@@ -153,7 +153,7 @@ def _targets(mesh: Mesh, middle, radius: float, number: int) -> tuple[np.ndarray
     return grid[inside], covered[:, inside]
 
 
-def _hexagonal(low, high, middle, spacing: float) -> np.ndarray:
+def _hexagonal_lattice(low, high, middle, spacing: float) -> np.ndarray:
     """Points (k, 2) of a hexagonal grid with a point at `middle` that covers the box from `low` to `high`."""
     step = spacing * np.array([1, np.sqrt(0.75)])
     (first, bottom), (last, top) = np.floor((low - middle) / step) - 1, np.ceil((high - middle) / step) + 1
@@ -161,14 +161,14 @@ def _hexagonal(low, high, middle, spacing: float) -> np.ndarray:
     return middle + step * np.stack([column + row % 2 / 2, row], axis=-1).reshape(-1, 2)
 
 
-def _cubic(low, high, middle, spacing: float) -> np.ndarray:
+def _cubic_lattice(low, high, middle, spacing: float) -> np.ndarray:
     """Points (k, 3) of a cubic grid with a point at `middle` that covers the box from `low` to `high`."""
     first, last = np.floor((low - middle) / spacing) - 1, np.ceil((high - middle) / spacing) + 1
     steps = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
     return middle + spacing * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def _samples(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _sample_points(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Iterate over groups of cells, and yield sampling points (q, d) spread evenly over each cell, their cells, and the
     fraction of the cell that each point represents.
 
@@ -187,7 +187,7 @@ def _samples(mesh: Mesh, spacing: float) -> Iterator[tuple[np.ndarray, np.ndarra
         steps = steps[steps.sum(axis=1) < number]
         barycentric = (np.column_stack([steps, number - 1 - steps.sum(axis=1)]) + 1 / count) / number
         alike = np.flatnonzero(cuts == number)
-        for cells in np.array_split(alike, -(-alike.size * len(steps) // _AT_ONCE)):
+        for cells in np.array_split(alike, -(-alike.size * len(steps) // _SAMPLES_AT_ONCE)):
             samples = (barycentric @ corners[cells]).reshape(-1, corners.shape[2])
             yield samples, np.repeat(cells, len(steps)), np.full(len(samples), 1 / len(steps))
 
@@ -196,12 +196,14 @@ def _desired_images(mesh: Mesh, position, area, radius: float) -> scipy.sparse.c
     """Desired images X (m, K): a disc around each position, with half its height at `radius` and the integral `area`
     (K,) over the body."""
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
-    pairs = KDTree(centre).sparse_distance_matrix(KDTree(position), (1 + _EDGE) * radius, output_type="ndarray")
-    ramp = np.clip((pairs["v"] / radius - 1) / _EDGE, -1, 1)
+    pairs = KDTree(centre).sparse_distance_matrix(
+        KDTree(position), (1 + _EDGE_HALF_WIDTH) * radius, output_type="ndarray"
+    )
+    ramp = np.clip((pairs["v"] / radius - 1) / _EDGE_HALF_WIDTH, -1, 1)
     height = (1 - np.sin(0.5 * np.pi * ramp)) / 2
     disc = scipy.sparse.coo_array((height, (pairs["i"], pairs["j"])), shape=(len(centre), len(position))).tocsc()
     total = disc.T @ measure
-    if not (total > 0.01 * _ball(radius, mesh.dimension)).all():
+    if not (total > 0.01 * _ball_measure(radius, mesh.dimension)).all():
         raise ValueError(
             f"radius: a desired image of {1e3 * radius:.3g} mm radius is lost between the cells of this mesh; give a "
             "larger radius, or a finer mesh."
@@ -209,11 +211,11 @@ def _desired_images(mesh: Mesh, position, area, radius: float) -> scipy.sparse.c
     return disc @ scipy.sparse.diags_array(area / total)
 
 
-def _check(radius, target_radius, num_targets, hyperparameter, noise_figure) -> None:
-    if not _LEAST <= target_radius <= radius < 1:
+def _check_options(radius, target_radius, num_targets, hyperparameter, noise_figure) -> None:
+    if not _MIN_TARGET_RADIUS <= target_radius <= radius < 1:
         raise ValueError(
             "radius and target_radius are fractions of the body's radius, and targets no larger than their images: "
-            f"give {_LEAST} ≤ target_radius ≤ radius < 1; they are {target_radius} and {radius}."
+            f"give {_MIN_TARGET_RADIUS} ≤ target_radius ≤ radius < 1; they are {target_radius} and {radius}."
         )
     if int(num_targets) != num_targets or num_targets < 1:
         raise ValueError(f"num_targets: give a whole number of training targets, such as 1000; it is {num_targets}.")

@@ -24,7 +24,7 @@ from jeit.mesh import Mesh
 from jeit_solvers.engines import as_array, has_values, is_forked, on_device, on_host, product_for_jax
 
 # Approximate number of cells used to find which channels have proportional columns.
-_ENOUGH = 4000
+_NUM_SAMPLED_CELLS = 4000
 
 
 @functools.partial(
@@ -81,8 +81,10 @@ class LinearReconstruction:
         """Create from images (m, r) and weights (r, M), whose product is the reconstruction matrix. The product is
         formed only if it is smaller than the factors."""
         images, weights = factors
-        some = images[:: max(1, len(images) // _ENOUGH)]  # channels are proportional in every cell or in none
-        first, second, ratio = _combine(model, some @ weights)
+        some = images[
+            :: max(1, len(images) // _NUM_SAMPLED_CELLS)
+        ]  # channels are proportional in every cell or in none
+        first, second, ratio = _proportional_channels(model, some @ weights)
         tied = (weights.T[first] + ratio[:, None] * weights.T[second]) / (1 + ratio**2)[:, None]
         rows, mixing = (images.T, tied) if len(first) > images.shape[1] else (tied @ images.T, None)
         places = as_array(first), as_array(second), as_array(ratio)
@@ -100,7 +102,7 @@ class LinearReconstruction:
             given = every, every, nothing, jnp.asarray(matrix).T, jnp.asarray(hyperparameter, float)
             return cls(model.mesh, *given, matrix.shape[1], rule, method, choice)
         matrix = np.asarray(matrix)
-        first, second, ratio = _combine(model, matrix)
+        first, second, ratio = _proportional_channels(model, matrix)
         # The weighted mean of two proportional columns is used: for small λ their rounding errors are large and
         # opposite.
         tied = matrix.T[first] + ratio[:, None] * matrix.T[second]
@@ -138,14 +140,14 @@ class LinearReconstruction:
                 f"(frames, {self.num_measurements})."
             )
         if not has_values(difference, self._parts):
-            return jax.jit(_product)(self._parts, difference)
+            return jax.jit(_image_product)(self._parts, difference)
         voltages = np.asarray(difference)
         if voltages.dtype.kind not in "iufc":
             raise ValueError(f"difference is {voltages.dtype}; give numbers, in volts.")
         if not np.isfinite(voltages).all():
             raise ValueError("difference has NaN or infinite voltages; put zeros in masked channels.")
         first, second, ratio, mixing, weights = self._parts
-        combined = _combined(voltages, first, second, ratio, mixing)
+        combined = _combine_channels(voltages, first, second, ratio, mixing)
         return on_device(combined @ weights) if is_forked() else product_for_jax(combined, weights)
 
     @functools.cached_property
@@ -155,17 +157,17 @@ class LinearReconstruction:
         return on_host(parts) if has_values(parts) else parts
 
 
-def _product(parts, difference) -> Any:
+def _image_product(parts, difference) -> Any:
     *channels, weights = parts
-    return _combined(difference, *channels) @ weights
+    return _combine_channels(difference, *channels) @ weights
 
 
-def _combined(difference, first, second, ratio, mixing) -> Any:
+def _combine_channels(difference, first, second, ratio, mixing) -> Any:
     combined = difference[..., first] + ratio * difference[..., second]
     return combined if mixing is None else combined @ mixing
 
 
-def _combine(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _proportional_channels(model: ForwardModel, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Channels `first` and `second` to add before the product, and the `ratio` of their columns: reciprocal pairs with
     proportional columns, and all other channels alone, with ratio 0."""
     size = np.linalg.norm(matrix, axis=0)

@@ -60,7 +60,7 @@ class ContactImpedance(AbstractUnknown):
         contact impedance."""
         if model.electrodes.is_point:
             raise ValueError("ContactImpedance: point electrodes have no contact impedance to estimate.")
-        self.deviation = _deviation("ContactImpedance", deviation, model.electrodes.num_electrodes)
+        self.deviation = _check_deviation("ContactImpedance", deviation, model.electrodes.num_electrodes)
 
     def fits(self, model):
         """Whether the model has the same number of electrodes, with contact impedance."""
@@ -97,7 +97,7 @@ class ElectrodePosition(AbstractUnknown):
             )
         direction = electrodes.directions(model.mesh)
         self.direction = jnp.asarray(direction)
-        self.deviation = _deviation("ElectrodePosition", deviation, direction.shape[0] * direction.shape[1])
+        self.deviation = _check_deviation("ElectrodePosition", deviation, direction.shape[0] * direction.shape[1])
 
     def fits(self, model):
         """Whether the model has the same number of electrodes, of a kind that can be moved."""
@@ -121,7 +121,7 @@ class Background(AbstractUnknown):
     deviation: Float[Array, " 1"]
 
     def __init__(self, deviation: float = 0.5):
-        self.deviation = _deviation("Background", deviation, 1)
+        self.deviation = _check_deviation("Background", deviation, 1)
 
     def apply(self, model, estimate, values):
         """Unchanged model, and the image plus the constant."""
@@ -137,7 +137,7 @@ class Scale(AbstractUnknown):
     deviation: Float[Array, " 1"]
 
     def __init__(self, deviation: float = 0.1):
-        self.deviation = _deviation("Scale", deviation, 1)
+        self.deviation = _check_deviation("Scale", deviation, 1)
 
     def apply(self, model, estimate, values):
         """Model with all currents multiplied by exp(value), and the unchanged image."""
@@ -149,15 +149,15 @@ class Scale(AbstractUnknown):
         return jnp.exp(values)
 
 
-def _deviation(name: str, deviation, size: int) -> Float[Array, " k"]:
+def _check_deviation(name: str, deviation, num_values: int) -> Float[Array, " k"]:
     values = np.asarray(deviation, float)
-    if values.shape not in ((), (size,)) or not (np.isfinite(values) & (values > 0)).all():
-        raise ValueError(f"{name}: deviation must be positive, one number or {size}; it is {deviation}.")
-    return jnp.broadcast_to(jnp.asarray(values), (size,))
+    if values.shape not in ((), (num_values,)) or not (np.isfinite(values) & (values > 0)).all():
+        raise ValueError(f"{name}: deviation must be positive, one number or {num_values}; it is {deviation}.")
+    return jnp.broadcast_to(jnp.asarray(values), (num_values,))
 
 
 # Minimum conductivity relative to the mean background, where no bound keeps it from zero.
-_LEAST = 1e-6
+_MIN_CONDUCTIVITY_RATIO = 1e-6
 
 
 class AbstractLink(eqx.Module):
@@ -199,7 +199,7 @@ class Linear(AbstractLink):
 
     def ends(self, lower, upper, reference):
         """The bounds themselves, the lower at least a millionth of the mean background."""
-        return namespace(lower, reference).maximum(lower, _LEAST * reference.mean()), upper
+        return namespace(lower, reference).maximum(lower, _MIN_CONDUCTIVITY_RATIO * reference.mean()), upper
 
 
 class Log(AbstractLink):
@@ -275,7 +275,7 @@ def _check_inside(conductivity, lower, upper) -> None:
         )
 
 
-def _tuple(unknowns) -> tuple[AbstractUnknown, ...]:
+def _as_tuple(unknowns) -> tuple[AbstractUnknown, ...]:
     if not isinstance(unknowns, Sequence) or not all(isinstance(one, AbstractUnknown) for one in unknowns):
         raise ValueError(
             f"unknowns must be a list of those in jeit.inverse.nonlinear, such as [Scale()]; it is {unknowns!r}."
@@ -283,12 +283,14 @@ def _tuple(unknowns) -> tuple[AbstractUnknown, ...]:
     return tuple(unknowns)
 
 
-def as_parametrisation(given: "Parametrisation | None") -> "Parametrisation":
+def as_parametrisation(parametrisation: "Parametrisation | None") -> "Parametrisation":
     """The given parametrisation, or the default for None. Raises `ValueError` for any other object."""
-    if given is None:
+    if parametrisation is None:
         return Parametrisation()
-    check_kind("parametrisation", given, Parametrisation, "a Parametrisation, such as Parametrisation(link=Log())")
-    return given
+    check_kind(
+        "parametrisation", parametrisation, Parametrisation, "a Parametrisation, such as Parametrisation(link=Log())"
+    )
+    return parametrisation
 
 
 class Parametrisation(eqx.Module):
@@ -310,7 +312,7 @@ class Parametrisation(eqx.Module):
     link: AbstractLink = eqx.field(default_factory=Log)
     bounds: tuple[float, float] | None = None
     regions: Int[np.ndarray, " m"] | None = None
-    unknowns: tuple[AbstractUnknown, ...] = eqx.field(default=(), converter=_tuple)
+    unknowns: tuple[AbstractUnknown, ...] = eqx.field(default=(), converter=_as_tuple)
     informative: float | None = None
 
     def __check_init__(self):

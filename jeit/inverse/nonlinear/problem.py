@@ -41,7 +41,7 @@ from jeit_solvers.engines import either_engine, has_values, host, namespace, on_
 
 # Relative distance within which a coefficient counts as being at a bound; solvers scale coefficients and bounds, which
 # causes rounding errors.
-_AT_BOUND = 1e-12
+_BOUND_TOLERANCE = 1e-12
 
 
 def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"], np.ndarray]:
@@ -51,7 +51,7 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
     """
     check_model(model)
     check_mask(mask)
-    voltages = _array(voltages)
+    voltages = _as_float_array(voltages)
     if voltages.dtype.kind == "c":
         raise ValueError("voltages are complex; reconstruct from their real part or magnitude.")
     if voltages.dtype.kind not in "biuf":
@@ -80,7 +80,7 @@ def check_frame(model: ForwardModel, voltages, mask) -> tuple[Float[Array, " M"]
 
 def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
     """Background conductivity per cell; raises `ValueError` unless it is one positive number or one per cell."""
-    background = _array(background)
+    background = _as_float_array(background)
     if background.dtype.kind not in "biuf" or background.shape not in ((), (model.mesh.num_cells,)):
         raise ValueError(
             f"background must be one real conductivity, or one for each of the {model.mesh.num_cells} cells; it is "
@@ -96,7 +96,7 @@ def check_background(model: ForwardModel, background) -> Float[Array, " m"]:
 
 def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[Array, " M"]:
     """Standard deviation of every channel in volts, 1 in channels left out; raises `ValueError` for invalid noise."""
-    given = np.zeros(()) if noise is None else _array(noise)
+    given = np.zeros(()) if noise is None else _as_float_array(noise)
     if given.shape not in ((), measured.shape) or given.dtype.kind not in "iuf":
         raise ValueError(
             f"noise is {given.dtype} of shape {given.shape}; give one real number, or one for each channel."
@@ -108,16 +108,16 @@ def check_noise(noise, measured: Float[Array, " M"], used: np.ndarray) -> Float[
     return xp.where(used, deviation, 1)
 
 
-def _array(values):
+def _as_float_array(values):
     """A NumPy copy, or a JAX array if it is traced."""
     return host.array(values) if has_values(values) else jnp.asarray(values)
 
 
-def check_steps(name: str, steps) -> int:
-    """`steps` as an integer. Raises `ValueError` unless it is a whole number from 1."""
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
-        raise ValueError(f"{name} must be a whole number from 1; it is {steps!r}.")
-    return int(steps)
+def check_steps(name: str, max_steps) -> int:
+    """`max_steps` as an integer. Raises `ValueError` unless it is a whole number from 1."""
+    if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
+        raise ValueError(f"{name} must be a whole number from 1; it is {max_steps!r}.")
+    return int(max_steps)
 
 
 def check_tolerance(name: str, tolerance) -> float:
@@ -152,15 +152,15 @@ def independent_data(
     return small, channels.weigh(deviation[kept]).combine(measured[kept])
 
 
-def informed(inversion: Inversion, least: float, persistence: float = 0.0) -> Inversion:
+def keep_informed_shapes(inversion: Inversion, min_signal: float, persistence: float = 0.0) -> Inversion:
     """Reduce a problem to the combinations of shapes that the data resolve; the penalty must be standard normal.
 
-    `least`: minimum signal of a shape of prior standard deviation, in standard deviations of the noise. `persistence`:
-    fraction of the last image that is expected in the next one; the variances of the shapes are those before a frame in
-    the steady state of the Kalman filter.
+    `min_signal`: minimum signal of a shape of prior standard deviation, in standard deviations of the noise.
+    `persistence`: fraction of the last image that is expected in the next one; the variances of the shapes are those
+    before a frame in the steady state of the Kalman filter.
     """
     squares, rows = (np.asarray(values) for values in _singular_values(inversion))
-    kept = squares > max(least**2, 1e-12 * squares[-1])
+    kept = squares > max(min_signal**2, 1e-12 * squares[-1])
     size = np.sqrt(_expected_variance(squares[kept], persistence) / squares[kept])
     shapes = host.asarray(jax.vmap(inversion.basis.expand)(jnp.asarray(size[:, None] * rows[kept])).T, np.float32)
     chosen = eqx.tree_at(lambda i: i.basis, inversion, DenseBasis(shapes))
@@ -297,16 +297,17 @@ class Inversion(eqx.Module):
 
 
 @eqx.filter_jit
-def as_solution(found: Float[Array, " n"], inversion: Inversion, box: Any = None) -> Float[Array, " n"]:
-    """`found` (n,), the result of a solver, with derivatives of the minimum attached: with respect to all fields of the
-    inversion and, if there are bounds, the lower and upper bounds `box`, (n,) each."""
+def as_solution(coefficients: Float[Array, " n"], inversion: Inversion, box: Any = None) -> Float[Array, " n"]:
+    """Return `coefficients` (n,), the result of a solver, unchanged, but with the derivatives of the exact minimum:
+    with respect to all fields of the inversion and, if there are bounds, the lower and upper bounds `box`, (n,)
+    each."""
     if box is None:
-        return as_minimum(found, (inversion, None, None), _free_gradient, _preconditioner)
-    slope = jax.grad(inversion.cost)(found)
+        return as_minimum(coefficients, (inversion, None, None), _free_gradient, _preconditioner)
+    slope = jax.grad(inversion.cost)(coefficients)
     # -1 at the lower bound, 1 at the upper one, 0 where a coefficient is free.
-    near = [_AT_BOUND * jnp.maximum(1, jnp.abs(end)) for end in box]
-    side = 1 * ((found >= box[1] - near[1]) & (slope < 0)) - ((found <= box[0] + near[0]) & (slope > 0))
-    point = as_minimum(jnp.where(side == 0, found, 0), (inversion, box, side), _free_gradient, _preconditioner)
+    near = [_BOUND_TOLERANCE * jnp.maximum(1, jnp.abs(end)) for end in box]
+    side = 1 * ((coefficients >= box[1] - near[1]) & (slope < 0)) - ((coefficients <= box[0] + near[0]) & (slope > 0))
+    point = as_minimum(jnp.where(side == 0, coefficients, 0), (inversion, box, side), _free_gradient, _preconditioner)
     return _with_bounds(point, box, side)
 
 

@@ -25,7 +25,7 @@ from jeit.inverse.nonlinear.problem import (
     check_frame,
     check_noise,
     independent_data,
-    informed,
+    keep_informed_shapes,
 )
 from jeit.inverse.nonlinear.solvers import LBFGSB, SOLVERS, AbstractSolver, GaussNewton, as_solver
 from jeit.inverse.prior.matern import PRIOR
@@ -161,7 +161,7 @@ def reconstruct(
     if parametrisation.informative and inversion.penalty.is_standard_normal:
         instead = "leave it out, and take all shapes"
         check_has_values("informative: the problem", inversion, "shapes that the data support come from", instead)
-        inversion = informed(inversion, parametrisation.informative)
+        inversion = keep_informed_shapes(inversion, parametrisation.informative)
     first = (
         as_array(np.zeros(inversion.num_coefficients))
         if start is None
@@ -183,7 +183,7 @@ def reconstruct(
         reason = "Conductivity or voltages are NaN; give better data, more noise or a greater λ."
     else:
         outcome = status.number
-        reason += "" if status == Status.CONVERGED else _mismatch(model, measured[kept], background, kept)
+        reason += "" if status == Status.CONVERGED else _mismatch_reason(model, measured[kept], background, kept)
     return Reconstruction(
         conductivity=conductivity,
         voltages=predicted,
@@ -243,7 +243,7 @@ def pose(
     asked = prior.default_hyperparameter if hyperparameter is None else hyperparameter
     is_rule = isinstance(asked, str) or callable(asked)
     if prior.is_quadratic:
-        predicted, seen, known = _whitened(model, data, background, link.slope(reference))
+        predicted, seen, known = _whitened_jacobian(model, data, background, link.slope(reference))
         spectrum = difference = None
         if is_rule:
             spectrum = Spectrum.create(seen, prior.covariance_product(mesh, seen), prior.null_space(mesh))
@@ -259,7 +259,7 @@ def pose(
     return inversion if namespace(model) is np else on_device(inversion), choice
 
 
-def _whitened(model: ForwardModel, data: Data, background, slope):
+def _whitened_jacobian(model: ForwardModel, data: Data, background, slope):
     """Voltages of the background, whitened Jacobian with respect to the link's variable there, and the data; as NumPy
     arrays unless traced."""
     if not has_values(model, data, background, slope):
@@ -280,7 +280,7 @@ def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Ar
     kind."""
     if not isinstance(start, Reconstruction):
         raise ValueError(f"start must be what reconstruct has returned, not {type(start).__name__}.")
-    if start.coefficients.shape != (inversion.num_coefficients,) or not _same_kind(start.inversion, inversion):
+    if start.coefficients.shape != (inversion.num_coefficients,) or not _have_same_unknowns(start.inversion, inversion):
         raise ValueError(
             f"start has {start.coefficients.size} coefficients of another kind of problem; this one has "
             f"{inversion.num_coefficients}. Give a reconstruction of the same model, prior and link."
@@ -290,16 +290,16 @@ def _start_coefficients(start, inversion: Inversion, choice: Choice) -> Float[Ar
     return start.coefficients.at[:size].multiply(scale)
 
 
-def _same_kind(one: Inversion, other: Inversion) -> bool:
+def _have_same_unknowns(first: Inversion, second: Inversion) -> bool:
     """Whether the coefficients of two problems have the same meaning."""
 
     def kinds(inversion):
         return [type(part) for part in (inversion.link, inversion.basis, inversion.penalty, *inversion.unknowns)]
 
-    return kinds(one) == kinds(other)
+    return kinds(first) == kinds(second)
 
 
-def _mismatch(model: ForwardModel, measured, background, kept) -> str:
+def _mismatch_reason(model: ForwardModel, measured, background, kept) -> str:
     """Hint at wrong units or polarity if measured voltages and those of the background differ in size or sign."""
     expected = model.voltages(background)[kept]
     ratio = float(jnp.vdot(measured, expected) / jnp.vdot(expected, expected))

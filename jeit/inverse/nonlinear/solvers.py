@@ -20,7 +20,7 @@ from jeit.inverse.nonlinear.problem import Inversion, as_solution, check_steps, 
 from jeit_solvers import BoundedMinimum, Descent, Status, ended, ended_number, lbfgsb, projected_gradient
 from jeit_solvers.engines import as_array, has_values, on_host, undifferentiated
 
-_Value = TypeVar("_Value")
+_Setting = TypeVar("_Setting")
 
 _MAX_STEPS = 30
 _REASONS = {
@@ -29,13 +29,13 @@ _REASONS = {
     Status.STALLED: "No shorter step lowered the objective; the model is at odds with the data.",
 }
 
-_ROUNDED = "The next step would change the objective by less than its rounding."
+_ROUNDED_REASON = "The next step would change the objective by less than its rounding."
 # Rounding error of the objective, which is a sum over all channels, in units of its machine precision.
-_ROUNDINGS = 100.0
-_TRACED = "It was solved inside a transformation of JAX; the status says how that ended."
+_ROUNDING_FACTOR = 100.0
+_TRACED_REASON = "It was solved inside a transformation of JAX; the status says how that ended."
 
 
-class Solved(NamedTuple):
+class Solution(NamedTuple):
     """Result of a solver.
 
     **Fields**: `coefficients` (n,); `iterations`: number of iterations; `costs`: objective at the start and at every
@@ -72,7 +72,7 @@ class AbstractSolver(eqx.Module):
         return False
 
     @abc.abstractmethod
-    def minimise(self, inversion: Inversion, start: Float[Array, " n"], box) -> Solved:
+    def minimise(self, inversion: Inversion, start: Float[Array, " n"], box) -> Solution:
         """Minimise the objective from `start`. A solver that keeps bounds minimises between the lower and upper bounds
         `box`, (n,) each."""
 
@@ -103,19 +103,19 @@ class GaussNewton(AbstractSolver):
     rtol: float | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        _check(self.max_steps, self.rtol)
+        _check_settings(self.max_steps, self.rtol)
 
     def minimise(self, inversion, start, box):
         """Minimise by `jeit_solvers.Descent`."""
-        return _descend(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
+        return _run_descent(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
         """The solver, with these settings as defaults."""
-        return GaussNewton(_first(self.max_steps, max_steps), _first(self.rtol, rtol))
+        return GaussNewton(_first_given(self.max_steps, max_steps), _first_given(self.rtol, rtol))
 
     def descent(self, max_steps, rtol):
         """Descent without damping."""
-        return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol))
+        return _descent_for(_first_given(self.max_steps, max_steps), _first_given(self.rtol, rtol))
 
 
 class LevenbergMarquardt(AbstractSolver):
@@ -131,21 +131,21 @@ class LevenbergMarquardt(AbstractSolver):
     damping: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self):
-        _check(self.max_steps, self.rtol)
+        _check_settings(self.max_steps, self.rtol)
         if not self.damping > 0:
             raise ValueError(f"damping must be positive; it is {self.damping}. Without it, take GaussNewton().")
 
     def minimise(self, inversion, start, box):
         """Minimise by `jeit_solvers.Descent`."""
-        return _descend(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
+        return _run_descent(self.descent(_MAX_STEPS, inversion.penalty.tolerance), inversion, start)
 
     def for_frames(self, max_steps=None, rtol=None):
         """The solver, with these settings as defaults."""
-        return LevenbergMarquardt(_first(self.max_steps, max_steps), _first(self.rtol, rtol), self.damping)
+        return LevenbergMarquardt(_first_given(self.max_steps, max_steps), _first_given(self.rtol, rtol), self.damping)
 
     def descent(self, max_steps, rtol):
         """Descent with damping."""
-        return _steps(_first(self.max_steps, max_steps), _first(self.rtol, rtol), self.damping)
+        return _descent_for(_first_given(self.max_steps, max_steps), _first_given(self.rtol, rtol), self.damping)
 
 
 class LBFGSB(AbstractSolver):
@@ -157,7 +157,7 @@ class LBFGSB(AbstractSolver):
     tolerance: float = eqx.field(static=True, default=1e-6)
 
     def __check_init__(self):
-        _check(self.max_steps, self.tolerance, "tolerance")
+        _check_settings(self.max_steps, self.tolerance, "tolerance")
 
     @property
     def keeps_bounds(self):
@@ -166,7 +166,7 @@ class LBFGSB(AbstractSolver):
 
     def minimise(self, inversion, start, box):
         """Minimise by `jeit_solvers.lbfgsb`."""
-        return _between(lbfgsb, inversion, start, box, self.max_steps, self.tolerance)
+        return _minimise_in_box(lbfgsb, inversion, start, box, self.max_steps, self.tolerance)
 
 
 class ProjectedGradient(AbstractSolver):
@@ -177,7 +177,7 @@ class ProjectedGradient(AbstractSolver):
     tolerance: float = eqx.field(static=True, default=1e-6)
 
     def __check_init__(self):
-        _check(self.max_steps, self.tolerance, "tolerance")
+        _check_settings(self.max_steps, self.tolerance, "tolerance")
 
     @property
     def keeps_bounds(self):
@@ -186,7 +186,7 @@ class ProjectedGradient(AbstractSolver):
 
     def minimise(self, inversion, start, box):
         """Minimise by `jeit_solvers.projected_gradient`."""
-        return _between(projected_gradient, inversion, start, box, self.max_steps, self.tolerance)
+        return _minimise_in_box(projected_gradient, inversion, start, box, self.max_steps, self.tolerance)
 
 
 class LeastSquares(AbstractSolver):
@@ -197,7 +197,7 @@ class LeastSquares(AbstractSolver):
     max_steps: int = eqx.field(static=True, default=_MAX_STEPS)
 
     def __check_init__(self):
-        _check(self.max_steps, None)
+        _check_settings(self.max_steps, None)
 
     @property
     def needs_squares(self):
@@ -210,13 +210,13 @@ class LeastSquares(AbstractSolver):
             problem, first = undifferentiated((inversion, start))
             solution = _least_squares(problem, first, self.solver, self.max_steps, {})
             number = ended_number(solution.result)
-            return _traced(inversion, start, solution.value, solution.stats["num_steps"], number)
+            return _traced_solution(inversion, start, solution.value, solution.stats["num_steps"], number)
         solution = _least_squares(inversion, start, self.solver, self.max_steps, {})
-        costs = jnp.stack([_cost(inversion, start), _cost(inversion, solution.value)])
+        costs = jnp.stack([_cost_at(inversion, start), _cost_at(inversion, solution.value)])
         status, iterations = ended(solution.result), int(solution.stats["num_steps"])
         if status == Status.STEP_LIMIT and _is_within_rounding(inversion, solution.value):
-            return Solved(solution.value, iterations, costs, Status.CONVERGED, _ROUNDED)
-        return Solved(solution.value, iterations, costs, status, _reason(status, iterations))
+            return Solution(solution.value, iterations, costs, Status.CONVERGED, _ROUNDED_REASON)
+        return Solution(solution.value, iterations, costs, status, _reason(status, iterations))
 
 
 class OneStep(AbstractSolver):
@@ -288,15 +288,15 @@ def residual(coefficients: Float[Array, " n"], inversion: Inversion):
     return inversion.data.whiten(inversion.residual(coefficients)), coefficients
 
 
-def _check(max_steps, tolerance, name: str = "rtol") -> None:
+def _check_settings(max_steps, tolerance, name: str = "rtol") -> None:
     if max_steps is not None:
         check_steps("max_steps", max_steps)
     if tolerance is not None:
         check_tolerance(name, tolerance)
 
 
-def _first(own: _Value | None, other: _Value) -> _Value:
-    return other if own is None else own
+def _first_given(setting: _Setting | None, default: _Setting) -> _Setting:
+    return default if setting is None else setting
 
 
 @eqx.filter_jit
@@ -304,13 +304,13 @@ def _least_squares(inversion: Inversion, start, solver, max_steps: int, options:
     return optx.least_squares(residual, solver, start, inversion, options=options, max_steps=max_steps, throw=False)
 
 
-def _steps(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
+def _descent_for(max_steps: int, rtol: float, damping: float = 0.0) -> Descent:
     """Descent of `max_steps` steps, with a history that also holds the start. `atol` ends the iteration when the
     objective tends to zero, as for an undisturbed frame, where no change is small relative to it."""
     return Descent(rtol=rtol, atol=0.5 * rtol, damping=damping, history=max_steps + 1)
 
 
-def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
+def _run_descent(descent: Descent, inversion: Inversion, start) -> Solution:
     if inversion.runs_at_once:
         start, problem = on_host((start, inversion))
         point, state = descent.at_once(expand, start, problem, descent.history)
@@ -320,38 +320,39 @@ def _descend(descent: Descent, inversion: Inversion, start) -> Solved:
         problem, first = undifferentiated((inversion, start))
         solution = _least_squares(problem, first, descent, descent.history, {"expand": expand})
         iterations = jnp.maximum(solution.state.num_accepted - 1, 0)
-        return _traced(inversion, start, solution.value, iterations, ended_number(solution.result))
+        return _traced_solution(inversion, start, solution.value, iterations, ended_number(solution.result))
     else:
         solution = _least_squares(inversion, start, descent, descent.history, {"expand": expand})
         point, state, status = solution.value, solution.state, ended(solution.result)
     accepted = int(state.num_accepted)
     iterations = max(accepted - 1, 0)
     reason = _reason(status, iterations, int(state.num_steps) - 1 - iterations)
-    return Solved(point, iterations, as_array(np.asarray(state.history)[:accepted]), status, reason)
+    return Solution(point, iterations, as_array(np.asarray(state.history)[:accepted]), status, reason)
 
 
-def _traced(inversion: Inversion, start, found, iterations, status, box=None) -> Solved:
-    """Result of a solver for a traced problem, with derivatives of the minimum attached to `found`."""
-    found = as_solution(found, inversion, box)
-    costs = jnp.stack([_cost(inversion, start), _cost(inversion, found)])
-    return Solved(found, iterations, costs, status, _TRACED)
+def _traced_solution(inversion: Inversion, start, coefficients, iterations, status, box=None) -> Solution:
+    """Result of a solver inside jax.jit, jax.grad or jax.vmap: `coefficients` with the derivatives of the exact
+    minimum."""
+    coefficients = as_solution(coefficients, inversion, box)
+    costs = jnp.stack([_cost_at(inversion, start), _cost_at(inversion, coefficients)])
+    return Solution(coefficients, iterations, costs, status, _TRACED_REASON)
 
 
-def _between(minimise, inversion: Inversion, start, box, max_steps: int, tolerance: float) -> Solved:
+def _minimise_in_box(minimise, inversion: Inversion, start, box, max_steps: int, tolerance: float) -> Solution:
     start = jnp.clip(start, *box)
     lower, upper = box
     if not has_values(inversion, start, box):
         problem, first, *ends = undifferentiated((inversion, start, lower, upper))
         found = minimise_between(problem, first, ends[0], ends[1], minimise, int(max_steps), float(tolerance))
         status = jnp.where(found.converged, Status.CONVERGED.number, Status.STEP_LIMIT.number)
-        return _traced(inversion, start, found.x, found.steps, status, box)
+        return _traced_solution(inversion, start, found.x, found.steps, status, box)
     found = minimise_between(inversion, start, lower, upper, minimise, int(max_steps), float(tolerance))
-    costs = jnp.stack([_cost(inversion, start), _cost(inversion, found.x)])
+    costs = jnp.stack([_cost_at(inversion, start), _cost_at(inversion, found.x)])
     if found.converged:
         reason = "No step between the bounds would change the image much."
-        return Solved(found.x, int(found.steps), costs, Status.CONVERGED, reason)
+        return Solution(found.x, int(found.steps), costs, Status.CONVERGED, reason)
     iterations = int(found.steps)
-    return Solved(found.x, iterations, costs, Status.STEP_LIMIT, _reason(Status.STEP_LIMIT, iterations))
+    return Solution(found.x, iterations, costs, Status.STEP_LIMIT, _reason(Status.STEP_LIMIT, iterations))
 
 
 @eqx.filter_jit
@@ -390,9 +391,9 @@ def _is_within_rounding(inversion: Inversion, coefficients):
     steps by the decrease of the objective stall there, before they reach very small tolerances."""
     cost, step = inversion.quadratic_model(coefficients)
     _, slope, curvature = step(0.0)
-    return abs(slope + 0.5 * curvature) <= _ROUNDINGS * jnp.finfo(cost.dtype).eps * cost
+    return abs(slope + 0.5 * curvature) <= _ROUNDING_FACTOR * jnp.finfo(cost.dtype).eps * cost
 
 
 @eqx.filter_jit
-def _cost(inversion: Inversion, coefficients):
+def _cost_at(inversion: Inversion, coefficients):
     return inversion.cost(coefficients)

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 # Diagonal entries of at least this fraction of the largest count as equal to it, as in symmetric meshes. The first of
 # them is the pivot, so that rounding errors do not decide.
-_AS_LARGE = 1 - 1e-4
+_EQUAL_DIAGONAL = 1 - 1e-4
 
 
 def pivoted_cholesky(
@@ -38,7 +38,7 @@ def pivoted_cholesky(
     for rank in range(shapes.shape[0]):
         if left.sum() <= enough:
             return shapes[:rank].T
-        pivot = int(np.argmax(left >= _AS_LARGE * left.max()))
+        pivot = int(np.argmax(left >= _EQUAL_DIAGONAL * left.max()))
         row = column(pivot) - shapes[:rank, pivot] @ shapes[:rank]
         shapes[rank] = row / np.sqrt(left[pivot])
         left = np.maximum(left - shapes[rank] ** 2, 0)
@@ -62,37 +62,37 @@ def traced_pivoted_cholesky(scaled: Float[Array, "m d"], *, tolerance: float, ma
     return jax.scipy.linalg.solve_triangular(lower, columns.T, lower=True).T
 
 
-def _squared_distances(one, other):
-    return ((one[:, None] - other) ** 2).sum(axis=-1)
+def _squared_distances(points, other_points):
+    return ((points[:, None] - other_points) ** 2).sum(axis=-1)
 
 
-def _pivots(scaled, tolerance: float, size: int):
+def _pivots(scaled, tolerance: float, max_rank: int):
     """Indices (size,) of the pivots, and how many of them are needed."""
     enough = tolerance * len(scaled)
 
     def go_on(state):
         rank, _, _, left = state
-        return (rank < size) & (left.sum() > enough)
+        return (rank < max_rank) & (left.sum() > enough)
 
     def add(state):
         rank, pivots, shapes, left = state
-        pivot = jnp.argmax(left >= _AS_LARGE * left.max())
+        pivot = jnp.argmax(left >= _EQUAL_DIAGONAL * left.max())
         row = jnp.exp(-((scaled - scaled[pivot]) ** 2).sum(axis=1)) - shapes[:, pivot] @ shapes
         row = row / jnp.sqrt(left[pivot])
         left = jnp.maximum(left - row**2, 0).at[pivot].set(0)
         return rank + 1, pivots.at[rank].set(pivot), shapes.at[rank].set(row), left
 
-    nothing = 0, jnp.zeros(size, int), jnp.zeros((size, len(scaled))), jnp.ones(len(scaled))
+    nothing = 0, jnp.zeros(max_rank, int), jnp.zeros((max_rank, len(scaled))), jnp.ones(len(scaled))
     rank, pivots, _, _ = jax.lax.while_loop(go_on, add, nothing)
     return pivots, rank
 
 
 # Grid points per correlation length; number of grid points along an axis from which the cubic interpolates.
-_PER_LENGTH, _CUBIC = 3, 4
+_GRID_POINTS_PER_LENGTH, _CUBIC = 3, 4
 # Limits within which a grid is worthwhile: maximum number of grid points per point, and in total.
-_EACH, _MOST = 8, 500_000
+_MAX_GRID_RATIO, _MAX_GRID_POINTS = 8, 500_000
 # Number of columns processed at a time, which limits the memory of the grid.
-_COLUMNS = 64
+_COLUMNS_AT_ONCE = 64
 
 
 class GriddedGaussian:
@@ -102,28 +102,28 @@ class GriddedGaussian:
     """
 
     def __init__(self, places: Float[np.ndarray, "m d"], length: float):
-        spacing = length / _PER_LENGTH
+        spacing = length / _GRID_POINTS_PER_LENGTH
         low = places.min(axis=0) - 1.5 * spacing
         self._shape = tuple(int(count) for count in np.ceil((places.max(axis=0) - low) / spacing) + 2)
         steps = [np.arange(count) for count in self._shape]
-        self._along = [np.exp(-((one[:, None] - one) ** 2) / (2 * _PER_LENGTH**2)) for one in steps]
+        self._along = [np.exp(-((one[:, None] - one) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2)) for one in steps]
         place = (places - low) / spacing
-        self._interpolation = _cubic(place, self._shape)
-        weights, nodes = _weights(place), np.arange(_CUBIC)
-        between = np.exp(-((nodes[:, None] - nodes) ** 2) / (2 * _PER_LENGTH**2))
+        self._interpolation = _cubic_interpolation(place, self._shape)
+        weights, nodes = _cubic_weights(place), np.arange(_CUBIC)
+        between = np.exp(-((nodes[:, None] - nodes) ** 2) / (2 * _GRID_POINTS_PER_LENGTH**2))
         self.variance = np.prod(np.einsum("mdi,ij,mdj->md", weights, between, weights), axis=1)
 
     @staticmethod
     def suits(places: Float[np.ndarray, "m d"], length: float) -> bool:
         """Whether the grid has few enough points to be worthwhile."""
-        extent = np.ptp(places, axis=0) / length * _PER_LENGTH + 5
-        return bool(np.prod(extent) < min(_EACH * len(places), _MOST))
+        extent = np.ptp(places, axis=0) / length * _GRID_POINTS_PER_LENGTH + 5
+        return bool(np.prod(extent) < min(_MAX_GRID_RATIO * len(places), _MAX_GRID_POINTS))
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Γ times columns."""
         found = np.empty(columns.shape)
-        for start in range(0, columns.shape[1], _COLUMNS):
-            some = slice(start, start + _COLUMNS)
+        for start in range(0, columns.shape[1], _COLUMNS_AT_ONCE):
+            some = slice(start, start + _COLUMNS_AT_ONCE)
             grid = (self._interpolation.T @ columns[:, some]).reshape(*self._shape, -1)
             for axis, along in enumerate(self._along):
                 grid = np.moveaxis(np.tensordot(along, grid, axes=(1, axis)), 0, axis)
@@ -131,16 +131,16 @@ class GriddedGaussian:
         return found
 
 
-def _weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
+def _cubic_weights(place: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "m d 4"]:
     """Weights of cubic Lagrange interpolation from the two grid points on either side, along every axis."""
     t = place - np.floor(place) + 1
     nodes = np.arange(_CUBIC)
     return np.stack([np.prod([(t - j) / (i - j) for j in nodes if j != i], axis=0) for i in nodes], axis=-1)
 
 
-def _cubic(place: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
+def _cubic_interpolation(place: Float[np.ndarray, "m d"], shape: tuple[int, ...]) -> scipy.sparse.csr_array:
     """Sparse matrix (m, grid points) that interpolates from the grid to points `place`, in units of the spacing."""
-    first, nodes, along = np.floor(place).astype(int) - 1, np.arange(_CUBIC), _weights(place)
+    first, nodes, along = np.floor(place).astype(int) - 1, np.arange(_CUBIC), _cubic_weights(place)
     weight, index = np.ones((len(place), 1)), np.zeros((len(place), 1), int)
     for axis, count in enumerate(shape):
         weight = (weight[:, :, None] * along[:, axis, None, :]).reshape(len(place), -1)

@@ -29,12 +29,12 @@ from jeit.mesh.geometry import facet_measures
 from jeit_solvers.engines import has_values, host, on_host
 
 # Length scale of the Robin condition at the wall, in units of 1/κ.
-_ROBIN = 1.42
+_ROBIN_COEFFICIENT = 1.42
 # Number of nodes up to which variances are computed exactly; number of random fields from which they are estimated on
 # larger meshes.
-_FEW, _FIELDS = 3000, 400
+_MAX_EXACT_NODES, _NUM_SAMPLED_FIELDS = 3000, 400
 # Number of fields processed at a time.
-_AT_ONCE = 50
+_COLUMNS_AT_ONCE = 50
 
 
 class Matern(AbstractPrior):
@@ -76,15 +76,15 @@ class Matern(AbstractPrior):
         field = self._field(mesh, jacobian)
         return informed_shapes(np.asarray(jacobian), field.product, field.variance())
 
-    def _field(self, mesh: Mesh, jacobian) -> "_Field":
+    def _field(self, mesh: Mesh, jacobian) -> "_MaternField":
         instead = "take Gaussian(length), which can be differentiated"
         check_has_values(
             "model, or the prior's length", (mesh, jacobian, self.length), "a Matérn field is made", instead
         )
-        return _Field.create(mesh, float(self.length))
+        return _MaternField.create(mesh, float(self.length))
 
 
-class _Field(NamedTuple):
+class _MaternField(NamedTuple):
     """Matérn field on the nodes of a mesh.
 
     **Fields**: `means` (m, n): matrix that averages nodal values over each cell; `solve`: solves systems with A; `mass`
@@ -99,7 +99,7 @@ class _Field(NamedTuple):
     fields: Float[np.ndarray, "n k"]
 
     @classmethod
-    def create(cls, mesh: Mesh, length: float) -> "_Field":
+    def create(cls, mesh: Mesh, length: float) -> "_MaternField":
         system = NodalSystem.create(mesh)
         mesh = system.mesh
         count, size = mesh.cells.shape[1], mesh.num_points
@@ -109,21 +109,21 @@ class _Field(NamedTuple):
         mass = np.bincount(mesh.cells.ravel(), np.repeat(measure / count, count), size)
         wall = np.asarray(facet_measures(mesh)) / mesh.dimension
         rim = np.bincount(mesh.facets.ravel(), np.repeat(wall, mesh.dimension), size)
-        solve = system.inverse(system.assemble(stiffness, decay**2 * mass + decay / _ROBIN * rim))
-        fields = _fields(solve, mass)
+        solve = system.inverse(system.assemble(stiffness, decay**2 * mass + decay / _ROBIN_COEFFICIENT * rim))
+        fields = _covariance_factor(solve, mass)
         scale = 1 / np.sqrt(np.einsum("nk,nk->n", fields, fields))
         return cls(system.means, solve, mass, scale, scale[:, None] * fields)
 
     def variance(self) -> Float[np.ndarray, " m"]:
         """Variance of the cells."""
-        some = np.array_split(self.fields, max(1, self.fields.shape[1] // _AT_ONCE), axis=1)
+        some = np.array_split(self.fields, max(1, self.fields.shape[1] // _COLUMNS_AT_ONCE), axis=1)
         return np.sum([((self.means @ part) ** 2).sum(axis=1) for part in some], axis=0)
 
     def product(self, columns: Float[np.ndarray, "m k"]) -> Float[np.ndarray, "m k"]:
         """Γ times columns."""
 
-        def some(part: Any) -> Any:
-            within = self.scale[:, None] * (self.means.T @ part)
+        def some(column_slice: Any) -> Any:
+            within = self.scale[:, None] * (self.means.T @ column_slice)
             return self.means @ (self.scale[:, None] * self.solve(self.mass[:, None] * self.solve(within)))
 
         return by_columns(some, columns, len(columns))
@@ -133,12 +133,12 @@ class _Field(NamedTuple):
         return self.means @ (self.scale[:, None] * self.solve(np.diag(np.sqrt(self.mass))))
 
 
-def _fields(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
+def _covariance_factor(solve: Solve, mass: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n k"]:
     """F with F Fᵀ = A⁻¹ M A⁻¹. For a large mesh the columns are random fields of that covariance, which approximate
     the diagonal of F Fᵀ."""
-    if len(mass) <= _FEW:
+    if len(mass) <= _MAX_EXACT_NODES:
         return solve(np.diag(np.sqrt(mass)))
-    noise = np.random.default_rng(0).standard_normal((len(mass), _FIELDS)) / np.sqrt(_FIELDS)
+    noise = np.random.default_rng(0).standard_normal((len(mass), _NUM_SAMPLED_FIELDS)) / np.sqrt(_NUM_SAMPLED_FIELDS)
     return solve(np.sqrt(mass)[:, None] * noise)
 
 

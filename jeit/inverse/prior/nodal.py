@@ -27,7 +27,7 @@ from jeit_solvers.engines import on_host
 
 # Number of columns solved for at a time, by a plan's padded fronts and by fronts of their own size: with more, they
 # exceed the caches and memory grows.
-_AT_ONCE, _BY_FRONTS = 32, 256
+_COLUMNS_BY_PLAN, _COLUMNS_BY_FRONTS = 32, 256
 
 Solve = Callable[[Any], Any]
 """Function that solves a linear system for columns (n, k)."""
@@ -74,7 +74,7 @@ class NodalSystem(NamedTuple):
         return lambda columns: by_columns(factor.solve, columns, len(columns))
 
 
-class Factorised(NamedTuple):
+class FactorisedMatrix(NamedTuple):
     """A factorised matrix A = L Lᵀ. **Fields**: `solve`: A⁻¹ times columns (n, k); `half_solve`: L⁻¹ times columns,
     rows in an order of its own."""
 
@@ -82,15 +82,16 @@ class Factorised(NamedTuple):
     half_solve: Solve
 
 
-def factorised(plan: FactorisationPlan, fronts: Fronts, values: Any) -> Factorised:
-    """Factorise a matrix: in NumPy by its `fronts`, with the columns split over all cores, or traced by its `plan`."""
+def factorise_matrix(plan: FactorisationPlan, fronts: Fronts, values: Any) -> FactorisedMatrix:
+    """Factorise a matrix with these values: in NumPy, with the order `fronts`, or inside jax.jit, jax.grad and
+    jax.vmap, with the compiled `plan`."""
     if not isinstance(values, np.ndarray):
         factor = factorise(plan, values)
-        return Factorised(
+        return FactorisedMatrix(
             lambda columns: solve(plan, factor, columns), lambda columns: half_solve(plan, factor, columns)
         )
     mine = factorise_fronts(fronts, values)
-    return Factorised(
+    return FactorisedMatrix(
         lambda columns: by_columns(mine.solve, columns, len(columns)),
         lambda columns: by_columns(mine.half_solve, columns, len(columns)),
     )
@@ -100,10 +101,10 @@ def solve_columns(plan: FactorisationPlan, factor: Factor, columns: Any) -> Any:
     """Solutions for columns (n, k). NumPy arrays are split over all cores."""
     if not isinstance(columns, np.ndarray):
         return solve(plan, factor, columns)
-    return by_columns(functools.partial(solve, plan, factor), columns, plan.size, _AT_ONCE)
+    return by_columns(functools.partial(solve, plan, factor), columns, plan.size, _COLUMNS_BY_PLAN)
 
 
-def by_columns(function: Callable[[Any], Any], columns: Any, rows: int, at_once: int = _BY_FRONTS) -> Any:
+def by_columns(function: Callable[[Any], Any], columns: Any, rows: int, at_once: int = _COLUMNS_BY_FRONTS) -> Any:
     """Apply `function` to blocks of `at_once` columns of a NumPy array (n, k), in parallel on all cores; returns
     (rows, k). `function` may itself call `by_columns` with all columns it is given."""
     number = columns.shape[1]

@@ -30,7 +30,7 @@ from jeit_solvers.engines import host, namespace
 
 # Multiple of the identity, relative to the largest entry, added to a precision that has a null space before it is
 # inverted approximately.
-_LITTLE = 1e-6
+_DIAGONAL_SHIFT = 1e-6
 
 
 class AbstractPenalty(eqx.Module):
@@ -134,7 +134,7 @@ class QuadraticForm(AbstractPenalty):
         entry = jnp.where(mine[self.row] & mine[self.column], self.value, 0)
         dense = jnp.zeros((self.size, self.size)).at[self.row, self.column].add(entry)
         scale = jnp.max(jnp.abs(self.value))
-        dense = dense + jnp.diag(jnp.where(mine, _LITTLE * scale, scale))
+        dense = dense + jnp.diag(jnp.where(mine, _DIAGONAL_SHIFT * scale, scale))
         solved = jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(dense), image)
         return jnp.concatenate([jnp.where(mine[:, None], solved, 0), rest])
 

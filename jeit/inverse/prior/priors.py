@@ -42,24 +42,26 @@ from jeit_solvers import (
 )
 from jeit_solvers.engines import has_values, host, on_host
 
-_WANTED = "an object of jeit.inverse: Noser(), Gaussian(length in metres), Laplace(), Tikhonov(), TotalVariation()"
+_PRIOR_EXAMPLES = (
+    "an object of jeit.inverse: Noser(), Gaussian(length in metres), Laplace(), Tikhonov(), TotalVariation()"
+)
 
 
 def check_prior(prior: Any) -> None:
     """Raise `ValueError` unless `prior` is a prior object. Names of priors are accepted only by the command line and
     `ImagingSettings`."""
-    check_kind("prior", prior, AbstractPrior, _WANTED)
+    check_kind("prior", prior, AbstractPrior, _PRIOR_EXAMPLES)
 
 
 # Number of rows of a dense covariance computed at a time.
-_BLOCK = 512
+_ROWS_AT_ONCE = 512
 # Fraction of a Gaussian prior's variance that its shapes may leave out; maximum number of shapes.
-_LEFT_OUT, _MOST_SHAPES = 1e-3, 2000
+_OMITTED_VARIANCE, _MAX_SHAPES = 1e-3, 2000
 # Number of cells above which images consist only of shapes that the data resolve, and the Laplace prior couples nodes
 # in place of cells; squared signal of a shape, relative to the largest, below which the data do not resolve it.
-_MANY, _NOTHING = 30_000, 1e-12
+_LARGE_MESH_CELLS, _MIN_SIGNAL = 30_000, 1e-12
 # Term added to the diagonal of a precision matrix that has constant images in its null space.
-_FREEDOM = 1e-6
+_DIAGONAL_TERM = 1e-6
 
 
 class AbstractPrior(eqx.Module):
@@ -98,7 +100,7 @@ class AbstractPrior(eqx.Module):
         """
         assert jacobian is not None  # a quadratic prior may depend on it
         if not per_cell:
-            many = mesh.num_cells > _MANY and has_values(mesh, jacobian, self)
+            many = mesh.num_cells > _LARGE_MESH_CELLS and has_values(mesh, jacobian, self)
             basis = (self.informed_basis if many else self.basis)(mesh, jacobian).scaled(1 / hyperparameter)
             return basis if regions is None else basis.pooled(regions), Ridge()
         if regions is not None:
@@ -188,8 +190,8 @@ class Laplace(AbstractPrior):
     def covariance_product(self, mesh, jacobian):
         """Γ Jᵀ, where Γ is the generalised inverse of Q with cell 0, or node 0, grounded."""
         check_cells(mesh)
-        if mesh.dimension == 3 and mesh.num_cells > _MANY and has_values(mesh, jacobian):
-            return host.asarray(_between_nodes(mesh, np.asarray(jacobian).T, 0.0))
+        if mesh.dimension == 3 and mesh.num_cells > _LARGE_MESH_CELLS and has_values(mesh, jacobian):
+            return host.asarray(_node_covariance_product(mesh, np.asarray(jacobian).T, 0.0))
         pairs, _ = interior_facets(mesh)
         pattern, plan = on_host(cell_factorisation(mesh, [pairs, np.zeros((1, 1), int)]))
         link = host.broadcast_to(np.array([[2.0, -2.0], [-2.0, 2.0]]), (len(pairs), 2, 2))
@@ -211,7 +213,7 @@ class Laplace(AbstractPrior):
     def basis(self, mesh, jacobian):
         """Dense basis from a Cholesky factor of Q, with a very small penalty on constant images."""
         precision = self.precision(mesh, jacobian).toarray()
-        precision[np.diag_indices_from(precision)] += _FREEDOM
+        precision[np.diag_indices_from(precision)] += _DIAGONAL_TERM
         lower = scipy.linalg.cholesky(precision, lower=True)
         return DenseBasis(scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
 
@@ -220,7 +222,7 @@ class Laplace(AbstractPrior):
         `basis`."""
         if mesh.dimension != 3:
             return self.basis(mesh, jacobian)
-        free = partial(_between_nodes, mesh, freedom=_FREEDOM)
+        free = partial(_node_covariance_product, mesh, freedom=_DIAGONAL_TERM)
         return informed_shapes(np.asarray(jacobian), free, None)
 
     def null_space(self, mesh):
@@ -246,10 +248,12 @@ class Gaussian(AbstractPrior):
         scaled = centroids(mesh) / (np.sqrt(2) * self.length)
         if not has_values(scaled, jacobian):
             return _traced_product(jnp.asarray(scaled), jnp.asarray(jacobian))
-        if mesh.num_cells > _MANY and GriddedGaussian.suits(places := np.asarray(centroids(mesh)), float(self.length)):
+        if mesh.num_cells > _LARGE_MESH_CELLS and GriddedGaussian.suits(
+            places := np.asarray(centroids(mesh)), float(self.length)
+        ):
             return host.asarray(GriddedGaussian(places, float(self.length)).product(np.asarray(jacobian).T))
         scaled = np.asarray(scaled)
-        rows = np.split(scaled, np.arange(_BLOCK, len(scaled), _BLOCK))
+        rows = np.split(scaled, np.arange(_ROWS_AT_ONCE, len(scaled), _ROWS_AT_ONCE))
         return host.concatenate([np.exp(-cdist(row, scaled, "sqeuclidean")) @ np.asarray(jacobian).T for row in rows])
 
     def basis(self, mesh, jacobian):
@@ -260,14 +264,16 @@ class Gaussian(AbstractPrior):
         centres = centroids(mesh)
         if not has_values(centres, self.length):
             scaled = jnp.asarray(centres) / (np.sqrt(2) * self.length)
-            return DenseBasis(traced_pivoted_cholesky(scaled, tolerance=_LEFT_OUT, max_rank=_MOST_SHAPES))
+            return DenseBasis(traced_pivoted_cholesky(scaled, tolerance=_OMITTED_VARIANCE, max_rank=_MAX_SHAPES))
         centres = np.asarray(centres)
 
         def column(cell):
             return np.exp(-np.sum((centres - centres[cell]) ** 2, axis=1) / (2 * self.length**2))
 
         ones = np.ones(len(centres))
-        return DenseBasis(host.asarray(pivoted_cholesky(ones, column, tolerance=_LEFT_OUT, max_rank=_MOST_SHAPES)))
+        return DenseBasis(
+            host.asarray(pivoted_cholesky(ones, column, tolerance=_OMITTED_VARIANCE, max_rank=_MAX_SHAPES))
+        )
 
     def informed_basis(self, mesh, jacobian):
         """Informed shapes (`informed_shapes`), computed on a grid; `basis` if the grid would be too large."""
@@ -290,7 +296,7 @@ def informed_shapes(
     covariance: Callable[[Float[np.ndarray, "m M"]], Any],
     variance: Float[np.ndarray, " m"] | None,
 ) -> DenseBasis:
-    """Basis of the shapes that data resolve, ΓJᵀ(JΓJᵀ)^-½, which are no more than the data.
+    """Basis of the shapes that data resolve, ΓJᵀ(JΓJᵀ)^-½, of which there are at most as many as data.
 
     `covariance`: function that multiplies with Γ; `variance`: diagonal of Γ, if known. Shapes are in single precision,
     which changes an image by a relative 1e-6.
@@ -298,7 +304,7 @@ def informed_shapes(
     product = np.asarray(covariance(jacobian.T))
     inner = jacobian @ product
     size, vectors = np.linalg.eigh((inner + inner.T) / 2)
-    kept = size > _NOTHING * size[-1]
+    kept = size > _MIN_SIGNAL * size[-1]
     shapes = (product @ (vectors[:, kept] / np.sqrt(size[kept]))).astype(np.float32)
     if variance is None:
         return DenseBasis(host.asarray(shapes))
@@ -306,7 +312,7 @@ def informed_shapes(
     return DenseBasis(host.asarray(shapes), host.asarray(np.maximum(variance - seen, 0)))
 
 
-def _between_nodes(mesh: Mesh, columns: Float[np.ndarray, "m k"], freedom: float) -> Float[np.ndarray, "m k"]:
+def _node_covariance_product(mesh: Mesh, columns: Float[np.ndarray, "m k"], freedom: float) -> Float[np.ndarray, "m k"]:
     """Γ times columns, where Γ is the inverse of twice the graph Laplacian of nodes that share an edge, averaged over
     cells. `freedom` is added to the diagonal; if it is 0, node 0 is grounded."""
     system = NodalSystem.create(mesh)
@@ -328,8 +334,8 @@ def _traced_product(scaled, jacobian):
     def rows(block):
         return jnp.exp(-((block[:, None] - scaled) ** 2).sum(axis=-1)) @ jacobian.T
 
-    missing = -len(scaled) % _BLOCK
-    blocks = jnp.pad(scaled, ((0, missing), (0, 0))).reshape(-1, _BLOCK, scaled.shape[1])
+    missing = -len(scaled) % _ROWS_AT_ONCE
+    blocks = jnp.pad(scaled, ((0, missing), (0, 0))).reshape(-1, _ROWS_AT_ONCE, scaled.shape[1])
     return jax.lax.map(rows, blocks).reshape(-1, len(jacobian))[: len(scaled)]
 
 

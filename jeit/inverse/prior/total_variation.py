@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from jeit.inverse.hyperparameter.choice import EDGE_PRICE
 from jeit.inverse.prior.bases import DiagonalBasis, NodalBasis
-from jeit.inverse.prior.nodal import factorised
+from jeit.inverse.prior.nodal import factorise_matrix
 from jeit.inverse.prior.penalties import AbstractPenalty, SparseNormal
 from jeit.inverse.prior.priors import AbstractPrior, cell_factorisation, check_cells
 from jeit.mesh import Mesh, gradients, measures
@@ -142,7 +142,7 @@ class NodalTotalVariation(AbstractPenalty):
             xp = namespace(self, jacobian)
             flux = stiffness[:, None] * self._gradient(self.reference + image)
             gradient = self.pull * image + self._divergence(flux)
-            factor = factorised(self.plan, self.fronts, self._matrix(self._elements(stiffness), self.pull))
+            factor = factorise_matrix(self.plan, self.fronts, self._matrix(self._elements(stiffness), self.pull))
             columns = xp.concatenate([jacobian[:, :size].T, gradient[:, None]], axis=1)
             # Products with Γ are formed from half solves; the direction takes one more full solve.
             half = factor.half_solve(columns)
@@ -190,7 +190,7 @@ class NodalTotalVariation(AbstractPenalty):
 
 
 # Weight of the deviation from the background relative to λ: it determines the image where the data do not.
-_LEVEL = 1e-3
+_BACKGROUND_WEIGHT = 1e-3
 
 
 class TotalVariation(AbstractPrior):
@@ -220,15 +220,15 @@ class TotalVariation(AbstractPrior):
 
     def covariance_product(self, mesh, jacobian) -> NoReturn:
         """Not available. Raises `ValueError`."""
-        _refuse("covariance")
+        _raise_not_quadratic("covariance")
 
     def precision(self, mesh, jacobian) -> NoReturn:
         """Not available. Raises `ValueError`."""
-        _refuse("precision matrix")
+        _raise_not_quadratic("precision matrix")
 
     def basis(self, mesh, jacobian) -> NoReturn:
         """Not available. Raises `ValueError`."""
-        _refuse("basis of independent shapes")
+        _raise_not_quadratic("basis of independent shapes")
 
     def penalty(self, mesh, reference, hyperparameter, *, jacobian=None, regions=None, per_cell=False):
         """Basis with one coefficient per cell (or node of a solid), and the penalty weighted with λ. An edge as long as
@@ -237,7 +237,7 @@ class TotalVariation(AbstractPrior):
             raise ValueError("regions: total variation finds its own; leave them out, or take another prior.")
         check_cells(mesh)
         if mesh.dimension == 3 and not per_cell and has_values(mesh):
-            return NodalTotalVariation.create(mesh, reference, hyperparameter, self.smoothing, _LEVEL)
+            return NodalTotalVariation.create(mesh, reference, hyperparameter, self.smoothing, _BACKGROUND_WEIGHT)
         pairs, nodes = interior_facets(mesh)
         points = on_host(mesh.points)
         xp = namespace(points, hyperparameter, self.smoothing)
@@ -253,7 +253,7 @@ class TotalVariation(AbstractPrior):
         penalty = TotalVariationPenalty(
             pairs=host.asarray(pairs),
             weight=hyperparameter * length / size ** (mesh.dimension - 1),
-            level=hyperparameter * _LEVEL * area / area.sum(),
+            level=hyperparameter * _BACKGROUND_WEIGHT * area / area.sum(),
             smoothing=xp.asarray(self.smoothing),
             reference=reference,
             pattern=pattern,
@@ -263,7 +263,7 @@ class TotalVariation(AbstractPrior):
         return DiagonalBasis(host.ones(mesh.num_cells)), penalty
 
 
-def _refuse(what: str) -> NoReturn:
+def _raise_not_quadratic(what: str) -> NoReturn:
     raise ValueError(
         f"prior: total variation has no {what}, so there is no linear image with it; take reconstruct, or an Imager "
         "with gauss-newton or levenberg-marquardt, or another prior."

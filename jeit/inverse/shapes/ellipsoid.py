@@ -22,7 +22,7 @@ from jeit.mesh import Mesh, measures
 
 # Difference of log evidence above which only the likelier of two descriptions is reported (ellipsoid or column, one
 # material or several); maximum number of steps when an alternative is fitted; tolerance of that fit.
-_UNDECIDED, _STEPS, _ROUGHLY = 4.0, 8, 1e-2
+_UNDECIDED_ODDS, _STEPS, _COARSE_TOLERANCE = 4.0, 8, 1e-2
 # Contribution of the mesh to the standard deviation of a contrast in log σ, in a sheet and in a solid. Balls of three
 # times the bath's conductivity are estimated as 3.87, 3.59 and 3.31 times as conductive if edges on their surfaces are
 # 0.7, 0.5 and 0.35 of the radius, and as 3.1 to 3.2 times if they are 0.25 of it. Disks of four times the conductivity
@@ -42,7 +42,10 @@ def unmodelled_deviations(problem: ShapeProblem, fitted: Fit, each: Fit | None =
     `each`: fit in which every body has its own material. If the data do not rule it out, its contrasts are included.
     """
     variance = np.full(len(fitted.bodies.sign), _BY_THE_MESH[fitted.bodies.dimension] ** 2)
-    if each and problem.surprise(each) - each.bodies.odds < problem.surprise(fitted) - fitted.bodies.odds + _UNDECIDED:
+    if (
+        each
+        and problem.surprise(each) - each.bodies.odds < problem.surprise(fitted) - fitted.bodies.odds + _UNDECIDED_ODDS
+    ):
         contrast, deviation = _contrasts(problem, fitted)
         own, its = _contrasts(problem, each)
         variance += np.maximum((np.abs(own - contrast) + its) ** 2 - deviation**2, 0)
@@ -63,9 +66,9 @@ def alternatives(problem: ShapeProblem, fitted: Fit) -> list[tuple[Ellipsoid | N
     bodies, number = fitted.bodies, len(fitted.bodies.sign)
     if not number or bodies.prior.is_of_one_kind or not isinstance(bodies, Ellipsoids):
         return [(None, np.nan)] * number
-    most, found = problem.surprise(fitted) - bodies.odds + _UNDECIDED, []
+    most, found = problem.surprise(fitted) - bodies.odds + _UNDECIDED_ODDS, []
     for k in range(number):
-        other = problem.fit(*bodies.otherwise([k], fitted.coefficients), _STEPS, _ROUGHLY)
+        other = problem.fit(*bodies.otherwise([k], fitted.coefficients), _STEPS, _COARSE_TOLERANCE)
         if problem.surprise(other) - other.bodies.odds < most:
             found.append((other.bodies.body(k, other.coefficients), contrast_deviations(problem, other)[k]))
         else:
@@ -382,15 +385,15 @@ class Ellipsoids(Bodies):
         squeeze = (direction * np.exp(-log_stretch)) @ direction.T
         centre, radius = self.centre(k, row), np.exp(min(self.log_radius(row), np.log(10 * self.span)))
         farthest, axes = radius * np.exp(log_stretch[-1]), self._axes_of(k)
-        reached = _length((self.points[:, :, 0] - centre[:, None]) * axes[:, None]) < farthest + _REACH * self.width
+        reached = _lengths((self.points[:, :, 0] - centre[:, None]) * axes[:, None]) < farthest + _REACH * self.width
         cells = np.flatnonzero(reached)
         offset = (self.points[:, cells] - centre[:, None, None]) * axes[:, None, None]
-        distance, width = _length(offset), self.width[cells, None]
+        distance, width = _lengths(offset), self.width[cells, None]
         if (at_centre := distance == 0).any():
             offset[:, at_centre] = 1e-9 * self.span
-            distance = _length(offset)
+            distance = _lengths(offset)
         round_offset = np.tensordot(squeeze, offset, 1)
-        reach = _length(round_offset)
+        reach = _lengths(round_offset)
         # On the ray from the centre, the surface is at the distance radius · distance / reach.
         surface = radius * distance / reach
         # The blur of a convex surface adds more volume than it removes. Reducing the surface by `excess` compensates.
@@ -428,5 +431,5 @@ class Ellipsoids(Bodies):
         return direction @ ((direction.T @ _STRETCHES @ direction) * divided) @ direction.T
 
 
-def _length(vectors: Float[np.ndarray, "3 *n"]) -> Float[np.ndarray, "*n"]:
+def _lengths(vectors: Float[np.ndarray, "3 *n"]) -> Float[np.ndarray, "*n"]:
     return np.sqrt(np.einsum("i...,i...->...", vectors, vectors))

@@ -2,8 +2,8 @@
 
 A mesh that suffices for a smooth image resolves a body of a few cells badly. The error of the voltages is proportional
 to the edge length on the surface, differs between channels, and resembles the effect of another body. Bodies that were
-found are therefore fitted again on a mesh that is bisected at their surfaces. The rest of the problem, including the
-voltages of the background, is unchanged.
+found are therefore fitted again on a mesh that is bisected at their surfaces. The rest of the problem,
+including the voltages of the background, is unchanged.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from jeit.forward.changes import solved_fields
 from jeit.inverse.shapes.ellipsoid import Ellipsoids
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh
-from jeit.mesh.bisection import bisected
+from jeit.mesh.bisection import bisect_with_parents
 from jeit.protocol import Protocol
 from jeit_solvers.engines import on_host
 
 # Ratio of the number of nodes of the refined mesh to that of the given one, below which no longer edges are tried.
-_MOST = 2.5
+_MAX_NODES = 2.5
 
 
-class Finer(NamedTuple):
+class FinerModel(NamedTuple):
     """Shape problem on a refined mesh.
 
     **Fields**: `problem`: the problem on the refined mesh; `bodies`: the bodies on it; `cell` (f,): index of the cell
@@ -55,7 +55,7 @@ class Finer(NamedTuple):
         return self.problem.background * np.exp(image + np.broadcast_to(field, self.cell.max() + 1)[self.cell])
 
 
-def finer(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> Finer:
+def refine_at_surfaces(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> FinerModel:
     """Refine the mesh of a problem at the surfaces of the ellipsoids of a fit.
 
     `edges`: lengths of the edges there, in units of the shortest half axis; the first that does not add too many nodes
@@ -63,20 +63,20 @@ def finer(problem: ShapeProblem, fit: Fit, edges: Sequence[float]) -> Finer:
     """
     bodies, model = fit.bodies, problem.model
     assert isinstance(bodies, Ellipsoids)
-    tagged, names = _tagged(model.mesh, model.electrodes)
-    mesh, cell = bisected(tagged, partial(bodies.edges, fit.coefficients, edges[0]))
+    tagged, names = _tag_electrodes(model.mesh, model.electrodes)
+    mesh, cell = bisect_with_parents(tagged, partial(bodies.edges, fit.coefficients, edges[0]))
     for edge in edges[1:]:
-        if mesh.num_points < _MOST * tagged.num_points:
+        if mesh.num_points < _MAX_NODES * tagged.num_points:
             break
-        mesh, cell = bisected(tagged, partial(bodies.edges, fit.coefficients, edge))
-    there = on_host(ForwardModel(mesh, _on(mesh, model.electrodes, iter(names)), model.protocol))
+        mesh, cell = bisect_with_parents(tagged, partial(bodies.edges, fit.coefficients, edge))
+    there = on_host(ForwardModel(mesh, _electrodes_on(mesh, model.electrodes, iter(names)), model.protocol))
     background = problem.background[cell]
     moved = solved_fields(there, background).voltages - solved_fields(model, problem.background).voltages
     data = eqx.tree_at(lambda data: data.voltages, problem.data, np.asarray(problem.data.voltages) + moved)
-    return Finer(ShapeProblem(there, data, background), bodies.on(mesh), cell)
+    return FinerModel(ShapeProblem(there, data, background), bodies.on(mesh), cell)
 
 
-def _tagged(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]]:
+def _tag_electrodes(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]]:
     """The mesh with the facets that each electrode covers as tags, which bisection preserves; and the tags' names."""
     parts = electrodes.parts if isinstance(electrodes, CombinedElectrodes) else (electrodes,)
     covers = [column for part in parts if isinstance(part, FacetElectrodes) for column in np.asarray(part.covers).T]
@@ -84,10 +84,11 @@ def _tagged(mesh: Mesh, electrodes: AbstractElectrodes) -> tuple[Mesh, list[str]
     return replace(mesh, tags=tags), list(tags)
 
 
-def _on(mesh: Mesh, electrodes: AbstractElectrodes, names) -> AbstractElectrodes:
-    """Electrodes on the bisected mesh: those that cover facets from the tags `names`, all others unchanged."""
+def _electrodes_on(mesh: Mesh, electrodes: AbstractElectrodes, names) -> AbstractElectrodes:
+    """Electrodes on the bisected mesh: those that cover facets from the tags `names`, all others
+    unchanged."""
     if isinstance(electrodes, CombinedElectrodes):
-        return CombinedElectrodes(*[_on(mesh, part, names) for part in electrodes.parts])
+        return CombinedElectrodes(*[_electrodes_on(mesh, part, names) for part in electrodes.parts])
     if isinstance(electrodes, FacetElectrodes):
         return plates(mesh, [next(names) for _ in range(electrodes.num_electrodes)], electrodes.contact_impedance)
     return electrodes

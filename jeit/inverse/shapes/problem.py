@@ -31,7 +31,7 @@ from jaxtyping import Float
 
 from jeit.arguments import check_kind
 from jeit.forward import ForwardModel
-from jeit.forward.changes import Change, solved_fields
+from jeit.forward.changes import ConductivityChange, solved_fields
 from jeit.inverse.channels import Data
 from jeit.inverse.nonlinear.reconstruct import Reconstruction
 from jeit.inverse.shapes.bodies import Bodies
@@ -150,7 +150,10 @@ class ShapeProblem:
 
         def jacobian():
             there = [conductivity if cells is None else conductivity[cells] for cells, _ in slopes]
-            changes = [Change(cells, one[:, None] * slope) for one, (cells, slope) in zip(there, slopes, strict=True)]
+            changes = [
+                ConductivityChange(cells, one[:, None] * slope)
+                for one, (cells, slope) in zip(there, slopes, strict=True)
+            ]
             voltages = bodies.by_coefficients(fields.derivatives(changes))
             return np.concatenate([weight[:, None] * voltages, apart * overlap_slope])
 

@@ -26,22 +26,22 @@ from jeit.inverse.shapes.ellipsoid import (
     unmodelled_deviations,
 )
 from jeit.inverse.shapes.problem import Fit, ShapeProblem, SmoothField
-from jeit.inverse.shapes.quantities import Accuracy, including, quantified
+from jeit.inverse.shapes.quantities import Accuracy, include_deviation, with_quantities
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
 from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array
 
 if TYPE_CHECKING:
-    from jeit.inverse.shapes.finer import Finer
+    from jeit.inverse.shapes.finer import FinerModel
 
 # Minimum factor by which the objective must rise when a body is left out and the others are fitted again.
 LEAST_RISE = 1.4
 _FIRST_STEPS, _STEPS, _STEPS_WITHOUT, _STEPS_TRIED = 15, 40, 8, 6
-_ROUGHLY = 1e-2
+_COARSE_TOLERANCE = 1e-2
 # Number of starts in a row that the data do not support, after which the remaining, weaker ones are not tried.
-_MOST_REFUSED = 2
+_MAX_UNSUPPORTED = 2
 # Factor by which the objective rises without a body, above which the body is beyond doubt.
-_SURELY = 10.0
+_CERTAIN_RISE = 10.0
 # Maximum number of changes of the number or kind of bodies.
 _MOST_CHANGES = 10
 # Maximum number of times that the mesh is refined at the bodies, which move as a result. Edge lengths on their
@@ -49,7 +49,7 @@ _MOST_CHANGES = 10
 # ghosts among the bodies, and in later ones.
 _MOST_MESHES, _EDGES = 3, ((0.7,), (0.25, 0.35, 0.5, 0.7))
 # Minimum gain of log evidence for accepting the richer of two descriptions of the bodies.
-_MARGIN = 2.0
+_MIN_EVIDENCE_GAIN = 2.0
 
 
 Body = Star | Ellipsoid
@@ -74,10 +74,10 @@ class ShapeReconstruction(eqx.Module):
     voltages predicted for the bodies; `misfit`: root mean square of predicted - measured over the channels used, in
     standard deviations; `drift`: relative difference of the bath's conductivity from `background`; `doubtful`: bodies
     that were removed because their `rise` is too small; `contrast_deviations`: posterior standard deviation of each
-    body's contrast due to noise, combined with that of the mesh (0.03, in solids 0.1); `alternatives`: for each body
-    of a solid, the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
-    `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`: for a solid
-    with bodies, the conductivity on the last refined mesh, for display.
+    body's contrast due to noise, combined with that of the mesh (0.03, in solids 0.1); `alternatives`: for each body of
+    a solid, the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
+    `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`:
+    for a solid with bodies, the conductivity on the last refined mesh, for display.
     """
 
     bodies: tuple[Body, ...]
@@ -162,31 +162,31 @@ def reconstruct_shapes(
     check_kind("prior", prior, kind, f"one of bodies of that dimension, such as {kind.__name__}(modes=2)")
     if not (is_number(least_rise) and least_rise >= 1):
         raise ValueError(f"least_rise must be a number from 1; it is {describe(least_rise)}.")
-    sign, centre, radius = _checked_start(start, model.mesh.dimension)
+    sign, centre, radius = _check_start(start, model.mesh.dimension)
     small, data = independent_data(model, measured, used, deviation, at_once=True)
     solid = model.mesh.dimension == 3
-    problem = ShapeProblem(small, data, background, _ROUGHLY if solid else ShapeProblem.rtol)
+    problem = ShapeProblem(small, data, background, _COARSE_TOLERANCE if solid else ShapeProblem.rtol)
     bodies = form.create(model.mesh, prior, centre, sign)
     coefficients = bodies.of_radii(radius)
     if isinstance(prior, EllipsoidPrior) and prior.kinds == "columns":
         bodies, coefficients = bodies.otherwise(range(len(radius)), coefficients)
-    setting = _Setting(problem, None if smooth is None else SmoothField.create(smooth, problem))
+    setting = _FitSetting(problem, None if smooth is None else SmoothField.create(smooth, problem))
     level, report = 0.0, progress or (lambda stage: None)
     report("bodies")
     if smooth is not None:
-        level, balls, _ = _added_one_by_one(setting, *bodies.with_modes(1, coefficients))
+        level, balls, _ = _add_bodies(setting, *bodies.with_modes(1, coefficients))
         bodies, coefficients = balls.bodies.with_modes(prior.modes, balls.coefficients)
         problem = setting.problem(level)
-    fitted = problem.fit(*_grown(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
-    found = _without_ghosts(problem, fitted, (), least_rise)
+    fitted = problem.fit(*_grow_bodies(problem, bodies, coefficients, _FIRST_STEPS), _STEPS)
+    found = _remove_unsupported(problem, fitted, (), least_rise)
     report("bodies, how many")
-    best, there = _State(setting, level, _changed(problem, found, least_rise)), None
+    best, there = _SearchState(setting, level, _improve_fit(problem, found, least_rise)), None
     if solid:
-        best, there = _on_finer_meshes(best, least_rise, report)
+        best, there = _refine_meshes(best, least_rise, report)
         report("bodies, of which kind")
     (setting, level, (each, rises, doubtful)), beside = best, best.setting.beside
     problem = setting.problem(level)
-    fitted = _of_one_material(problem, each)
+    fitted = _with_common_contrast(problem, each)
     bodies, coefficients = fitted.bodies, fitted.coefficients
     field = 0.0 if beside is None else beside.estimate(level, fitted)
     drawn = bodies.on(model.mesh) if isinstance(bodies, Ellipsoids) else bodies
@@ -205,8 +205,8 @@ def reconstruct_shapes(
         moved = setting.alone.data.voltages - data.voltages  # by the finer mesh
         exact = eqx.tree_at(lambda one: one.voltages, exact, exact.voltages + moved)
         unmodelled = unmodelled_deviations(problem, fitted, each)
-        known = quantified(setting.weighted(exact).problem(level), fitted, accuracy, unmodelled, order)
-        known = [including(one, others[k][0], others[k][1]) for one, k in zip(known, order, strict=True)]
+        known = with_quantities(setting.weighted(exact).problem(level), fitted, accuracy, unmodelled, order)
+        known = [include_deviation(one, others[k][0], others[k][1]) for one, k in zip(known, order, strict=True)]
         found_bodies = [body.with_quantities(one) for body, one in zip(found_bodies, known, strict=True)]
     return ShapeReconstruction(
         bodies=tuple(found_bodies),
@@ -222,7 +222,7 @@ def reconstruct_shapes(
     )
 
 
-def _checked_start(start, dimension: int):
+def _check_start(start, dimension: int):
     """Signs (k,), centres (k, d) and radii (k,) from `start`. Raises `ValueError` for invalid starts."""
     try:
         sign = np.array([one[0] for one in start], float)
@@ -236,13 +236,13 @@ def _checked_start(start, dimension: int):
     return sign, centre, radius
 
 
-def _grown(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
+def _grow_bodies(problem: ShapeProblem, bodies: Bodies, coefficients, steps: int):
     """Fit the bodies as disks or balls, and return them with all their modes, and their coefficients."""
-    found = problem.fit(*bodies.with_modes(1, coefficients), steps, _ROUGHLY)
+    found = problem.fit(*bodies.with_modes(1, coefficients), steps, _COARSE_TOLERANCE)
     return found.bodies.with_modes(bodies.prior.modes, found.coefficients)
 
 
-class _Setting(NamedTuple):
+class _FitSetting(NamedTuple):
     """Setting in which bodies are fitted: the problem of bodies `alone`, and the smooth field `beside` them or None."""
 
     alone: ShapeProblem
@@ -252,17 +252,17 @@ class _Setting(NamedTuple):
         """The problem of bodies, with the smooth field of this level if there is a field."""
         return self.alone if self.beside is None else self.beside.beside(level)
 
-    def on(self, alone: ShapeProblem) -> _Setting:
+    def on(self, alone: ShapeProblem) -> _FitSetting:
         """The setting with the problem `alone` on another mesh."""
-        return _Setting(alone, self.beside and replace(self.beside, alone=alone))
+        return _FitSetting(alone, self.beside and replace(self.beside, alone=alone))
 
-    def weighted(self, data: Data) -> _Setting:
+    def weighted(self, data: Data) -> _FitSetting:
         """The setting with other weights and errors of the data."""
         alone, beside = replace(self.alone, data=data), self.beside
         if beside is not None:
             relative = np.asarray(data.weight) / np.asarray(self.alone.data.weight)
             beside = replace(beside, jacobian=relative[:, None] * beside.jacobian, alone=alone)
-        return _Setting(alone, beside)
+        return _FitSetting(alone, beside)
 
     def settled(self, bodies: Bodies, coefficients, level: float, steps: int) -> tuple[float, Fit, float]:
         """Alternate between fitting the bodies and lowering the field's level, until the level is the likeliest.
@@ -272,14 +272,14 @@ class _Setting(NamedTuple):
         """
         while True:
             problem = self.problem(level)
-            fit = problem.fit(bodies, coefficients, steps, _ROUGHLY)
+            fit = problem.fit(bodies, coefficients, steps, _COARSE_TOLERANCE)
             likeliest = level if self.beside is None else self.beside.likeliest(fit)
             if likeliest >= level:
                 return level, fit, problem.surprise(fit) + problem.uncertainty
             level, coefficients = likeliest, fit.coefficients
 
 
-def _added_one_by_one(setting: _Setting, bodies: Bodies, coefficients, sure: int = 0) -> tuple[float, Fit, list[int]]:
+def _add_bodies(setting: _FitSetting, bodies: Bodies, coefficients, sure: int = 0) -> tuple[float, Fit, list[int]]:
     """Add bodies in their order to a smooth field, and keep each that the data support besides those before it.
 
     Returns the level of the field, the fit, and the indices of the bodies kept. The first `sure` bodies are beyond
@@ -292,14 +292,14 @@ def _added_one_by_one(setting: _Setting, bodies: Bodies, coefficients, sure: int
     for k in range(sure, len(rows)):
         start = np.append(fit.coefficients, rows[k])
         tried, one, surprise = setting.settled(bodies.only([*chosen, k]), start, level, _FIRST_STEPS)
-        if surprise + _MARGIN <= least:
+        if surprise + _MIN_EVIDENCE_GAIN <= least:
             level, fit, least, chosen, refused = tried, one, surprise, [*chosen, k], 0
-        elif (refused := refused + 1) == _MOST_REFUSED:
+        elif (refused := refused + 1) == _MAX_UNSUPPORTED:
             break
     return level, fit, chosen
 
 
-class _Found(NamedTuple):
+class _SearchResult(NamedTuple):
     """Result of removing ghosts: `fit` of the remaining bodies, their `rises`, and the removed bodies, `doubtful`."""
 
     fit: Fit
@@ -307,20 +307,22 @@ class _Found(NamedTuple):
     doubtful: tuple[Body, ...]
 
 
-class _State(NamedTuple):
+class _SearchState(NamedTuple):
     """State of the search: the bodies `found` in a `setting`, with the field at its `level`."""
 
-    setting: _Setting
+    setting: _FitSetting
     level: float
-    found: _Found
+    found: _SearchResult
 
 
-def _on_finer_meshes(state: _State, least_rise: float, report: Callable[[str], None]) -> tuple[_State, Finer | None]:
+def _refine_meshes(
+    state: _SearchState, least_rise: float, report: Callable[[str], None]
+) -> tuple[_SearchState, FinerModel | None]:
     """Fit the bodies on meshes refined at their surfaces, until the surfaces stay within the refined cells.
 
     Ghosts due to the coarse mesh are dropped. Returns the state and the last refined problem, or None.
     """
-    from jeit.inverse.shapes.finer import finer
+    from jeit.inverse.shapes.finer import refine_at_surfaces
 
     given, there = state.setting, None
     for again in range(_MOST_MESHES):
@@ -328,7 +330,7 @@ def _on_finer_meshes(state: _State, least_rise: float, report: Callable[[str], N
         if not len(before.bodies.sign):
             break
         report(f"bodies, finer mesh {again + 1}")
-        there = finer(given.alone, before, _EDGES[again > 0])
+        there = refine_at_surfaces(given.alone, before, _EDGES[again > 0])
         setting, bodies, coefficients = given.on(there.problem), there.bodies, before.coefficients
         missed = np.array(rises) * before.cost
         if again:
@@ -336,30 +338,30 @@ def _on_finer_meshes(state: _State, least_rise: float, report: Callable[[str], N
         else:
             order = np.argsort(-missed)
             start = np.append(coefficients[0], bodies.rows(coefficients)[order])
-            sure = int((missed > _SURELY * before.cost).sum())
-            level, fit, some = _added_one_by_one(setting, bodies.only(order), start, sure)
+            sure = int((missed > _CERTAIN_RISE * before.cost).sum())
+            level, fit, some = _add_bodies(setting, bodies.only(order), start, sure)
             left = np.setdiff1d(np.arange(len(order)), some)
             doubtful = (*doubtful, *(bodies.body(k, coefficients, rises[k]) for k in order[left]))
             missed = missed[order[some]]
             coefficients = np.append(coefficients[0], bodies.rows(coefficients)[order[some]])
         problem = setting.problem(level)
         fit = problem.fit(fit.bodies, fit.coefficients, _STEPS)
-        found = _without_ghosts(problem, fit, doubtful, least_rise, missed)
-        if again < _MOST_MESHES - 1 and (other := _otherwise(problem, found.fit)):
-            found = _without_ghosts(problem, other, found.doubtful, least_rise)
-        state, after = _State(setting, level, found), found.fit
+        found = _remove_unsupported(problem, fit, doubtful, least_rise, missed)
+        if again < _MOST_MESHES - 1 and (other := _alternative_fits(problem, found.fit)):
+            found = _remove_unsupported(problem, other, found.doubtful, least_rise)
+        state, after = _SearchState(setting, level, found), found.fit
         if again and not bodies.moved(coefficients, after.bodies, after.coefficients):
             break
     return state, there
 
 
-def _without_ghosts(
+def _remove_unsupported(
     problem: ShapeProblem,
     fitted: Fit,
     doubtful: Sequence[Body],
     least_rise: float,
     known: Float[np.ndarray, " k"] | None = None,
-) -> _Found:
+) -> _SearchResult:
     """Remove bodies without which the others, fitted again, explain the data about as well; one at a time, starting
     with the body whose absence raises the cost least.
 
@@ -370,41 +372,41 @@ def _without_ghosts(
         bodies, coefficients, cost, _ = fitted
         # After a ghost is removed, leaving out another body raises the cost at least as much as before, so costs
         # computed earlier are lower limits.
-        beyond_doubt = max(_SURELY * cost, problem.surprise(fitted) + _MARGIN)
+        beyond_doubt = max(_CERTAIN_RISE * cost, problem.surprise(fitted) + _MIN_EVIDENCE_GAIN)
         unsure, others = np.flatnonzero(missed <= beyond_doubt).tolist(), {}
         for k in unsure:
-            others[k] = problem.fit(*bodies.without(k, coefficients), _STEPS_WITHOUT, 2 * _ROUGHLY)
+            others[k] = problem.fit(*bodies.without(k, coefficients), _STEPS_WITHOUT, 2 * _COARSE_TOLERANCE)
             missed[k] = others[k].cost
         least = min(others, key=lambda k: missed[k], default=None)
         if least is None or (missed[least] >= least_rise * cost and _is_supported(problem, others[least], fitted)):
-            return _Found(fitted, list(missed / cost), tuple(doubtful))
+            return _SearchResult(fitted, list(missed / cost), tuple(doubtful))
         doubtful.append(bodies.body(least, coefficients, float(missed[least]) / cost))
         missed = np.delete(missed, least)
         fitted = problem.fit(others[least].bodies, others[least].coefficients, _STEPS)
 
 
-def _in_two(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
+def _split_bodies(problem: ShapeProblem, fitted: Fit, least_rise: float) -> Fit | None:
     """The bodies with one of them split in two; None if the data do not support the split."""
     bodies, coefficients, cost, _ = fitted
     tried = [
-        _grown(problem, *bodies.split(k, coefficients, number), _STEPS_TRIED)
+        _grow_bodies(problem, *bodies.split(k, coefficients, number), _STEPS_TRIED)
         for k in range(len(bodies.sign))
         for number in range(bodies.num_splits)
     ]
-    found = _best(problem, fitted, tried)
+    found = _best_fit(problem, fitted, tried)
     return found if found and cost >= least_rise * found.cost and _is_supported(problem, fitted, found) else None
 
 
-def _otherwise(problem: ShapeProblem, fitted: Fit) -> Fit | None:
+def _alternative_fits(problem: ShapeProblem, fitted: Fit) -> Fit | None:
     """The bodies with one or all of them changed to the other kind, weak stars or columns; None if the data do not
     support the change."""
     plain = np.flatnonzero(~fitted.bodies.other & (not fitted.bodies.prior.is_of_one_kind))
     some = [[k] for k in plain] + [plain] * (len(plain) > 1)
-    found = _best(problem, fitted, [fitted.bodies.otherwise(one, fitted.coefficients) for one in some])
+    found = _best_fit(problem, fitted, [fitted.bodies.otherwise(one, fitted.coefficients) for one in some])
     return found if found and _is_supported(problem, fitted, found) else None
 
 
-def _of_one_material(problem: ShapeProblem, fitted: Fit) -> Fit:
+def _with_common_contrast(problem: ShapeProblem, fitted: Fit) -> Fit:
     """The ellipsoids, with one material for all bodies of a sign where that is likelier than a material for each."""
     for sign in (1, -1):
         bodies = fitted.bodies
@@ -414,35 +416,37 @@ def _of_one_material(problem: ShapeProblem, fitted: Fit) -> Fit:
     return fitted
 
 
-def _best(problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]) -> Fit | None:
+def _best_fit(
+    problem: ShapeProblem, fitted: Fit, starts: Sequence[tuple[Bodies, Float[np.ndarray, " n"]]]
+) -> Fit | None:
     """Make a few steps from each of several starts, and fit the best of them to convergence. None if its cost is more
-    than `_SURELY` times that of `fitted`."""
-    tried = [problem.fit(*one, _STEPS_TRIED, _ROUGHLY) for one in starts]
+    than `_CERTAIN_RISE` times that of `fitted`."""
+    tried = [problem.fit(*one, _STEPS_TRIED, _COARSE_TOLERANCE) for one in starts]
     best = min(tried, key=lambda one: one.cost, default=None)
-    if best is None or best.cost > _SURELY * fitted.cost:
+    if best is None or best.cost > _CERTAIN_RISE * fitted.cost:
         return None
     return problem.fit(best.bodies, best.coefficients, _STEPS)
 
 
 def _is_supported(problem: ShapeProblem, simple: Fit, other: Fit) -> bool:
     """Whether the evidence for `other` exceeds that for `simple` by the margin."""
-    return problem.surprise(other) + _MARGIN <= problem.surprise(simple)
+    return problem.surprise(other) + _MIN_EVIDENCE_GAIN <= problem.surprise(simple)
 
 
-def _changed(problem: ShapeProblem, found: _Found, least_rise: float) -> _Found:
+def _improve_fit(problem: ShapeProblem, found: _SearchResult, least_rise: float) -> _SearchResult:
     """Search for better bodies, starting once with a split and once with a change of kind; the likelier result, or
     `found` if neither change is supported."""
-    changes = [_in_two(problem, found.fit, least_rise), _otherwise(problem, found.fit)]
-    ways = [_searched(problem, found, one, least_rise) for one in changes if one is not None] or [found]
+    changes = [_split_bodies(problem, found.fit, least_rise), _alternative_fits(problem, found.fit)]
+    ways = [_search_until_stable(problem, found, one, least_rise) for one in changes if one is not None] or [found]
     return min(ways, key=lambda one: problem.surprise(one.fit))
 
 
-def _searched(problem: ShapeProblem, found: _Found, changed: Fit, least_rise: float) -> _Found:
+def _search_until_stable(problem: ShapeProblem, found: _SearchResult, changed: Fit, least_rise: float) -> _SearchResult:
     """Search onwards from the bodies `changed`: remove ghosts, then split a body or, if no split is supported, change
     a kind, until no change is supported."""
     for _ in range(_MOST_CHANGES):
-        found = _without_ghosts(problem, changed, found.doubtful, least_rise)
-        change = _in_two(problem, found.fit, least_rise) or _otherwise(problem, found.fit)
+        found = _remove_unsupported(problem, changed, found.doubtful, least_rise)
+        change = _split_bodies(problem, found.fit, least_rise) or _alternative_fits(problem, found.fit)
         if change is None:
             break
         changed = change

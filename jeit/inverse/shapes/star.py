@@ -131,7 +131,7 @@ class Star(eqx.Module):
         return cross.sum() / 2, (self.outline + np.roll(self.outline, -1, axis=0)).T @ cross / 6
 
 
-class _Values(NamedTuple):
+class _StarValues(NamedTuple):
     """Centre (x + iy, metres), log radius and `waves` aₙ - i bₙ of a star."""
 
     centre: complex
@@ -216,9 +216,9 @@ class Stars(Bodies):
         contrast = float(self.contrast(k, row)[0])
         return Star(int(self.sign[k]), middle, pair, contrast, bool(self.other[k]), float(rise))
 
-    def _values(self, k: int, row) -> _Values:
+    def _values(self, k: int, row) -> _StarValues:
         values = self.prior.deviation(self.span)[4:] * row[4:]
-        return _Values(complex(*self.centre(k, row)), self.log_radius(row), values[0::2] - 1j * values[1::2])
+        return _StarValues(complex(*self.centre(k, row)), self.log_radius(row), values[0::2] - 1j * values[1::2])
 
     def _wave(self, waves, direction):
         """Σ (aₙ cos nθ + bₙ sin nθ) and its derivative with respect to θ, for `direction` exp iθ; and the powers
@@ -257,11 +257,11 @@ def _first_crossing(centre: complex, direction, edges) -> tuple[Float[np.ndarray
     does not; and whether the closed line formed by the edges encloses `centre`."""
     start, along = edges[:, 0] - centre, edges[:, 1] - edges[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        across = _cross(direction[:, None], along)
-        distance, share = _cross(start, along) / across, _cross(start, direction[:, None]) / across
+        across = _cross_products(direction[:, None], along)
+        distance, share = _cross_products(start, along) / across, _cross_products(start, direction[:, None]) / across
     crossed = (distance > 0) & (share >= 0) & (share < 1)
     return np.where(crossed, distance, np.inf).min(axis=1), bool((crossed.sum(axis=1) % 2).mean() > 0.5)
 
 
-def _cross(one, other):
-    return (np.conj(one) * other).imag
+def _cross_products(first, second):
+    return (np.conj(first) * second).imag

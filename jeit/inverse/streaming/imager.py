@@ -24,7 +24,7 @@ from jeit.forward import ForwardModel
 from jeit.inverse.channels import IndependentChannels, Weighing
 from jeit.inverse.hyperparameter.rules import Rule
 from jeit.inverse.nonlinear.parametrisation import Parametrisation, as_parametrisation
-from jeit.inverse.nonlinear.problem import Inversion, check_background, check_frame, check_noise, informed
+from jeit.inverse.nonlinear.problem import Inversion, check_background, check_frame, check_noise, keep_informed_shapes
 from jeit.inverse.nonlinear.reconstruct import pose
 from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solver, expand, residual
 from jeit.inverse.prior.matern import smooth_prior
@@ -34,10 +34,10 @@ from jeit_solvers.engines import as_array
 FRAME_STEPS = 4
 """Default maximum number of iterations per frame."""
 # Default tolerance of the solver; default minimum signal of a shape (see `Parametrisation.informative`).
-_RTOL, _INFORMATIVE = 1e-3, 0.03
+_RTOL, _MIN_SIGNAL = 1e-3, 0.03
 # Ratio of the standard deviation assigned to masked channels to the largest noise. With a larger ratio, matrices of
 # combinations that only masked channels measure could not be inverted in double precision.
-_BLIND = 1e3
+_MASKED_NOISE_RATIO = 1e3
 
 
 def check_memory(memory) -> None:
@@ -145,7 +145,7 @@ class Imager(eqx.Module):
         prior = smooth_prior(float(np.ptp(np.asarray(model.mesh.points), axis=0).max())) if prior is None else prior
         check_prior(prior)
         parametrisation = as_parametrisation(parametrisation)
-        _check_together(chosen, prior, parametrisation, memory)
+        _check_combination(chosen, prior, parametrisation, memory)
         background = check_background(model, background)
         predicted = model.voltages(background)
         frame, used = check_frame(model, predicted if reference is None else reference, mask)
@@ -162,9 +162,9 @@ class Imager(eqx.Module):
             parametrisation,
         )
         persistence = float(np.exp(-1 / memory)) if memory > 0 else 0.0
-        least = _INFORMATIVE if parametrisation.informative is None else parametrisation.informative
+        least = _MIN_SIGNAL if parametrisation.informative is None else parametrisation.informative
         if (least > 0 or memory > 0) and inversion.penalty.is_standard_normal:
-            inversion = informed(inversion, least, persistence)
+            inversion = keep_informed_shapes(inversion, least, persistence)
         return cls(
             channels=channels,
             inversion=inversion,
@@ -215,7 +215,7 @@ class Imager(eqx.Module):
 
     def linear_map(self, weighing: Weighing) -> LinearMap:
         """Linear image of frames with this weighing: one Gauss-Newton step from the background."""
-        return _linear_map(self.inversion, weighing, self.offset, self.persistence)
+        return _compute_linear_map(self.inversion, weighing, self.offset, self.persistence)
 
     def estimate(self, frame: Float[Array, " M"], weighing: Weighing, start: Float[Array, " n"]) -> FrameEstimate:
         """Image of a frame (M,) in volts, computed by at most `steps` iterations from coefficients `start`.
@@ -223,10 +223,10 @@ class Imager(eqx.Module):
         With a memory, `start` is also the prior mean, `persistence` times the last image's coefficients. Unused
         channels must hold finite voltages, preferably those of the last frame.
         """
-        return _estimate(self, frame, weighing, start)
+        return _estimate_frame(self, frame, weighing, start)
 
 
-def _check_together(solver: AbstractSolver, prior: AbstractPrior, parametrisation: Parametrisation, memory) -> None:
+def _check_combination(solver: AbstractSolver, prior: AbstractPrior, parametrisation: Parametrisation, memory) -> None:
     """Raise `ValueError` for settings that need a covariance the prior does not have, or unbounded time."""
     if memory > 0 and not prior.is_quadratic:
         raise ValueError("memory: total variation has no covariance to carry on; take another prior, or memory 0.")
@@ -249,11 +249,11 @@ def _check_reference(measured, predicted) -> None:
 
 
 def _masked_noise(noise, used) -> Float[Array, " M"]:
-    return jnp.where(used, noise, _BLIND * jnp.max(jnp.where(used, noise, 0)))
+    return jnp.where(used, noise, _MASKED_NOISE_RATIO * jnp.max(jnp.where(used, noise, 0)))
 
 
 @functools.partial(jax.jit, static_argnames="persistence")
-def _linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: float) -> LinearMap:
+def _compute_linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: float) -> LinearMap:
     start = jnp.zeros(inversion.num_coefficients)
     posed = eqx.tree_at(lambda i: i.data, inversion, weighing.combine(offset))
     residual, jacobian = posed.linearise(start)
@@ -271,7 +271,7 @@ def _linear_map(inversion: Inversion, weighing: Weighing, offset, persistence: f
 
 
 @jax.jit
-def _estimate(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate:
+def _estimate_frame(imager: Imager, frame, weighing: Weighing, start) -> FrameEstimate:
     data = weighing.combine(frame + imager.offset)
     inversion = eqx.tree_at(lambda i: i.data, imager.inversion, data)
     expected = jnp.zeros_like(start)

@@ -22,16 +22,16 @@ _LARGEST_DIFFERENCE = 0.5
 # Relative difference from an undisturbed frame above which dead electrodes and saturation are looked for. An electrode
 # is dead if without its channels at most the second fraction of the difference is left, and if the median relative
 # change of its channels exceeds the third number.
-_SUSPICIOUS, _EXPLAINED, _LOST = 0.15, 0.5, 0.5
+_SUSPECT_FACTOR, _MAX_REMAINING_SHARE, _MIN_DEAD_CHANGE = 0.15, 0.5, 0.5
 # Minimum fraction of the channels in use that must be usable.
-_LEAST_CHANNELS = 0.5
+_MIN_CHANNELS = 0.5
 # Minimum number of channels with equal readings, above or below all others, that count as saturated; relative
 # difference within which their undisturbed voltages count as equal.
-_AT_RAIL, _ALIKE = 3, 1e-6
+_MIN_SATURATED, _EQUAL_EXPECTED = 3, 1e-6
 # A frame differs from an undisturbed one by more than noise if the correlation of the changes of reciprocal channels
 # exceeds that of independent noise. Threshold in standard deviations; minimum number of pairs; relative change of a
 # frame below which it counts as equal to the undisturbed one.
-_CHANCE, _FEWEST_PAIRS, _EQUAL = 3.0, 10, 1e-12
+_CORRELATION_THRESHOLD, _MIN_PAIRS, _EQUAL_TOLERANCE = 3.0, 10, 1e-12
 
 
 class FrameStatus(StrEnum):
@@ -70,7 +70,7 @@ class FrameCheck:
         self.ratio = tied[1]
         self.trust = 1 / np.hypot(noise[self.first], noise[self.second] / self.ratio)
         self.size = np.linalg.norm(expected[mask])
-        self.ordinary = (_SUSPICIOUS * self.size) ** 2
+        self.ordinary = (_SUSPECT_FACTOR * self.size) ** 2
 
     @np.errstate(over="ignore")  # a frame whose square overflows is treated as faulty
     def __call__(self, frame):
@@ -83,14 +83,14 @@ class FrameCheck:
     def _reason_unchanged(self, values, usable) -> str:
         """Sentence that says that a frame differs from an undisturbed one by noise only; empty if it does not."""
         change = np.where(usable, values - self.expected, 0)
-        if np.linalg.norm(change) <= _EQUAL * self.size:
+        if np.linalg.norm(change) <= _EQUAL_TOLERANCE * self.size:
             return "It equals an undisturbed frame."
         both = usable[self.first] & usable[self.second]
-        if np.count_nonzero(both) < _FEWEST_PAIRS:
+        if np.count_nonzero(both) < _MIN_PAIRS:
             return ""
         one, other = (self.trust * change[self.first])[both], (self.trust * change[self.second] / self.ratio)[both]
         alike = 2 * (one @ other) / (one @ one + other @ other)
-        if alike * np.sqrt(len(one)) > _CHANCE:
+        if alike * np.sqrt(len(one)) > _CORRELATION_THRESHOLD:
             return ""
         return "Nothing but noise: reciprocal channels change alike as by chance."
 
@@ -113,7 +113,7 @@ class FrameCheck:
         finite = np.isfinite(values)
         usable = self.mask if finite.all() else self.mask & finite
         count = np.count_nonzero(usable)
-        if count < _LEAST_CHANNELS * np.count_nonzero(self.mask):
+        if count < _MIN_CHANNELS * np.count_nonzero(self.mask):
             return (
                 values,
                 usable,
@@ -124,7 +124,7 @@ class FrameCheck:
             return values, none, FrameStatus.REFUSED, "All channels read zero; the current source has failed."
         difference = np.where(usable, values - self.expected, 0)
         relative = np.linalg.norm(difference) / self.size
-        if relative > _SUSPICIOUS:
+        if relative > _SUSPECT_FACTOR:
             usable, reason = self._without_dead_electrode(difference, usable)
             if reason:
                 return values, usable, FrameStatus.PARTIAL, reason
@@ -145,34 +145,34 @@ class FrameCheck:
         total = np.linalg.norm(difference)
         left = np.array([np.linalg.norm(difference[usable & ~touching]) for touching in self.touching])
         # An electrode whose removal leaves too few channels, such as a common reference, cannot be left out.
-        left[(usable & ~self.touching).sum(axis=1) < _LEAST_CHANNELS * self.mask.sum()] = np.inf
+        left[(usable & ~self.touching).sum(axis=1) < _MIN_CHANNELS * self.mask.sum()] = np.inf
         electrode = int(np.argmin(left))
         if not np.isfinite(left[electrode]):
             return usable, ""
         own, rest = usable & self.touching[electrode], usable & ~self.touching[electrode]
         read = own & (self.expected != 0)
-        lost = read.any() and np.median(np.abs(difference[read]) / np.abs(self.expected[read])) > _LOST
-        explained = left[electrode] <= min(_EXPLAINED * total, _LARGEST_DIFFERENCE * self.size)
+        lost = read.any() and np.median(np.abs(difference[read]) / np.abs(self.expected[read])) > _MIN_DEAD_CHANGE
+        explained = left[electrode] <= min(_MAX_REMAINING_SHARE * total, _LARGEST_DIFFERENCE * self.size)
         if not (lost and explained):
             return usable, ""
         return rest, f"Electrode {electrode + 1} seems to be dead; its channels are left out."
 
     def _at_rail(self, values, usable):
         """Channels (M,) at which the amplifier is saturated."""
-        far = np.abs(values - self.expected) > _SUSPICIOUS * np.abs(self.expected)
+        far = np.abs(values - self.expected) > _SUSPECT_FACTOR * np.abs(self.expected)
         rail = np.zeros_like(usable)
         for end in (values[usable].max(), values[usable].min()):
             same = usable & (values == end)
-            if np.count_nonzero(same) < _AT_RAIL or not end:
+            if np.count_nonzero(same) < _MIN_SATURATED or not end:
                 continue
             # Channels that are equal by symmetry, as in simulated frames, are also equal in the undisturbed frame.
-            if far[same].all() and np.ptp(self.expected[same]) > _ALIKE * np.abs(self.expected[same]).max():
+            if far[same].all() and np.ptp(self.expected[same]) > _EQUAL_EXPECTED * np.abs(self.expected[same]).max():
                 rail |= same
         return rail
 
     def _without_saturated(self, values, difference, usable, rail):
         rest, channels = usable & ~rail, counted(int(np.count_nonzero(rail)), "channel")
-        if np.count_nonzero(rest) < _LEAST_CHANNELS * np.count_nonzero(self.mask):
+        if np.count_nonzero(rest) < _MIN_CHANNELS * np.count_nonzero(self.mask):
             return values, rest, FrameStatus.REFUSED, f"Saturated: {channels} at the ends of the range."
         if np.linalg.norm(difference[rest]) > _LARGEST_DIFFERENCE * self.size:
             return values, rest, FrameStatus.REFUSED, f"Saturated: {channels}, and the others are far off too."
@@ -221,10 +221,10 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
     if isinstance(frames, (np.ndarray, jax.Array)) and frames.ndim != 2:
         raise ValueError(f"frames has shape {frames.shape}; give (frames, channels), or for one frame [frame].")
-    return _images(imager, frames)
+    return _image_frames(imager, frames)
 
 
-def _images(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
+def _image_frames(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     state = StreamState(imager)
     for number, frame in enumerate(frames):
         yield state.image(number, frame)

@@ -162,11 +162,11 @@ def clear_of_outline(front: Front, nodes: np.ndarray, points: np.ndarray, gap: n
 PROMISED_ANGLE = 25.0
 _REPAIR_ANGLE = 25.5
 _POLISH_ANGLE = 31.0
-_ROUNDS = 120
+_MAX_REPAIR_ROUNDS = 120
 
-_ANGLES = 2 * np.pi * np.arange(8) / 8
-_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
-_STEPS = np.concatenate([length * _DIRECTIONS for length in (0.02, 0.06, 0.15, 0.3)])
+_STEP_ANGLES = 2 * np.pi * np.arange(8) / 8
+_STEP_DIRECTIONS = np.stack([np.cos(_STEP_ANGLES), np.sin(_STEP_ANGLES)], axis=1)
+_TRIAL_STEPS = np.concatenate([length * _STEP_DIRECTIONS for length in (0.02, 0.06, 0.15, 0.3)])
 
 
 def improvable(front: Front, cells: np.ndarray) -> np.ndarray:
@@ -210,7 +210,7 @@ def polish(front: Front, passes: int = 4) -> None:
             second = points[around[np.arange(len(star)), (corner + 1) % 3]]
             third = points[around[np.arange(len(star)), (corner + 2) % 3]]
             reach = np.linalg.norm(second - points[node], axis=1).mean()
-            places = points[node] + np.concatenate([np.zeros((1, 2)), reach * _STEPS])
+            places = points[node] + np.concatenate([np.zeros((1, 2)), reach * _TRIAL_STEPS])
             shape = (len(places), len(star), 2)
             corners = np.stack(
                 [
@@ -237,7 +237,7 @@ def repair(front: Front) -> bool:
     J. Ruppert, J. Algorithms 18 (1995) 548: a node is inserted at the circumcentre of a bad cell, unless it would lie
     too close to an outline segment, which is halved instead. Many cells far enough from each other are treated at once.
     """
-    for round_number in range(_ROUNDS):
+    for round_number in range(_MAX_REPAIR_ROUNDS):
         points = front.points()
         cells = triangulate(front, points)
         missing = missing_segments(front, cells, len(points))
@@ -248,18 +248,18 @@ def repair(front: Front) -> bool:
         bad = np.flatnonzero((angle < _REPAIR_ANGLE) & improvable(front, cells))
         if not bad.size:
             return True
-        _refine(front, points, cells[bad], angle[bad])
+        _insert_circumcentres(front, points, cells[bad], angle[bad])
         if round_number % 3 == 2:
             polish(front, passes=2)
     return False
 
 
-def _diametral(front: Front, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _diametral_circles(front: Front, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ends = points[front.segments()]
     return ends.mean(axis=1), 0.5 * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
 
 
-def _divisible(front: Front) -> np.ndarray:
+def _is_divisible(front: Front) -> np.ndarray:
     """Whether each outline segment may be divided: neither of its ends is a sharp corner."""
     return np.logical_not(front.guarded()[front.segments()].any(axis=1))
 
@@ -267,23 +267,23 @@ def _divisible(front: Front) -> np.ndarray:
 def _recover(front: Front, points: np.ndarray, missing: np.ndarray, *, remove: bool) -> None:
     """Make missing outline segments appear: remove the free nodes close to them or, if there are none, halve the
     segments."""
-    middle, half = _diametral(front, points)
+    middle, half = _diametral_circles(front, points)
     if remove and len(front.free):
         near = KDTree(front.free).query_ball_point(middle[missing], half[missing])
         doomed = np.unique(np.concatenate([np.asarray(n, dtype=int) for n in near]))
         if doomed.size:
             front.free = np.delete(front.free, doomed, axis=0)
             return
-    divisible = _divisible(front)[missing]
+    divisible = _is_divisible(front)[missing]
     front.divide(missing[divisible])
 
 
-def _refine(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray) -> None:
+def _insert_circumcentres(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray) -> None:
     centre, radius = circumcircles(points, bad)
     chosen = select_apart(centre, radius, -angle)
     centre = centre[chosen]
-    middle, half = _diametral(front, points)
-    divisible = _divisible(front)
+    middle, half = _diametral_circles(front, points)
+    divisible = _is_divisible(front)
     # A segment is encroached upon if a new node lies in the circle whose diameter is the segment.
     near = KDTree(centre).query_ball_point(middle, half * (1 - 1e-9))
     encroached = np.array([len(n) > 0 for n in near])
@@ -304,10 +304,10 @@ def _refine(front: Front, points: np.ndarray, bad: np.ndarray, angle: np.ndarray
 
 # Maximum ratio of circumradius to cell size, chosen so that the mean edge equals the cell size (the ratio of an
 # equilateral triangle is 0.577).
-_FILLING = 0.74
+_RADIUS_PER_SIZE = 0.74
 _SMOOTHING_STEPS = 14
 # Angle below which a corner is cut off by a single isosceles cell: two cells there would be too thin.
-_SHARP = np.radians(75.0)
+_SHARP_CORNER = np.radians(75.0)
 
 
 def outline_nodes(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray, size: Size, guard: float) -> Front:
@@ -315,7 +315,7 @@ def outline_nodes(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarra
     all_stops, guards = [], []
     for curve, own in zip(curves, stops, strict=True):
         stop = np.unique(np.concatenate([curve.corners, own % curve.length]))
-        sharp = np.flatnonzero(curve.angles < _SHARP)
+        sharp = np.flatnonzero(curve.angles < _SHARP_CORNER)
         extra = []
         for corner in sharp:
             place = curve.corners[corner]
@@ -335,7 +335,7 @@ def fill(front: Front, size: Size) -> None:
         cells = triangulate(front, points)
         centre, radius = circumcircles(points, cells)
         wanted = size(centre)
-        large = radius > _FILLING * wanted
+        large = radius > _RADIUS_PER_SIZE * wanted
         centre, ratio, wanted = centre[large], (radius / wanted)[large], wanted[large]
         good = clear_of_outline(front, points, centre, 0.5 * wanted)
         if not good.any():

@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 from jeit.mesh.generate.curve import Curve, Size, within
 
 # Factor between successive trial numbers of nodes, and maximum number of nodes tried.
-_STEP, _MOST = 1.1, 2e6
+_TRIAL_FACTOR, _MAX_TRIAL_NODES = 1.1, 2e6
 
 
 class TooFewNodes(ValueError):
@@ -45,15 +45,15 @@ def nodes_of_solid(asked: int | None, in_plane: Callable[[int], int]) -> Iterato
         if asked is None:
             raise
         number = float(asked)
-        while in_plane(round(number)) < error.least and number < _MOST:
-            number *= _STEP
+        while in_plane(round(number)) < error.least and number < _MAX_TRIAL_NODES:
+            number *= _TRIAL_FACTOR
         least = float(f"{number:.2g}")
         raise ValueError(f"num_points: {error.solid.format(asked=asked, least=f'{least:.0f}')}") from None
 
 
 # Growth of the edge length per length away from nodes that lie close together, and in a size function given by the
 # user.
-_OWN_GROWTH = 0.45
+_USER_SIZE_GROWTH = 0.45
 
 
 class Refine(eqx.Module):
@@ -129,9 +129,9 @@ Refinement = Refine | Sequence[Refine] | Callable[[np.ndarray], np.ndarray] | No
 class SizeField:
     """Requested edge length at any point, for a given background cell size."""
 
-    def __init__(self, curves: list[Curve], refine: Refinement, held: np.ndarray, spacing: np.ndarray):
-        """`held` (k, 2): positions of required nodes; `spacing` (k,): distance of each of them to its nearest neighbour
-        or side.
+    def __init__(self, curves: list[Curve], refine: Refinement, required_nodes: np.ndarray, spacing: np.ndarray):
+        """`required_nodes` (k, 2): positions where nodes must be; `spacing` (k,): distance of each of them to its
+        nearest neighbour or side.
 
         Raises `ValueError` if `refine` contains anything but `Refine` objects.
         """
@@ -145,8 +145,8 @@ class SizeField:
                     raise ValueError(
                         f"refine: expected a Refine, several of them, or a function of points, got {term!r}."
                     )
-                self._terms.append((_distance_from(curves, term.points), term))
-        self._held = _close_nodes(held, spacing)
+                self._terms.append((_distance_function(curves, term.points), term))
+        self._required_size = _size_at_close_nodes(required_nodes, spacing)
         self._least_room = float(spacing.min()) if len(spacing) else np.inf
 
     @property
@@ -158,8 +158,8 @@ class SizeField:
         """Edge lengths (p,) at points (p, 2), as a function of the background cell size in metres. If the user gave a
         size function, the argument is instead the factor by which its sizes are multiplied."""
         if self._own is not None:
-            own, held = self._own(points), self._held(points)
-            return lambda factor: np.minimum(factor * own, held)
+            own, required = self._own(points), self._required_size(points)
+            return lambda factor: np.minimum(factor * own, required)
         apart = [np.maximum(distance(points) - term.distance, 0.0) for distance, term in self._terms]
 
         def size(background: float) -> np.ndarray:
@@ -167,34 +167,34 @@ class SizeField:
             for beyond, (_, term) in zip(apart, self._terms, strict=True):
                 result = np.minimum(result, term.smallest(background) + term.growth * beyond)
             # Required nodes that are farther apart than the background cell size need no refinement.
-            return result if background <= self._least_room else np.minimum(result, self._held(points))
+            return result if background <= self._least_room else np.minimum(result, self._required_size(points))
 
         return size
 
 
-def _distance_from(curves: list[Curve], points: np.ndarray | None) -> Callable[[np.ndarray], np.ndarray]:
+def _distance_function(curves: list[Curve], points: np.ndarray | None) -> Callable[[np.ndarray], np.ndarray]:
     if points is None:
         return lambda where: np.min([curve.distance(where) for curve in curves], axis=0)
     tree = KDTree(points)
     return lambda where: tree.query(where)[0]
 
 
-def _close_nodes(held: np.ndarray, spacing: np.ndarray) -> Size:
+def _size_at_close_nodes(required_nodes: np.ndarray, spacing: np.ndarray) -> Size:
     """Size function that limits cells at required nodes to the `spacing` there, growing away from them."""
-    if not len(held):
+    if not len(required_nodes):
         return lambda points: np.full(len(points), np.inf)
-    tree = KDTree(held)
-    count = min(8, len(held))
+    tree = KDTree(required_nodes)
+    count = min(8, len(required_nodes))
     if count > 1:
         # Propagate the spacing of distant nodes, so that the nearest few nodes suffice to evaluate the size.
         for _ in range(4):
-            apart, other = tree.query(held, k=count)
-            spacing = np.min(spacing[other] + _OWN_GROWTH * apart, axis=1)
+            apart, other = tree.query(required_nodes, k=count)
+            spacing = np.min(spacing[other] + _USER_SIZE_GROWTH * apart, axis=1)
 
     def size(points: np.ndarray) -> np.ndarray:
         apart, other = tree.query(points, k=count)
         apart, other = apart.reshape(len(points), count), other.reshape(len(points), count)
-        return np.min(spacing[other] + _OWN_GROWTH * apart, axis=1)
+        return np.min(spacing[other] + _USER_SIZE_GROWTH * apart, axis=1)
 
     return size
 
@@ -233,7 +233,7 @@ def limited(curves: list[Curve], function: Callable[[np.ndarray], Any], resoluti
     ]
     start = np.concatenate([a.ravel() for a, _, _ in links] + [np.full(len(inside), len(flat))])
     end = np.concatenate([b.ravel() for _, b, _ in links] + [inside])
-    weight = np.concatenate([np.full(a.size, _OWN_GROWTH * length) for a, _, length in links] + [values])
+    weight = np.concatenate([np.full(a.size, _USER_SIZE_GROWTH * length) for a, _, length in links] + [values])
     graph = coo_array((weight, (start, end)), shape=(len(flat) + 1,) * 2).tocsr()
     field = dijkstra(graph, directed=False, indices=len(flat))[:-1].reshape(shape)
     interpolate = scipy.interpolate.RegularGridInterpolator(axes, field)

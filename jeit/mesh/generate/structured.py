@@ -15,7 +15,7 @@ from jeit.mesh.generate.refine import TooFewNodes
 
 # Height of a row divided by the mean edge length along it: a value between 1 for squares and 0.87 for equilateral
 # triangles.
-_ROW = 0.93
+_ROW_HEIGHT = 0.93
 
 
 def zip_chains(outer: np.ndarray, inner: np.ndarray, *, closed: bool) -> np.ndarray:
@@ -82,9 +82,9 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
     if cell_size is not None:
         # A cell with base b and height 0.93 b has the area of an equilateral triangle with edge 1.036 b.
         cell_size = min(cell_size, width, height) / 1.036
-        return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_ROW * cell_size)))
-    edge = np.sqrt(width * height / (_ROW * num_points))
-    guess = height / (_ROW * edge)
+        return max(1, round(width / cell_size - 0.5)), max(1, round(height / (_ROW_HEIGHT * cell_size)))
+    edge = np.sqrt(width * height / (_ROW_HEIGHT * num_points))
+    guess = height / (_ROW_HEIGHT * edge)
     # With few nodes, accept a larger deviation from their number rather than stretched cells.
     enough = 0.03 if num_points > 200 else 0.1
     best = None
@@ -95,7 +95,7 @@ def choose_rows(width: float, height: float, num_points: int, cell_size: float |
                 continue
             total = (num_rows + 1) * (num_columns + 1) + odd
             miss = abs(total / num_points - 1.0)
-            stretch = abs(np.log(height / num_rows / (_ROW * width / (num_columns + 0.5))))
+            stretch = abs(np.log(height / num_rows / (_ROW_HEIGHT * width / (num_columns + 0.5))))
             cost = (stretch > 0.6, max(0.0, miss - enough), stretch)
             if best is None or cost < best[0]:
                 best = (cost, num_columns, num_rows)

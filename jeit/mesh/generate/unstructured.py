@@ -25,9 +25,9 @@ DEFAULT_NUM_POINTS = 1200
 # Maximum number of nodes of a mesh.
 MOST_POINTS = 1_000_000
 # Minimum distance between required nodes, relative to the length of the outline.
-_CLOSEST = 1e-6
+_MIN_NODE_DISTANCE = 1e-6
 # Tolerated relative error of the number of nodes before smoothing and repair, which may change the number slightly.
-_MISS = 0.02
+_NODE_COUNT_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
@@ -94,22 +94,25 @@ def mesh_within(
     Nodes are placed at `boundary_points`, arc lengths (k,) in metres on the first curve, and at `interior_points` (k,
     2) in metres. Raises `ValueError` for invalid or contradictory arguments.
     """
-    stops = [_merge(curve, own) for curve, own in zip(curves, _stops(curves, boundary_points), strict=True)]
+    stops = [
+        _merge_with_corners(curve, own)
+        for curve, own in zip(curves, _required_positions(curves, boundary_points), strict=True)
+    ]
     fixed = _check_interior(interior_points, curves)
-    field = SizeField(curves, refine, *_room(curves, stops, fixed))
+    field = SizeField(curves, refine, *_required_spacing(curves, stops, fixed))
     front = None
     if target.cell_size is not None:
         size = partial(_capped_size_at if field.is_own else _size_at, field, target.cell_size)
-        check_total(_estimate(curves, size, area), "cell_size")
+        check_total(_estimate_num_nodes(curves, size, area), "cell_size")
     elif field.is_own and not target.asked:
         size = partial(_size_at, field, 1.0)
-        check_total(_estimate(curves, size, area), "refine")
+        check_total(_estimate_num_nodes(curves, size, area), "refine")
     else:
-        size, front = _fit(curves, stops, fixed, field, target.num_points, area)
+        size, front = _fit_cell_size(curves, stops, fixed, field, target.num_points, area)
     return Mesh.create(*_triangulate.generate(curves, stops, fixed, size, front))
 
 
-def _stops(curves: list[Curve], boundary_points: ArrayLike | None) -> list[np.ndarray]:
+def _required_positions(curves: list[Curve], boundary_points: ArrayLike | None) -> list[np.ndarray]:
     """Arc lengths of required nodes on each curve, apart from its corners; a curve without corners has a node at its
     start."""
     stops = [np.zeros(0 if len(curve.corners) else 1) for curve in curves]
@@ -126,14 +129,14 @@ def _capped_size_at(field: SizeField, cap: float, points: np.ndarray) -> np.ndar
     return np.minimum(field.at(points)(1.0), cap)
 
 
-def _merge(curve: Curve, own: np.ndarray) -> np.ndarray:
+def _merge_with_corners(curve: Curve, positions: np.ndarray) -> np.ndarray:
     """Merge required positions on a curve with its corners. Raises `ValueError` if two positions are too close to each
     other."""
-    stops = np.sort(np.concatenate([curve.corners, np.mod(own, curve.length)]))
+    stops = np.sort(np.concatenate([curve.corners, np.mod(positions, curve.length)]))
     if len(stops) < 2:
         return stops
     gaps = np.diff(np.append(stops, stops[0] + curve.length)) / curve.length
-    close = (gaps > 1e-9) & (gaps < _CLOSEST)
+    close = (gaps > 1e-9) & (gaps < _MIN_NODE_DISTANCE)
     if close.any():
         first = int(np.flatnonzero(close)[0])
         raise ValueError(
@@ -158,18 +161,18 @@ def _check_interior(interior_points: ArrayLike | None, curves: list[Curve]) -> n
     if fixed.ndim != 2 or fixed.shape[1] != 2 or not np.isfinite(fixed).all():
         raise ValueError(f"interior_points: expected finite coordinates of shape (k, 2), got shape {fixed.shape}.")
     apart = np.min([curve.distance(fixed) for curve in curves], axis=0)
-    bad = np.flatnonzero(~within(curves, fixed) | (apart < _CLOSEST * curves[0].length))
+    bad = np.flatnonzero(~within(curves, fixed) | (apart < _MIN_NODE_DISTANCE * curves[0].length))
     if bad.size:
         raise ValueError(
             f"interior_points: point {bad[0]} at {fixed[bad[0]].tolist()} does not lie inside the outline. Use "
             "boundary_points for nodes on it."
         )
-    if len(fixed) > 1 and KDTree(fixed).query(fixed, k=2)[0][:, 1].min() < _CLOSEST * curves[0].length:
+    if len(fixed) > 1 and KDTree(fixed).query(fixed, k=2)[0][:, 1].min() < _MIN_NODE_DISTANCE * curves[0].length:
         raise ValueError("interior_points: two points coincide or nearly so. Keep one of them.")
     return fixed
 
 
-def _room(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _required_spacing(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Positions (k, 2) of required nodes, and the distance (k,) of each to the nearest other one or to the nearest side
     that it does not lie on."""
     chains = [curve.at(stop) for curve, stop in zip(curves, stops, strict=True)]
@@ -194,7 +197,7 @@ def _room(curves: list[Curve], stops: list[np.ndarray], fixed: np.ndarray) -> tu
     return held, spacing
 
 
-def _sample(curves: list[Curve]) -> np.ndarray:
+def _interior_samples(curves: list[Curve]) -> np.ndarray:
     """Points of a regular grid that lie inside the domain."""
     outline = curves[0].at(np.linspace(0, curves[0].length, 400))
     axes = [np.linspace(outline[:, k].min(), outline[:, k].max(), 60) for k in (0, 1)]
@@ -202,16 +205,16 @@ def _sample(curves: list[Curve]) -> np.ndarray:
     return grid[within(curves, grid)]
 
 
-def _estimate(curves: list[Curve], size: Size, area: float) -> float:
+def _estimate_num_nodes(curves: list[Curve], size: Size, area: float) -> float:
     """Estimate the number of nodes of a mesh with this size function, from samples inside the domain and along its
     outline."""
-    total = area * float(np.mean(1.0 / size(_sample(curves)) ** 2))
+    total = area * float(np.mean(1.0 / size(_interior_samples(curves)) ** 2))
     for curve in curves:
         total += curve.length * float(np.mean(1.0 / size(curve.at(np.linspace(0, curve.length, 400)))))
     return total
 
 
-def _fit(
+def _fit_cell_size(
     curves: list[Curve],
     stops: list[np.ndarray],
     fixed: np.ndarray,
@@ -228,7 +231,7 @@ def _fit(
     first = num_points / 4 if num_points > 4000 else num_points
     value = float(np.sqrt(1.1 * area / first))
     if field.is_own:
-        value *= float(np.sqrt(np.mean(1.0 / field.at(_sample(curves))(1.0) ** 2)))
+        value *= float(np.sqrt(np.mean(1.0 / field.at(_interior_samples(curves))(1.0) ** 2)))
     best: tuple[float, Size, Front] | None = None
     for _ in range(6):
         size = partial(_size_at, field, value)
@@ -238,7 +241,7 @@ def _fit(
         miss = len(points) / num_points - 1.0
         if best is None or abs(miss) < best[0]:
             best = (abs(miss), size, front)
-        if abs(miss) < _MISS:
+        if abs(miss) < _NODE_COUNT_TOLERANCE:
             break
         cells = triangulate(front, points)
         value = _correct_background(
@@ -249,15 +252,15 @@ def _fit(
 
 
 def _correct_background(
-    size: Callable[[float], np.ndarray], weight: np.ndarray, value: float, miss: float, num_points: int
+    size: Callable[[float], np.ndarray], weight: np.ndarray, value: float, surplus: float, num_points: int
 ) -> float:
-    """Background size for which ∫ 1/h² is its value for the background size `value` divided by 1 + `miss`, where `miss`
-    is the relative surplus of nodes."""
+    """Background size for which ∫ 1/h² is its value for the background size `value` divided by 1 + `surplus`, where
+    `surplus` is the relative surplus of nodes."""
 
     def total(trial: float) -> float:
         return float(np.sum(weight / size(trial) ** 2))
 
-    wanted = total(value) / (1.0 + miss)
+    wanted = total(value) / (1.0 + surplus)
     if total(1e3 * value) > 1.1 * wanted:
         least = round(num_points * total(1e3 * value) / wanted)
         raise TooFewNodes(

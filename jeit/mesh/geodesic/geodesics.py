@@ -26,15 +26,15 @@ from jeit.mesh.mesh import Mesh
 
 # Minimum relative decrease of a distance that is propagated, and number of sources processed together, which limits the
 # memory for distances (s, n).
-_ENOUGH, _TOGETHER = 1e-10, 128
+_MIN_DECREASE, _SOURCES_PER_BATCH = 1e-10, 128
 # Maximum length of a path on a sphere, in radians: near the antipode the wave converges to a point.
-_FARTHEST = 2.6
+_MAX_SPHERE_ANGLE = 2.6
 # Tolerated disagreement between the distances at the corners of a triangle, as a fraction of its side, if they belong
 # to the same wave.
-_APART = 0.02
+_WAVE_TOLERANCE = 0.02
 # Maximum distance of given points from the surface, relative to the surface's extent: points on the other side of a
 # thick skin are accepted.
-_OFF = 0.25
+_MAX_OFF_SURFACE = 0.25
 
 
 class _Corners(NamedTuple):
@@ -65,17 +65,17 @@ class Geodesics(eqx.Module):
 
     @classmethod
     def create(cls, surface: Triangles | Mesh, face: str | None = None) -> "Geodesics":
-        """Create for a surface, or for a `face` of a shell as in `Triangles.of`. Raises `ValueError` as `Triangles.of`
-        does."""
+        """Prepare distances on a surface, or on the facets of a shell that have the tag `face`. Raises `ValueError` as
+        `Triangles.of` does."""
         triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
         cells, points = triangles.cells, triangles.points
         node, start, end = (np.roll(cells, -turn, axis=1).ravel() for turn in range(3))
-        local = _in_plane(points[start], points[end], points[node])
+        local = _triangle_coordinates(points[start], points[end], points[node])
         ends = np.concatenate([start, end])
         order = np.argsort(ends, kind="stable")
         first = np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=len(points)))])
         corners = _Corners(node, start, end, *local)
-        return cls(triangles, corners, _curvature(triangles, corners), first, order % len(node))
+        return cls(triangles, corners, _gaussian_curvature(triangles, corners), first, order % len(node))
 
     def distances(
         self,
@@ -90,26 +90,26 @@ class Geodesics(eqx.Module):
         Distances beyond `limit`, metres, and between disconnected parts are infinite. Raises `ValueError` for points
         farther from the surface than a quarter of its extent.
         """
-        begun = sources if isinstance(sources, SurfacePlaces) else self._nearest("sources", sources)
+        begun = sources if isinstance(sources, SurfacePlaces) else self._project("sources", sources)
         if isinstance(targets, SurfacePlaces) or targets is None:
             reached = targets
         else:
-            reached = self._nearest("targets", targets)
+            reached = self._project("targets", targets)
         found = []
-        for low in range(0, len(begun.triangle), _TOGETHER):
-            some = SurfacePlaces(*(getattr(begun, one)[low : low + _TOGETHER] for one in _FIELDS))
-            lengths, bent = self._from(some, limit)
-            found.append(lengths if reached is None else self._at(some, lengths, bent, reached))
+        for low in range(0, len(begun.triangle), _SOURCES_PER_BATCH):
+            some = SurfacePlaces(*(getattr(begun, one)[low : low + _SOURCES_PER_BATCH] for one in _PLACE_FIELDS))
+            lengths, bent = self._distances_to_nodes(some, limit)
+            found.append(lengths if reached is None else self._distances_in_triangles(some, lengths, bent, reached))
         found = np.concatenate(found) if found else np.zeros((0, 0))
         found[found > limit] = np.inf
         return found
 
-    def _nearest(self, name: str, places: ArrayLike) -> SurfacePlaces:
+    def _project(self, name: str, places: ArrayLike) -> SurfacePlaces:
         """Nearest points on the surface. Raises `ValueError` with the argument's `name` for points that are too far
         from it."""
         at = self.surface.nearest(places)
         extent = float(np.ptp(self.surface.points, axis=0).max())
-        lost = np.flatnonzero(~(at.away <= _OFF * extent))
+        lost = np.flatnonzero(~(at.away <= _MAX_OFF_SURFACE * extent))
         if lost.size:
             raise ValueError(
                 f"{name}: {lost.size} of {len(at.away)} lie off the surface, the first, at "
@@ -138,11 +138,13 @@ class Geodesics(eqx.Module):
             _, corner = self._opposite_corners(changed, np.zeros_like(changed))
             start, end, node = self.corners.start[corner], self.corners.end[corner], self.corners.node[corner]
             local = (part[corner] for part in self.corners[3:])
-            through, along = _distances_across(lengths[start], lengths[end], *local, joined=owner[start] == owner[end])
+            through, along = _distances_across(
+                lengths[start], lengths[end], *local, same_source=owner[start] == owner[end]
+            )
             changed = _lower_distances(lengths, owner, node, through, np.where(along, owner[start], owner[end]))
         return owner, lengths
 
-    def _from(self, sources: SurfacePlaces, limit: float):
+    def _distances_to_nodes(self, sources: SurfacePlaces, limit: float):
         """Distances (s, n) from the sources to all nodes, and mean curvatures (s, n) along the paths."""
         count = len(self.surface.points)
         lengths = np.full(len(sources.triangle) * count, np.inf)
@@ -159,7 +161,7 @@ class Geodesics(eqx.Module):
             through, by_start = _distances_across(lengths[start], lengths[end], *local, curvature=mean)
             node = self.corners.node[corner]
             place = source + node
-            lower = (through < (1 - _ENOUGH) * lengths[place]) & (through <= 2 * limit)
+            lower = (through < (1 - _MIN_DECREASE) * lengths[place]) & (through <= 2 * limit)
             place, through, node = place[lower], through[lower], node[lower]
             before = np.where(by_start, lengths[start], lengths[end])[lower]
             np.minimum.at(lengths, place, through)
@@ -184,20 +186,22 @@ class Geodesics(eqx.Module):
         and their distances. Only targets within `limit` in a straight line are considered."""
         begun = self.surface.nearest(sources)
         tree, found = KDTree(targets.points), []
-        for low in range(0, len(begun.triangle), _TOGETHER):
-            some = SurfacePlaces(*(getattr(begun, one)[low : low + _TOGETHER] for one in _FIELDS))
-            lengths, bent = self._from(some, limit)
+        for low in range(0, len(begun.triangle), _SOURCES_PER_BATCH):
+            some = SurfacePlaces(*(getattr(begun, one)[low : low + _SOURCES_PER_BATCH] for one in _PLACE_FIELDS))
+            lengths, bent = self._distances_to_nodes(some, limit)
             close = [np.asarray(one, int) for one in tree.query_ball_point(some.points, limit, return_sorted=True)]
             source = np.repeat(np.arange(len(close)), [len(one) for one in close])
             every = np.concatenate(close) if close else np.zeros(0, int)
-            at = SurfacePlaces(*(getattr(targets, one)[every] for one in _FIELDS))
-            length = self._at(some, lengths, bent, at, source)
+            at = SurfacePlaces(*(getattr(targets, one)[every] for one in _PLACE_FIELDS))
+            length = self._distances_in_triangles(some, lengths, bent, at, source)
             ends = np.cumsum([len(one) for one in close])[:-1]
             for index, own in zip(np.split(every, ends), np.split(length, ends), strict=True):
                 found.append((index[own < limit], own[own < limit]))
         return found
 
-    def _at(self, sources: SurfacePlaces, lengths: Float[np.ndarray, "s n"], bent, targets: SurfacePlaces, source=None):
+    def _distances_in_triangles(
+        self, sources: SurfacePlaces, lengths: Float[np.ndarray, "s n"], bent, targets: SurfacePlaces, source=None
+    ):
         """Distances (s, p) at points inside triangles; or (p,), if `source` gives the index of the source for each
         target."""
         cells = self.surface.cells[targets.triangle]
@@ -207,24 +211,24 @@ class Geodesics(eqx.Module):
         for first, second, third in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             ends = (of, cells[:, first]), (of, cells[:, second])
             start, end = (lengths[one] for one in ends)
-            side, x, y = _in_plane(corners[:, first], corners[:, second], targets.points)
+            side, x, y = _triangle_coordinates(corners[:, first], corners[:, second], targets.points)
             through, _ = _distances_across(start, end, side, x, y, curvature=(bent[ends[0]] + bent[ends[1]]) / 2)
             # Where paths from two directions meet, the distances at the ends of a side belong to different waves, and
             # contradict the distance at the third corner. The path is then taken through a corner.
             with np.errstate(invalid="ignore", over="ignore"):
-                seen, behind, _ = _origin(start, end, side)
-                _, across, off = _in_plane(corners[:, first], corners[:, second], corners[:, third])
+                seen, behind, _ = _virtual_source(start, end, side)
+                _, across, off = _triangle_coordinates(corners[:, first], corners[:, second], corners[:, third])
                 apart = np.hypot(across - seen, off + behind) - lengths[of, cells[:, third]]
             by_corner = start + np.sqrt(x**2 + y**2)
-            found = np.minimum(found, np.where(np.abs(apart) < _APART * side, through, by_corner))
+            found = np.minimum(found, np.where(np.abs(apart) < _WAVE_TOLERANCE * side, through, by_corner))
         straight = np.linalg.norm(sources.points[of] - targets.points, axis=-1)
         return np.where(sources.triangle[of] == targets.triangle, straight, found)
 
 
-_FIELDS = "triangle", "weights", "points", "away"
+_PLACE_FIELDS = "triangle", "weights", "points", "away"
 
 
-def _in_plane(start, end, corner):
+def _triangle_coordinates(start, end, corner):
     """Length of the side from `start` to `end`, and coordinates of the `corner`: x along the side from its start, and y
     perpendicular to it; metres, each (c,)."""
     side = np.linalg.norm(end - start, axis=-1)
@@ -232,25 +236,26 @@ def _in_plane(start, end, corner):
     return side, x, np.sqrt(np.maximum(((corner - start) ** 2).sum(axis=-1) - x**2, 0.0))
 
 
-def _distances_across(start, end, side, x, y, *, joined: Any = True, curvature: Any = 0.0):
+def _distances_across(start, end, side, x, y, *, same_source: Any = True, curvature: Any = 0.0):
     """Distances at corners, computed from the distances at the `start` and `end` of the opposite sides, and whether the
-    path through the start is the shorter one. Straight lines across a side count only if `joined`: the distances at
-    both of its ends are from the same source. `curvature`: mean Gaussian curvature along the path, 1/m²."""
+    path through the start is the shorter one. Paths across the interior of a side are considered only where
+    `same_source` is True, i.e. where the distances at both of its ends are from the same source. `curvature`: mean
+    Gaussian curvature along the path, 1/m²."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         along = np.sqrt(x**2 + y**2) + start
         back = np.sqrt((side - x) ** 2 + y**2) + end
-        seen, behind, off = _origin(start, end, side)
+        seen, behind, off = _virtual_source(start, end, side)
         crossing = (seen * y + x * behind) / np.where(behind + y > 0, behind + y, 1.0)
-        straight = (off >= 0) & (crossing >= 0) & (crossing <= side) & joined & (behind + y > 0)
+        straight = (off >= 0) & (crossing >= 0) & (crossing <= side) & same_source & (behind + y > 0)
         length = np.sqrt((x - seen) ** 2 + (y + behind) ** 2)
         # Difference between the sagitta of the wave front at the crossing and that of a front in the plane.
         square = (crossing - seen) ** 2 + off
         across = np.where(square > 0, off / np.where(square > 0, square, 1.0), 0.0)
-        length += 0.5 * _flatter(curvature, np.sqrt(square)) * across * crossing * (side - crossing)
+        length += 0.5 * _front_flattening(curvature, np.sqrt(square)) * across * crossing * (side - crossing)
     return np.where(straight, length, np.minimum(along, back)), along <= back
 
 
-def _origin(start, end, side):
+def _virtual_source(start, end, side):
     """Virtual source of a wave with given distances at the start and the end of a side: its coordinate along the side,
     its distance behind the side, and the square of this distance, which is negative for incompatible distances."""
     seen = (start**2 - end**2 + side**2) / (2 * side)
@@ -258,16 +263,17 @@ def _origin(start, end, side):
     return seen, np.sqrt(np.maximum(off, 0.0)), off
 
 
-def _flatter(curvature, length):
-    """1/length - κ, in 1/m, where κ is the curvature of the wave front after a path of this length on a surface of
-    Gaussian curvature K: √K cot(√K length) on a sphere, with the hyperbolic cotangent for negative K."""
+def _front_flattening(curvature, length):
+    """1/length - κ, in 1/m, where κ is the curvature of the wave front after a path of this `length`, metres, on a
+    surface of Gaussian curvature K = `curvature`, 1/m²: κ = √K cot(√K length), with the hyperbolic cotangent for
+    negative K."""
     angle = np.sqrt(np.abs(curvature)) * length
-    small, round_, saddle = angle < 1e-3, np.clip(angle, 1e-3, _FARTHEST), np.clip(angle, 1e-3, 10.0)
+    small, round_, saddle = angle < 1e-3, np.clip(angle, 1e-3, _MAX_SPHERE_ANGLE), np.clip(angle, 1e-3, 10.0)
     share = np.where(curvature > 0, 1 - round_ / np.tan(round_), 1 - saddle / np.tanh(saddle))
     return np.where(small, curvature * length / 3, share / np.where(small, 1.0, length))
 
 
-def _curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]:
+def _gaussian_curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]:
     """Gaussian curvature (n,) at the nodes, 1/m²: angle defect, i.e. 2π minus the sum of the angles at the node,
     divided by a third of the area of its triangles; both are averaged over two rings of neighbours. Nodes on the border
     do not contribute."""
@@ -290,7 +296,7 @@ def _curvature(surface: Triangles, corners: _Corners) -> Float[np.ndarray, " n"]
 def _lower_distances(lengths, owner, nodes, through, number) -> np.ndarray:
     """Lower the distances of `nodes` to the minimum of the new distances `through`, and store the owner's index.
     Returns the nodes whose distance has decreased."""
-    lower = through < (1 - _ENOUGH) * lengths[nodes]
+    lower = through < (1 - _MIN_DECREASE) * lengths[nodes]
     nodes, through, number = nodes[lower], through[lower], number[lower]
     order = np.lexsort((through, nodes))
     changed, first = np.unique(nodes[order], return_index=True)

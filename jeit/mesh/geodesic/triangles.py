@@ -67,12 +67,12 @@ class Triangles(eqx.Module):
     @property
     def areas(self) -> Float[np.ndarray, " m"]:
         """Areas of the triangles, m²."""
-        return np.linalg.norm(self._crossed, axis=1) / 2
+        return np.linalg.norm(self._edge_cross_products, axis=1) / 2
 
     @property
     def normals(self) -> Float[np.ndarray, "m 3"]:
         """Outward unit normals of the triangles."""
-        return self._crossed / np.linalg.norm(self._crossed, axis=1, keepdims=True)
+        return self._edge_cross_products / np.linalg.norm(self._edge_cross_products, axis=1, keepdims=True)
 
     @property
     def node_areas(self) -> Float[np.ndarray, " n"]:
@@ -83,7 +83,7 @@ class Triangles(eqx.Module):
     def node_normals(self) -> Float[np.ndarray, "n 3"]:
         """Outward unit normals at the nodes: area-weighted means of the normals of the triangles."""
         summed = np.zeros_like(self.points)
-        np.add.at(summed, self.cells, self._crossed[:, None])
+        np.add.at(summed, self.cells, self._edge_cross_products[:, None])
         return summed / np.linalg.norm(summed, axis=1, keepdims=True)
 
     @property
@@ -94,7 +94,7 @@ class Triangles(eqx.Module):
         return edges[first[counts == 1]]
 
     @property
-    def _crossed(self) -> Float[np.ndarray, "m 3"]:
+    def _edge_cross_products(self) -> Float[np.ndarray, "m 3"]:
         corners = self.corners
         return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 

@@ -1,9 +1,10 @@
-"""`unfold`: the triangles of a surface around a point, laid into the plane of the triangle that contains the point.
+"""`unfold`: the triangles of a surface around a point, unfolded into the plane of the triangle that contains the point.
 
-Starting at this triangle, each next triangle is rotated about the side that it shares with the previous one, along the
-path that crosses the fewest triangles. On a developable surface, such as a bent sheet, the result does not depend on
-the path, and straight lines in the plane are exactly the geodesics on the triangles. On other surfaces the result
-depends on the path, and the points where it does are reported. The functions take arrays of NumPy or JAX and can be
+The triangle that contains the point keeps its place. Every other triangle is connected to it by the path that crosses
+the fewest triangles, and is rotated about the side that it shares with the previous triangle of this path, until it
+lies in the same plane. On a developable surface, such as a bent sheet, the result does not depend on the path, and
+straight lines in the plane are exactly the geodesics on the triangles. On other surfaces the result depends on the
+path; `Unfolding.exact` is False for the points where it does. The functions take NumPy or JAX arrays and can be
 differentiated and batched.
 """
 
@@ -19,18 +20,20 @@ from jeit_solvers.engines import has_values, namespace, on_host, sum_into, undif
 
 # Maximum deviation, in radians, of the sum of angles around a node from a full turn on a developable surface: it allows
 # for rounding of float32 files and steps of finite differences.
-_FLAT = 1e-4
-# Maximum number of rounds in which paths are concatenated in pairs: paths of up to 128 triangles.
-_JOININGS = 7
+_ANGLE_TOLERANCE = 1e-4
+# Number of times that the length of the paths is doubled by composing their transforms: paths of up to 2⁷ = 128
+# triangles.
+_MAX_DOUBLINGS = 7
 
 
 class Unfolding(NamedTuple):
     """Unfolded triangles around L points on a surface of m triangles; lengths in metres.
 
     **Fields**: `corners` (m, 3, 2): corners of each triangle in its own plane; `turn` (L, m, 2): cosine and sine of the
-    rotation, and `shift` (L, m, 2): translation, from that plane into the plane of the triangle that contains each
-    point; `place` (L, 2): position of each point in the latter plane; `reached` (L, m): whether a triangle is unfolded
-    around a point; `exact` (L,): whether the reached triangles are developable and at most 128 triangles away.
+    angle by which they are rotated, and `shift` (L, m, 2): the vector by which they are then translated, to come to lie
+    in the plane of the triangle that contains each point; `place` (L, 2): position of each point in this plane;
+    `reached` (L, m): whether a triangle is unfolded around a point; `exact` (L,): whether the reached triangles are
+    developable and at most 128 triangles away.
     """
 
     corners: Float[Array, "m 3 2"]
@@ -51,58 +54,58 @@ class Unfolding(NamedTuple):
         return (laid**2).sum(axis=-1)
 
 
-def unfold(mesh: Mesh, places: Float[Array, "L 3"], reach: Float[Array, "L m"]) -> Unfolding:
-    """Unfold the triangles whose centroids lie within a straight distance of `reach` metres of points `places` on the
-    surface and which are connected to the point's own triangle."""
+def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "L m"]) -> Unfolding:
+    """Unfold the triangles whose centroids lie within a straight distance of `max_distance` metres of points `places`
+    on the surface and which are connected to the point's own triangle."""
     xp = namespace(mesh, places)
     corners = xp.asarray(mesh.points[mesh.cells])
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     along = first / xp.sqrt((first**2).sum(axis=1, keepdims=True))
-    out = xp.cross(first, second)
-    out = out / xp.sqrt((out**2).sum(axis=1, keepdims=True))
-    axes = xp.stack([along, xp.cross(out, along)], axis=1)
+    normal = xp.cross(first, second)
+    normal = normal / xp.sqrt((normal**2).sum(axis=1, keepdims=True))
+    axes = xp.stack([along, xp.cross(normal, along)], axis=1)
     local = xp.einsum("mid,mad->mia", corners - corners[:, :1], axes)
-    frames = corners[:, 0], axes, out
-    root = _triangles_of(undifferentiated(places), *undifferentiated((frames, local)))
-    away = undifferentiated(((places[:, None] - corners.mean(axis=1)) ** 2).sum(axis=-1))
+    frames = corners[:, 0], axes, normal
+    root = _containing_triangles(undifferentiated(places), *undifferentiated((frames, local)))
+    squared_distance = undifferentiated(((places[:, None] - corners.mean(axis=1)) ** 2).sum(axis=-1))
     # If the values are known, compute on the host: XLA would take seconds to evaluate a sort of constants.
-    twin, cell = xp.asarray(_twins(on_host(mesh.cells))), xp.arange(len(corners))
-    reached, side = _hang_together(twin // 3, away <= undifferentiated(reach) ** 2, root)
-    half = 3 * cell + side
-    before = xp.where(side < 0, cell, twin[half] // 3)
-    turn, shift = (one[half] for one in _over_sides(local, twin))
-    known = (side >= 0)[..., None]
-    turn, shift = xp.where(known, turn, xp.array([1.0, 0.0])), xp.where(known, shift, 0.0)
-    turn, shift, last = _concatenate_steps(before, turn, shift)
+    opposite, cell = xp.asarray(_opposite_sides(on_host(mesh.cells))), xp.arange(len(corners))
+    reached, side = _connect(opposite // 3, squared_distance <= undifferentiated(max_distance) ** 2, root)
+    side_index = 3 * cell + side
+    previous = xp.where(side < 0, cell, opposite[side_index] // 3)
+    turn, shift = (transform[side_index] for transform in _transforms_across_sides(local, opposite))
+    has_previous = (side >= 0)[..., None]
+    turn, shift = xp.where(has_previous, turn, xp.array([1.0, 0.0])), xp.where(has_previous, shift, 0.0)
+    turn, shift, last = _compose_transforms(previous, turn, shift)
     place = xp.einsum("ld,lad->la", places - corners[root, 0], axes[root])
-    curved = _curved(undifferentiated(local), mesh.cells, twin, mesh.num_points)
+    curved = _is_curved(undifferentiated(local), mesh.cells, opposite, mesh.num_points)
     lost = reached & (curved | (last != root[:, None]))
     return Unfolding(local, turn, shift, place, reached, ~lost.any(axis=1))
 
 
 def _rotate(turn, points):
-    """Rotate points (…, 2) by angles with the cosine and sine `turn` (…, 2)."""
+    """Rotate points (…, 2) in the plane. `turn` (…, 2): cosine and sine of each angle."""
     cos, sin = turn[..., 0], turn[..., 1]
     x, y = points[..., 0], points[..., 1]
     return namespace(turn, points).stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
-def _triangles_of(places, frames, local) -> Int[Array, " L"]:
+def _containing_triangles(places, frames, local) -> Int[Array, " L"]:
     """Index of the triangle that contains each point: the nearest one, by height above its plane and distance outside
     it."""
     xp = namespace(places, local)
-    origin, axes, out = frames
+    origin, axes, normal = frames
     offset = places[:, None] - origin
     x, y = xp.moveaxis(xp.einsum("lmd,mad->lma", offset, axes), -1, 0)
     third = y / local[:, 2, 1]
     second = (x - third * local[:, 2, 0]) / local[:, 1, 0]
     outside = xp.maximum(-xp.minimum(xp.minimum(second, third), 1 - second - third), 0) * local[:, 1, 0]
-    return ((offset * out).sum(axis=-1) ** 2 + outside**2).argmin(axis=1)
+    return ((offset * normal).sum(axis=-1) ** 2 + outside**2).argmin(axis=1)
 
 
-def _twins(cells) -> Int[Array, " h"]:
-    """For each side of each triangle, with index 3 cell + number, the index of the same side in the neighbouring
-    triangle; at the border, the side's own index."""
+def _opposite_sides(cells) -> Int[Array, " h"]:
+    """For each side of each triangle, the index of the same side in the neighbouring triangle; at the border, the
+    side's own index. The index of side k (0, 1, 2) of triangle c is 3 c + k."""
     xp = namespace(cells)
     start, end = cells.reshape(-1), xp.roll(cells, -1, axis=1).reshape(-1)
     low, high = xp.minimum(start, end), xp.maximum(start, end)
@@ -114,56 +117,57 @@ def _twins(cells) -> Int[Array, " h"]:
     return other[xp.argsort(order)]
 
 
-def _hang_together(neighbour, near: Bool[Array, "L m"], root):
-    """Whether the triangles `near` each point can be reached from the triangle `root` (L,) across sides, and the number
-    of the side (L, m) of each that leads back to it; −1 for the root and for triangles that are not reached."""
+def _connect(neighbour, near: Bool[Array, "L m"], root):
+    """Find the triangles `near` each point that are connected to the triangle `root` (L,) across sides. Returns whether
+    each triangle (L, m) is connected, and the number of its side (L, m) that leads towards the root; −1 for the root
+    itself and for triangles that are not connected."""
     xp = namespace(neighbour, near)
     cell = xp.arange(near.shape[1])
     neighbour = neighbour.reshape(-1, 3)
     begun = cell == root[:, None]
 
-    def grown(state):
+    def grow(state):
         reached, side, _ = state
         there = reached[:, neighbour]
         new = near & ~reached & there.any(axis=-1)
         return reached | new, xp.where(new, there.argmax(axis=-1).astype(int), side), new.any()
 
     some = xp.ones((), bool)
-    reached, side, _ = while_loop(lambda state: state[2], grown, (begun, xp.full(near.shape, -1, int), some))
+    reached, side, _ = while_loop(lambda state: state[2], grow, (begun, xp.full(near.shape, -1, int), some))
     return reached, side
 
 
-def _over_sides(local, twin):
+def _transforms_across_sides(local, opposite):
     """Rotation (h, 2) and translation (h, 2) from the plane of each side's triangle into that of the neighbour."""
     xp = namespace(local)
     start, end = local.reshape(-1, 2), xp.roll(local, -1, axis=1).reshape(-1, 2)
-    own, other = end - start, start[twin] - end[twin]
+    own, other = end - start, start[opposite] - end[opposite]
     turn = xp.stack([(own * other).sum(axis=1), own[:, 0] * other[:, 1] - own[:, 1] * other[:, 0]], axis=1)
     turn = turn / xp.sqrt((turn**2).sum(axis=1, keepdims=True))
-    return turn, end[twin] - _rotate(turn, start)
+    return turn, end[opposite] - _rotate(turn, start)
 
 
-def _concatenate_steps(before, turn, shift):
-    """Concatenate the steps from each triangle into the one `before` it (L, m). Returns the rotation and translation of
-    the whole path, and the triangle where it ends."""
-    xp = namespace(before, turn)
-    row = xp.arange(len(before))[:, None]
-    for _ in range(_JOININGS):
-        then, moved = turn[row, before], shift[row, before]
+def _compose_transforms(previous, turn, shift):
+    """Compose the rotations and translations along the path from each triangle to the root. `previous` (L, m): next
+    triangle on that path. Returns the rotation and translation for the whole path, and the triangle where it ends."""
+    xp = namespace(previous, turn)
+    row = xp.arange(len(previous))[:, None]
+    for _ in range(_MAX_DOUBLINGS):
+        then, moved = turn[row, previous], shift[row, previous]
         turn, shift = _rotate(then, turn), _rotate(then, shift) + moved
-        before = before[row, before]
-        if has_values(before) and (before[row, before] == before).all():
+        previous = previous[row, previous]
+        if has_values(previous) and (previous[row, previous] == previous).all():
             break
-    return turn, shift, before
+    return turn, shift, previous
 
 
-def _curved(local, cells, twin, number: int) -> Bool[Array, " m"]:
+def _is_curved(local, cells, opposite, num_nodes: int) -> Bool[Array, " m"]:
     """For each triangle, whether the angles around one of its corners inside the surface do not sum to a full turn."""
     xp = namespace(local, cells)
     ahead, back = xp.roll(local, -1, axis=1) - local, xp.roll(local, 1, axis=1) - local
     angle = xp.arctan2(ahead[..., 0] * back[..., 1] - ahead[..., 1] * back[..., 0], (ahead * back).sum(axis=-1))
-    round_node = sum_into((number,), (cells,), angle)
-    edge = (twin == xp.arange(len(twin))).reshape(-1, 3)
-    ends = sum_into((number,), (cells,), 1.0 * (edge | xp.roll(edge, 1, axis=1)))
-    bent = (abs(round_node - 2 * np.pi) > _FLAT) & (ends == 0)
+    round_node = sum_into((num_nodes,), (cells,), angle)
+    edge = (opposite == xp.arange(len(opposite))).reshape(-1, 3)
+    ends = sum_into((num_nodes,), (cells,), 1.0 * (edge | xp.roll(edge, 1, axis=1)))
+    bent = (abs(round_node - 2 * np.pi) > _ANGLE_TOLERANCE) & (ends == 0)
     return bent[cells].any(axis=1)

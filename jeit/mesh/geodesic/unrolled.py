@@ -22,9 +22,9 @@ from scipy.sparse.linalg import factorized
 from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
 from jeit.mesh.mesh import Mesh
 
-_ROUNDS = 60
+_RIGID_ITERATIONS = 60
 # Minimum slope of a coordinate in space, in metres per metre on the flat surface, for its use as the upward direction.
-_UP = 0.3
+_MIN_UPWARD_SLOPE = 0.3
 
 
 class Unrolled(eqx.Module):
@@ -65,8 +65,8 @@ class Unrolled(eqx.Module):
 
     @property
     def _edges(self):
-        ends = _border_of(self.cells)
-        return ends, ~_among(np.sort(self.nodes[ends], axis=1), np.sort(self.surface.border, axis=1))
+        ends = _border_edges(self.cells)
+        return ends, ~_is_among(np.sort(self.nodes[ends], axis=1), np.sort(self.surface.border, axis=1))
 
     def flat(self, places: ArrayLike | SurfacePlaces) -> Float[np.ndarray, "p 2"]:
         """Positions (p, 2) on the flat surface, metres, of points (p, 3) on the surface, metres."""
@@ -81,12 +81,12 @@ def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut: ArrayLike
     `ValueError` as `Triangles.of` does, and for surfaces with handles or disconnected parts.
     """
     triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
-    cells, nodes = _cut_open(triangles, cut)
+    cells, nodes = _cut_to_disk(triangles, cut)
     corners = triangles.corners
     local = _plane_corners(corners)
-    points = _conformal(cells, local, len(nodes))
-    points = _rigid(cells, local, points)
-    points = _upright(points, triangles.points[nodes])
+    points = _conformal_map(cells, local, len(nodes))
+    points = _flatten_rigidly(cells, local, points)
+    points = _turn_upright(points, triangles.points[nodes])
     flat = _edges(points[cells]) @ np.linalg.inv(_edges(local))
     return Unrolled(triangles, cells, points, nodes, np.linalg.svd(flat, compute_uv=False)[:, ::-1])
 
@@ -105,9 +105,9 @@ def _edges(triangles: Float[np.ndarray, "m 3 2"]) -> Float[np.ndarray, "m 2 2"]:
     return np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=2)
 
 
-def _conformal(cells, local, count: int) -> np.ndarray:
+def _conformal_map(cells, local, count: int) -> np.ndarray:
     """Least-squares conformal map, which preserves angles as well as possible; the two farthest nodes are fixed."""
-    held = _far_apart(cells, local, count)
+    held = _farthest_nodes(cells, local, count)
     w = np.stack([local[:, 2] - local[:, 1], local[:, 0] - local[:, 2], local[:, 1] - local[:, 0]], axis=1)
     w = w / np.sqrt(np.abs(np.linalg.det(_edges(local))))[:, None, None]
     row = np.repeat(np.arange(len(cells)), 3)
@@ -126,7 +126,7 @@ def _conformal(cells, local, count: int) -> np.ndarray:
     return found.reshape(2, -1).T
 
 
-def _far_apart(cells, local, count: int):
+def _farthest_nodes(cells, local, count: int):
     """Two nodes far from each other, and their distance along edges."""
     length = np.linalg.norm(local[:, [1, 2, 0]] - local, axis=2)
     start, end = cells.ravel(), cells[:, [1, 2, 0]].ravel()
@@ -136,7 +136,7 @@ def _far_apart(cells, local, count: int):
     return first, int(np.argmax(lengths)), float(lengths.max())
 
 
-def _rigid(cells, local, points: np.ndarray) -> np.ndarray:
+def _flatten_rigidly(cells, local, points: np.ndarray) -> np.ndarray:
     """Flatten as rigidly as possible: alternately fit a rotation of each triangle to the map, and the nodes to the
     rotated triangles."""
     count = len(points)
@@ -151,7 +151,7 @@ def _rigid(cells, local, points: np.ndarray) -> np.ndarray:
     w = weight.ravel()
     matrix = scipy.sparse.csc_array((np.concatenate([w, w, -w, -w]), (rows, columns)), shape=(count, count))
     solve = factorized(matrix[1:, 1:].tocsc())
-    for _ in range(_ROUNDS):
+    for _ in range(_RIGID_ITERATIONS):
         drawn = points[end] - points[start]
         moment = np.einsum("mk,mki,mkj->mij", weight, drawn, edge)
         u, _, v = np.linalg.svd(moment)
@@ -169,35 +169,35 @@ def _rigid(cells, local, points: np.ndarray) -> np.ndarray:
     return points
 
 
-def _upright(points: np.ndarray, space: np.ndarray) -> np.ndarray:
+def _turn_upright(points: np.ndarray, space: np.ndarray) -> np.ndarray:
     """Rotate so that z points upward, or y or x if z has little slope, and centre at the origin. The map is not
     mirrored, since the surface is seen from outside."""
     points = points - points.mean(axis=0)
     for axis in (2, 1, 0):
         height = space[:, axis] - space[:, axis].mean()
         (a, b), *_ = np.linalg.lstsq(points, height, rcond=None)
-        if np.hypot(a, b) > _UP:
+        if np.hypot(a, b) > _MIN_UPWARD_SLOPE:
             c, s = np.array([b, a]) / np.hypot(a, b)
             return points @ np.array([[c, s], [-s, c]])
     return points
 
 
-def _border_of(cells) -> np.ndarray:
+def _border_edges(cells) -> np.ndarray:
     edges = cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
     return edges[first[counts == 1]]
 
 
-def _among(edges, others) -> np.ndarray:
+def _is_among(edges, others) -> np.ndarray:
     size = 1 + max(edges.max(initial=0), others.max(initial=0))
     return np.isin(edges[:, 0] * size + edges[:, 1], others[:, 0] * size + others[:, 1])
 
 
-def _cut_open(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
+def _cut_to_disk(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
     """Cut a surface so that it becomes a disk. Returns its triangles, and for each new node the original node."""
     cells, count = surface.cells, len(surface.points)
     border = surface.border
-    loops, label = _loops(border, count)
+    loops, label = _border_loops(border, count)
     edges = np.unique(np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
     euler = count - len(edges) + len(cells)
     graph = scipy.sparse.csr_array((np.ones(len(edges)), edges.T), shape=(count, count))
@@ -216,11 +216,11 @@ def _cut_open(surface: Triangles, cut) -> tuple[np.ndarray, np.ndarray]:
     else:
         axis = int(np.argmax(np.ptp(points, axis=0)))
         ends = np.array([points[:, axis].argmin()]), np.array([points[:, axis].argmax()])
-    path = _way(points, edges, ends, cut, border)
-    return _split(cells, path, count, closed=loops == 0)
+    path = _path_along_edges(points, edges, ends, cut, border)
+    return _split_along_path(cells, path, count, closed=loops == 0)
 
 
-def _loops(border, count: int):
+def _border_loops(border, count: int):
     """Number of loops of the border, and the index of the loop of each border edge."""
     if not len(border):
         return 0, np.zeros(0, int)
@@ -230,7 +230,7 @@ def _loops(border, count: int):
     return len(kinds), label
 
 
-def _way(points, edges, ends, cut, border) -> list[int]:
+def _path_along_edges(points, edges, ends, cut, border) -> list[int]:
     """Nodes of a path along edges from one end to the other, near the requested side and off the border."""
     middle = points.mean(axis=0)
     goal = np.asarray(cut, float) if cut is not None else None
@@ -248,7 +248,7 @@ def _way(points, edges, ends, cut, border) -> list[int]:
         cost = 1 + 20 * np.linalg.norm(away - (away @ way)[:, None] * way, axis=1) / spread
     length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1) * cost
     if len(border):
-        length = np.where(_among(edges, np.sort(border, axis=1)), 1e3 * length, length)
+        length = np.where(_is_among(edges, np.sort(border, axis=1)), 1e3 * length, length)
     graph = scipy.sparse.csr_array((length, edges.T), shape=(len(points), len(points)))
     lengths, before, _ = dijkstra(graph, directed=False, indices=ends[0], return_predecessors=True, min_only=True)
     path = [int(ends[1][np.argmin(lengths[ends[1]])])]
@@ -257,7 +257,7 @@ def _way(points, edges, ends, cut, border) -> list[int]:
     return path
 
 
-def _split(cells, path: list[int], count: int, *, closed: bool):
+def _split_along_path(cells, path: list[int], count: int, *, closed: bool):
     """Duplicate the nodes along a path for the triangles on one side of it. On a closed surface, the ends of the path
     are not duplicated."""
     doubled = path[1:-1] if closed else path
@@ -289,7 +289,7 @@ def _split(cells, path: list[int], count: int, *, closed: bool):
                     continue
                 for other in tuple(side):
                     shared = set(original[number].tolist()) & set(original[other].tolist()) - {node}
-                    if any(not _on_way(node, far, onto, ahead) for far in shared):
+                    if any(not _is_on_path(node, far, onto, ahead) for far in shared):
                         side.add(number)
                         grown = True
                         break
@@ -298,5 +298,5 @@ def _split(cells, path: list[int], count: int, *, closed: bool):
     return cells, np.concatenate([np.arange(count), np.array(doubled, int)])
 
 
-def _on_way(node: int, far: int, onto: set, ahead: set) -> bool:
+def _is_on_path(node: int, far: int, onto: set, ahead: set) -> bool:
     return far in onto and ((node, far) in ahead or (far, node) in ahead)

@@ -102,9 +102,9 @@ class Disk(Domain):
         """Mesh the disk. The arguments and the errors raised are those of `jeit.mesh.disk`."""
         middle = np.asarray(self.centre)
         if num_boundary is not None:
-            refine = self._finer_rim(num_boundary, refine)
+            refine = self._refine_rim(num_boundary, refine)
         if refine is None and boundary_points is None and interior_points is None:
-            points, cells = structured.ring_disk(*self._rings(num_points, cell_size))
+            points, cells = structured.ring_disk(*self._choose_rings(num_points, cell_size))
             return Mesh.create(middle + self.radius * points, cells)
         arcs = None
         if boundary_points is not None:
@@ -119,14 +119,14 @@ class Disk(Domain):
             )
         return mesh
 
-    def _finer_rim(self, num_boundary: int, refine: Refinement) -> Refinement:
+    def _refine_rim(self, num_boundary: int, refine: Refinement) -> Refinement:
         num_boundary = check_count("num_boundary", num_boundary, 3)
         if callable(refine):
             raise ValueError("num_boundary: cannot be combined with a size function; let the function give the size.")
         along = Refine(cell_size=self.perimeter / num_boundary)
         return (along, *(() if refine is None else (refine,) if isinstance(refine, Refine) else tuple(refine)))
 
-    def _rings(self, num_points: int | None, cell_size: float | None) -> tuple[int, int]:
+    def _choose_rings(self, num_points: int | None, cell_size: float | None) -> tuple[int, int]:
         target = Target.create(num_points, cell_size)
         if target.cell_size is None:
             rings = structured.choose_rings(target.num_points)

@@ -47,7 +47,7 @@ class Body(eqx.Module):
 
 # Maximum distance of an outline from the origin, divided by its size: beyond it, double precision leaves fewer than ten
 # digits for the shape.
-_FARTHEST = 1e6
+_MAX_DISTANCE_FROM_ORIGIN = 1e6
 
 
 class Pen(Protocol):
@@ -152,7 +152,7 @@ def check_length(name: str, value: Any, across: float = 1.0) -> Any:
 def check_near_origin(name: str, far: Any, size: Any) -> None:
     """Raise `ValueError` with the argument's `name` if an outline of `size` metres is so `far` from the origin, metres,
     that its coordinates lose accuracy. Traced values are not checked."""
-    if has_values(far, size) and float(np.max(np.abs(np.asarray(far)))) > _FARTHEST * float(size):
+    if has_values(far, size) and float(np.max(np.abs(np.asarray(far)))) > _MAX_DISTANCE_FROM_ORIGIN * float(size):
         away = float(np.max(np.abs(np.asarray(far))))
         raise ValueError(
             f"{name}: {away:.3g} m from the origin, and only {float(size):.3g} m across; give its coordinates about a "

@@ -54,14 +54,14 @@ def contains(loops: Sequence[Loop], points: ArrayLike) -> Bool[Array, "..."]:
     points = jnp.asarray(points)
     inside = jnp.zeros(points.shape[:-1], bool)
     for loop in loops:
-        inside = inside ^ _inside(loop, points)
+        inside = inside ^ _is_inside(loop, points)
     return inside
 
 
 def signed_distance(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " p"]:
     """Distance (p,) of `points` (p, 2) from the nearest side in metres, negative outside."""
     xp = numerics(loops, points)
-    at, inside, place = _nearest_on(xp, loops, points)
+    at, inside, place = _project_onto_loops(xp, loops, points)
     apart = xp.sqrt(((at - place) ** 2).sum(axis=1) + 1e-24)  # differentiable at zero, too
     return jnp.asarray(xp.where(inside, apart, -apart))
 
@@ -69,11 +69,11 @@ def signed_distance(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, " 
 def nearest(loops: Sequence[Loop], points: ArrayLike) -> Float[Array, "p 2"]:
     """Move those of `points` (p, 2) that lie outside to the nearest point on a side; others are returned unchanged."""
     xp = numerics(loops, points)
-    at, inside, place = _nearest_on(xp, loops, points)
+    at, inside, place = _project_onto_loops(xp, loops, points)
     return jnp.asarray(xp.where(inside[:, None], at, place))
 
 
-def _nearest_on(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:
+def _project_onto_loops(xp: Any, loops: Sequence[Loop], points: ArrayLike) -> tuple[Any, Any, Any]:
     """Convert `points` (p, 2) to an array; also returns whether each lies inside (p,), and the nearest point on a side
     (p, 2)."""
     chains, at = [xp.asarray(loop) for loop in loops], xp.asarray(points, float)
@@ -98,7 +98,7 @@ def _shoelace(loop: Loop) -> Float[Array, ""]:
     return 0.5 * jnp.sum(x * jnp.roll(y, -1) - jnp.roll(x, -1) * y)
 
 
-def _inside(loop: Loop, points: Float[Array, "... 2"]) -> Bool[Array, "..."]:
+def _is_inside(loop: Loop, points: Float[Array, "... 2"]) -> Bool[Array, "..."]:
     """Even-odd rule: count the sides that a ray towards +x crosses."""
 
     def crosses(inside: Array, side: Array) -> tuple[Array, None]:

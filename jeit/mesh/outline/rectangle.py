@@ -105,7 +105,7 @@ class Rectangle(Domain):
         `jeit.mesh.rectangle`."""
         target = Target.create(num_points, cell_size)
         if refine is None and boundary_points is None and interior_points is None:
-            mesh = self._rows(target)
+            mesh = self._mesh_rows(target)
         else:
             curve = closed_line(np.asarray(self.vertices))
             mesh = mesh_within([curve], self.area, target, refine, boundary_points, interior_points)
@@ -113,16 +113,16 @@ class Rectangle(Domain):
 
     def tagged(self, mesh: Mesh) -> Mesh:
         """Add tags for the sides of the rectangle to a mesh of it."""
-        return Mesh(mesh.points, mesh.cells, mesh.facets, self._sides(mesh))
+        return Mesh(mesh.points, mesh.cells, mesh.facets, self._side_facets(mesh))
 
-    def _rows(self, target: Target) -> Mesh:
+    def _mesh_rows(self, target: Target) -> Mesh:
         left, _, bottom, _ = self.extent
         rows = structured.choose_rows(self.width, self.height, target.num_points, target.cell_size)
         check_total(rows[0] * rows[1], "cell_size")
         points, cells = structured.row_rectangle(self.width, self.height, *rows)
         return Mesh.create(points + np.array([left, bottom]), cells)
 
-    def _sides(self, mesh: Mesh) -> dict:
+    def _side_facets(self, mesh: Mesh) -> dict:
         """Indices of the facets on each side, by the name of the side."""
         left, right, bottom, top = self.extent
         ends = np.asarray(mesh.points)[np.asarray(mesh.facets)]

@@ -36,10 +36,10 @@ def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
 
 # Minimum cosine of the angle between the mean normal at a node and those of its triangles: below it, the node lies on a
 # crease, which is not smoothed.
-_CREASE = np.cos(np.radians(50.0))
+_MIN_CREASE_COSINE = np.cos(np.radians(50.0))
 # Number of coefficients of the quadratic surface fitted to neighbours, and minimum ratio of the smallest to the largest
 # eigenvalue of its normal equations.
-_TERMS, _LEAST = 5, 1e-6
+_NUM_COEFFICIENTS, _MIN_EIGENVALUE_RATIO = 5, 1e-6
 
 
 def node_normals(mesh: Mesh) -> np.ndarray:
@@ -63,13 +63,13 @@ def node_normals(mesh: Mesh) -> np.ndarray:
     mean /= np.linalg.norm(mean, axis=1, keepdims=True)
     least = np.ones(len(points))
     np.minimum.at(least, cells, (mean[cells] * facing[:, None]).sum(axis=2))
-    slope, determined = _slopes(points, cells, mean)
-    smooth = (least > _CREASE) & determined
+    slope, determined = _fit_slopes(points, cells, mean)
+    smooth = (least > _MIN_CREASE_COSINE) & determined
     fitted = mean - np.where(smooth[:, None], slope, 0)
     return fitted / np.linalg.norm(fitted, axis=1, keepdims=True)
 
 
-def _slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _fit_slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fit a quadratic surface to the first and second neighbours of each node, as a height above the plane
     perpendicular to `normal`. Returns its slopes (n, 3) at the nodes, and whether the neighbours determine it."""
     count = len(points)
@@ -87,23 +87,23 @@ def _slopes(points: np.ndarray, cells: np.ndarray, normal: np.ndarray) -> tuple[
     scale = np.sqrt(np.bincount(one, (offset**2).sum(axis=1), count) / np.bincount(one, minlength=count))
     u, v, height = (offset / scale[one][:, None]).T
     terms = np.stack([u, v, u * u / 2, u * v, v * v / 2], axis=1)
-    matrix, right = np.zeros((count, _TERMS, _TERMS)), np.zeros((count, _TERMS))
-    for k in range(_TERMS):
+    matrix, right = np.zeros((count, _NUM_COEFFICIENTS, _NUM_COEFFICIENTS)), np.zeros((count, _NUM_COEFFICIENTS))
+    for k in range(_NUM_COEFFICIENTS):
         right[:, k] = np.bincount(one, terms[:, k] * height, count)
-        for j in range(_TERMS):
+        for j in range(_NUM_COEFFICIENTS):
             matrix[:, k, j] = np.bincount(one, terms[:, k] * terms[:, j], count)
     values = np.linalg.eigvalsh(matrix)
-    determined = values[:, 0] > _LEAST * values[:, -1]
-    matrix[~determined] = np.eye(_TERMS)
+    determined = values[:, 0] > _MIN_EIGENVALUE_RATIO * values[:, -1]
+    matrix[~determined] = np.eye(_NUM_COEFFICIENTS)
     found = np.linalg.solve(matrix, right[..., None])[:, :2, 0]
     return np.einsum("ni,nij->nj", found, axes[:, :2]), determined
 
 
 # Distance from a fold to a node, divided by the distance between folds, below which the fold is moved onto the node, to
 # avoid slivers.
-_ONTO = 0.1
+_FOLD_SNAP_DISTANCE = 0.1
 # Distance from a node to a line, divided by the width of the sheet, below which the node lies on the line.
-_ON = 1e-12
+_LINE_TOLERANCE = 1e-12
 
 
 def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = None) -> Mesh:
@@ -129,36 +129,36 @@ def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = 
         raise ValueError(f"num_folds: expected a whole number of at least 1, got {describe(num_folds)}.")
     across = 0 if axis == "y" else 1
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
-    folds = _folds(points[:, across], points[cells], across, num_folds)
+    folds = _fold_positions(points[:, across], points[cells], across, num_folds)
     edges = {name: np.asarray(mesh.facets)[np.asarray(index)] for name, index in mesh.tags.items()}
     for line in folds[1:-1]:
-        points, cells, edges = _cut(points, cells, edges, points[:, across] - line)
+        points, cells, edges = _cut_cells(points, cells, edges, points[:, across] - line)
     out, up = _roll_coordinates(points[:, across], folds, float(radius))
     columns = [out, points[:, 1], up] if across == 0 else [points[:, 0], out, up]
     return Mesh.create(np.stack(columns, axis=1), cells, tags=edges)
 
 
-def _folds(places: np.ndarray, corners: np.ndarray, across: int, num_folds: int | None) -> np.ndarray:
+def _fold_positions(places: np.ndarray, corners: np.ndarray, across: int, num_folds: int | None) -> np.ndarray:
     """Positions of the folds across the sheet, including both of its sides."""
     width = np.ptp(places)
     ordered = np.sort(places)
-    rows = ordered[np.concatenate([[True], np.diff(ordered) > _ON * width])]
+    rows = ordered[np.concatenate([[True], np.diff(ordered) > _LINE_TOLERANCE * width])]
     own = corners[..., across]
-    low, high = (np.searchsorted(rows, side - _ON * width) for side in (own.min(axis=1), own.max(axis=1)))
+    low, high = (np.searchsorted(rows, side - _LINE_TOLERANCE * width) for side in (own.min(axis=1), own.max(axis=1)))
     if num_folds is None and (high - low <= 1).all():
         return rows
     edge = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
     lines = np.linspace(rows[0], rows[-1], 1 + (num_folds or max(1, round(width / edge))))
     nearest = ordered[np.abs(ordered - lines[:, None]).argmin(axis=1)]
-    near = np.abs(nearest - lines) < _ONTO * (lines[1] - lines[0])
+    near = np.abs(nearest - lines) < _FOLD_SNAP_DISTANCE * (lines[1] - lines[0])
     return np.where(near, nearest, lines)
 
 
-def _cut(
+def _cut_cells(
     points: np.ndarray, cells: np.ndarray, edges: dict[str, np.ndarray], height: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Cut cells and named edges along a line; `height` (n,) are the signed distances of the nodes from it."""
-    side = np.where(np.abs(height) <= _ON * np.ptp(height), 0, np.sign(height)).astype(int)
+    side = np.where(np.abs(height) <= _LINE_TOLERANCE * np.ptp(height), 0, np.sign(height)).astype(int)
     sides = side[cells]
     crossed = (sides.min(axis=1) < 0) & (sides.max(axis=1) > 0)
     if not crossed.any():
@@ -218,9 +218,9 @@ def _roll_coordinates(places: np.ndarray, folds: np.ndarray, radius: float) -> t
     return np.interp(places, folds, out), np.interp(places, folds, up)
 
 
-_TAGS = ("inner", "outer", "side")
+_SHELL_TAGS = ("inner", "outer", "side")
 # Number of bisection steps to find the maximum thickness.
-_HALVINGS = 40
+_BISECTION_STEPS = 40
 
 
 def shell(
@@ -244,7 +244,7 @@ def shell(
     the message then states the position and the maximum thickness.
     """
     if not surface.is_surface:
-        raise ValueError("surface: a shell is made on a surface in space; on a flat mesh it is jeit.mesh.layer.")
+        raise ValueError("surface: this mesh is flat, and a shell needs a surface in space; use jeit.mesh.layer.")
     thickness = check_length("thickness", thickness)
     num_layers = unstructured.check_count("num_layers", num_layers, 1)
     points, cells, facets = (np.asarray(array) for array in (surface.points, surface.cells, surface.facets))
@@ -267,7 +267,7 @@ def shell(
     if len(facets):
         tags["side"] = stacked_wall(facets, count, num_layers)
     for name, index in surface.tags.items():
-        if name in _TAGS:
+        if name in _SHELL_TAGS:
             raise ValueError(f"surface: its tag {name!r} is taken in a shell. Rename it.")
         tags[name] = stacked_wall(facets[np.asarray(index)], count, num_layers)
     mesh = Mesh.create(stacked(thickness), solid, tags=tags)
@@ -298,7 +298,7 @@ def _check_upright(stacked, solid: np.ndarray, turned: np.ndarray, thickness: fl
             "read it with that: jeit.mesh.read(..., scale=1e-3) for millimetres, 0.0254 for inches, 1 for metres."
         )
     low, high = 0.0, thickness
-    for _ in range(_HALVINGS):
+    for _ in range(_BISECTION_STEPS):
         middle = (low + high) / 2
         upright = _volumes(stacked(middle), solid, turned).min() > 0
         low, high = (middle, high) if upright else (low, middle)

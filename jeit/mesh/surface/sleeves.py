@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from jeit.arguments import describe
-from jeit.mesh.cell_quality import merged
+from jeit.mesh.cell_quality import merge_points
 from jeit.mesh.generate import unstructured
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
@@ -17,10 +17,10 @@ from jeit.mesh.outline.domain import check_length
 from jeit.mesh.solids import disk
 
 # Height of a row of equilateral triangles, divided by their edge.
-_ROW = np.sqrt(3) / 2
-_FEWEST_AROUND = 6
+_ROW_HEIGHT = np.sqrt(3) / 2
+_MIN_AROUND = 6
 # Number of points on an ellipse for computing its arc length.
-_SAMPLES = 4096
+_ELLIPSE_SAMPLES = 4096
 
 
 def tube(
@@ -40,8 +40,8 @@ def tube(
     `bend`. Raises `ValueError` for invalid or contradictory arguments.
     """
     radius, height = check_length("radius", radius), check_length("height", height)
-    around, rows = _counts(2 * np.pi * radius, height, num_points, cell_size, num_around)
-    return _sleeve(height, np.full((rows + 1, 2), radius), around)
+    around, rows = _node_counts(2 * np.pi * radius, height, num_points, cell_size, num_around)
+    return _sleeve_mesh(height, np.full((rows + 1, 2), radius), around)
 
 
 def forearm(
@@ -60,15 +60,15 @@ def forearm(
     each section. Tags: 'bottom', 'top'. Raises `ValueError` for invalid or contradictory arguments.
     """
     length = check_length("length", length)
-    ends = np.stack([_section("wrist", wrist), _section("elbow", elbow)])
+    ends = np.stack([_semi_axes("wrist", wrist), _semi_axes("elbow", elbow)])
     girth = float(np.mean([_arc_lengths(*end)[-1] for end in ends]))
     slant = float(np.hypot(length, np.abs(ends[1] - ends[0]).mean()))
-    around, rows = _counts(girth, slant, num_points, cell_size, num_around)
+    around, rows = _node_counts(girth, slant, num_points, cell_size, num_around)
     share = np.linspace(0, 1, rows + 1)[:, None]
-    return _sleeve(length, (1 - share) * ends[0] + share * ends[1], around)
+    return _sleeve_mesh(length, (1 - share) * ends[0] + share * ends[1], around)
 
 
-def _section(name: str, given: float | Sequence[float]) -> np.ndarray:
+def _semi_axes(name: str, given: float | Sequence[float]) -> np.ndarray:
     try:
         half = np.asarray(given, dtype=float)
     except (TypeError, ValueError):
@@ -78,39 +78,39 @@ def _section(name: str, given: float | Sequence[float]) -> np.ndarray:
     return np.array([check_length(name, float(value)) for value in np.broadcast_to(half, 2)])
 
 
-def _counts(
+def _node_counts(
     girth: float, height: float, num_points: int | None, cell_size: float | None, num_around: int | None
 ) -> tuple[int, int]:
     """Number of nodes around a sleeve, and number of rows of triangles along it."""
     if num_around is not None:
         if num_points is not None or cell_size is not None:
             raise ValueError("num_around: give it, num_points or cell_size, not two of them.")
-        around = unstructured.check_count("num_around", num_around, _FEWEST_AROUND)
-        return around, max(1, round(height / (_ROW * girth / around)))
+        around = unstructured.check_count("num_around", num_around, _MIN_AROUND)
+        return around, max(1, round(height / (_ROW_HEIGHT * girth / around)))
     target = unstructured.Target.create(num_points, cell_size)
     if target.cell_size is None:
         # n = (g / h) (H / (0.87 h) + 1)
         number = target.num_points
-        edge = np.sqrt(girth * height / (_ROW * number))
+        edge = np.sqrt(girth * height / (_ROW_HEIGHT * number))
         for _ in range(30):
-            edge = np.sqrt(girth * (height / _ROW + edge) / number)
-        rows = max(1, round(height / (_ROW * edge)))
-        around = max(_FEWEST_AROUND, round(number / (rows + 1)))
+            edge = np.sqrt(girth * (height / _ROW_HEIGHT + edge) / number)
+        rows = max(1, round(height / (_ROW_HEIGHT * edge)))
+        around = max(_MIN_AROUND, round(number / (rows + 1)))
     else:
-        around = max(_FEWEST_AROUND, round(girth / target.cell_size))
-        rows = max(1, round(height / (_ROW * girth / around)))
+        around = max(_MIN_AROUND, round(girth / target.cell_size))
+        rows = max(1, round(height / (_ROW_HEIGHT * girth / around)))
     unstructured.check_total(around * (rows + 1), "num_points" if target.cell_size is None else "cell_size")
     return around, rows
 
 
 def _arc_lengths(a: float, b: float) -> np.ndarray:
     """Arc length along an ellipse with semi-axes a and b, at evenly spaced values of its angular parameter."""
-    angle = np.linspace(0, 2 * np.pi, _SAMPLES + 1)
+    angle = np.linspace(0, 2 * np.pi, _ELLIPSE_SAMPLES + 1)
     corners = np.stack([a * np.cos(angle), b * np.sin(angle)], axis=1)
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
 
 
-def _sleeve(height: float, halves: np.ndarray, around: int) -> Mesh:
+def _sleeve_mesh(height: float, halves: np.ndarray, around: int) -> Mesh:
     """Mesh a sleeve from rows of nodes on ellipses with semi-axes `halves` (r + 1, 2), evenly spaced along each."""
     rings = []
     for row, (a, b) in enumerate(halves):
@@ -118,12 +118,12 @@ def _sleeve(height: float, halves: np.ndarray, around: int) -> Mesh:
         angle = 2 * np.pi * turn
         if a != b:
             length = _arc_lengths(a, b)
-            angle = np.interp(turn * length[-1], length, np.linspace(0, 2 * np.pi, _SAMPLES + 1))
+            angle = np.interp(turn * length[-1], length, np.linspace(0, 2 * np.pi, _ELLIPSE_SAMPLES + 1))
         rings.append(np.stack([a * np.cos(angle), b * np.sin(angle), np.full(around, height * row)], axis=1))
     points = np.concatenate(rings)
     points[:, 2] /= len(halves) - 1
     numbers = np.arange(len(points)).reshape(len(halves), around)
-    cells = [_between(low, high, row % 2) for row, (low, high) in enumerate(pairwise(numbers))]
+    cells = [_triangles_between_rings(low, high, row % 2) for row, (low, high) in enumerate(pairwise(numbers))]
 
     def loop(ring: np.ndarray) -> np.ndarray:
         return np.stack([ring, np.roll(ring, -1)], axis=1)
@@ -131,7 +131,7 @@ def _sleeve(height: float, halves: np.ndarray, around: int) -> Mesh:
     return Mesh.create(points, np.concatenate(cells), tags={"bottom": loop(numbers[0]), "top": loop(numbers[-1])})
 
 
-def _between(low: np.ndarray, high: np.ndarray, ahead: int) -> np.ndarray:
+def _triangles_between_rings(low: np.ndarray, high: np.ndarray, ahead: int) -> np.ndarray:
     """Triangles between two rings with equal numbers of nodes, offset by half the node spacing; `ahead`: whether the
     lower ring is ahead."""
     after_low, after_high = np.roll(low, -1), np.roll(high, -1)
@@ -170,8 +170,8 @@ def sphere(radius: float, *, num_points: int | None = None, cell_size: float | N
     cells = np.concatenate([own + k * len(share) for k in range(len(faces))])
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     # Nodes on the edges of the icosahedron were created once for each of the two faces.
-    points, cells = merged(points, cells, 1e-6 / parts)
-    return Mesh.create(radius * points, _outward(points, cells))
+    points, cells = merge_points(points, cells, 1e-6 / parts)
+    return Mesh.create(radius * points, _orient_outward(points, cells))
 
 
 def cap(
@@ -202,7 +202,7 @@ def cap(
     return Mesh.create(points, flat.cells, tags={"edge": np.arange(flat.num_facets)})
 
 
-def _outward(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+def _orient_outward(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Orient triangles (m, 3) so that they face away from the origin."""
     facing = np.linalg.det(points[cells]) > 0
     return np.where(facing[:, None], cells, cells[:, [0, 2, 1]])

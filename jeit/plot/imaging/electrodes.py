@@ -112,7 +112,7 @@ def draw_electrodes(
     without known places.
     """
     ax = axes_or_new(ax)
-    pen = _Pen()
+    pen = _MatplotlibPen()
     electrodes.draw(mesh, pen)
     if pen.arcs:
         ax.add_collection(LineCollection(pen.arcs, colors=METAL, linewidths=5, capstyle="butt", zorder=3))
@@ -141,7 +141,7 @@ def draw_shapes(mesh: Mesh, shapes: ElectrodeShapes, *, ax: Axes) -> None:
     draw_numbers(ax, mesh, shapes.middles(), shapes.sizes[first] < 3, 1)
 
 
-class _Pen:
+class _MatplotlibPen:
     """Collector of electrodes to draw, by kind, with the centre of each electrode and whether its number is beside
     it."""
 
@@ -175,11 +175,11 @@ class _Pen:
 
 # Distance of a number from its electrode, and maximum distance of an electrode from the edge for it to lie on the edge,
 # both divided by the size of the body.
-_AWAY, _ON_EDGE = 0.058, 0.02
+_NUMBER_DISTANCE, _EDGE_TOLERANCE = 0.058, 0.02
 # Factor of this distance for texts that are not centred.
-_CLOSER = 0.7
+_ALIGNED_FACTOR = 0.7
 # Minimum free distance outside the outline, divided by the distance of a number, for the number to be outside.
-_ROOM = 1.6
+_MIN_FREE_DISTANCE = 1.6
 
 
 def draw_numbers(
@@ -192,11 +192,11 @@ def draw_numbers(
     each other share one text.
     """
     corners = np.asarray(mesh.points)[:, :2]
-    away = _AWAY * np.ptp(corners, axis=0).max()
+    away = _NUMBER_DISTANCE * np.ptp(corners, axis=0).max()
     if mesh.dimension == 2:
-        shift, inside = _off_the_edge(mesh, places, away)
+        shift, inside = _away_from_edge(mesh, places, away)
     else:
-        shift, inside = _off_the_middle(corners, places, away), np.zeros(len(places), bool)
+        shift, inside = _away_from_middle(corners, places, away), np.zeros(len(places), bool)
     shift[~beside] = 0
     fontsize = 9 if len(places) <= 20 else 7
     rim = [withStroke(linewidth=2, foreground="white")]
@@ -206,12 +206,12 @@ def draw_numbers(
         style = {"ha": "center", "va": "center", "fontsize": fontsize, "color": INK, "zorder": 4}
         text = ", ".join(str(k + first) for k in one)
         if len(one) > 1:
-            style["ha"] = _beside(shift[k])
-        x, y = places[k] + (1.0 if style["ha"] == "center" else _CLOSER) * shift[k]
+            style["ha"] = _alignment(shift[k])
+        x, y = places[k] + (1.0 if style["ha"] == "center" else _ALIGNED_FACTOR) * shift[k]
         ax.text(x, y, text, path_effects=effects, **style)
 
 
-def _beside(shift: Float[np.ndarray, " 2"]) -> str:
+def _alignment(shift: Float[np.ndarray, " 2"]) -> str:
     """Horizontal alignment of a text of several numbers beside an electrode, so that it does not cover the
     electrode."""
     if abs(shift[0]) < 0.8 * abs(shift[1]):
@@ -219,13 +219,13 @@ def _beside(shift: Float[np.ndarray, " 2"]) -> str:
     return "left" if shift[0] > 0 else "right"
 
 
-def at_one_place(places: Float[np.ndarray, "L 2"], near: float) -> list[list[int]]:
-    """Group electrodes within a distance `near` of each other, such as those of several rings of a tank seen from
+def at_one_place(places: Float[np.ndarray, "L 2"], tolerance: float) -> list[list[int]]:
+    """Group electrodes within a distance `tolerance` of each other, such as those of several rings of a tank seen from
     above."""
     together: list[list[int]] = []
     for k, place in enumerate(places):
         for one in together:
-            if np.linalg.norm(places[one[0]] - place) < near:
+            if np.linalg.norm(places[one[0]] - place) < tolerance:
                 one.append(k)
                 break
         else:
@@ -233,24 +233,24 @@ def at_one_place(places: Float[np.ndarray, "L 2"], near: float) -> list[list[int
     return together
 
 
-def _off_the_edge(mesh: Mesh, places, away: float) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
+def _away_from_edge(mesh: Mesh, places, away: float) -> tuple[Float[np.ndarray, "L 2"], Bool[np.ndarray, " L"]]:
     """Shifts (L, 2) of numbers from their electrodes on a sheet, and whether each number is inside the sheet."""
     start, end = np.asarray(mesh.points)[np.asarray(mesh.facets)].swapaxes(0, 1)
     shift, inside = np.tile([0.0, 0.7 * away], (len(places), 1)), np.ones(len(places), bool)
     for k, place in enumerate(places):
         distance = _distances(place, start, end)
-        if distance.min() > _ON_EDGE / _AWAY * away:
+        if distance.min() > _EDGE_TOLERANCE / _NUMBER_DISTANCE * away:
             continue
         # At a corner two edges are nearest, and the number is placed along the bisector.
         nearest = distance <= distance.min() + 1e-6 * away
         outward = _normals(start[nearest], end[nearest]).sum(axis=0)
         outward /= max(np.linalg.norm(outward), 1e-12)
-        inside[k] = _free(place, outward, start, end, 0.01 * away) < _ROOM * away
+        inside[k] = _is_free(place, outward, start, end, 0.01 * away) < _MIN_FREE_DISTANCE * away
         shift[k] = (-away if inside[k] else away) * outward
     return shift, inside
 
 
-def _off_the_middle(corners, places, away: float) -> Float[np.ndarray, "L 2"]:
+def _away_from_middle(corners, places, away: float) -> Float[np.ndarray, "L 2"]:
     """Shifts (L, 2) of numbers away from the middle of a body; zero for electrodes near the middle."""
     offset = places - (corners.min(axis=0) + corners.max(axis=0)) / 2
     distance = np.linalg.norm(offset, axis=1, keepdims=True)
@@ -271,11 +271,11 @@ def _distances(place, start, end) -> Float[np.ndarray, " b"]:
     return np.linalg.norm(start + fraction[:, None] * along - place, axis=1)
 
 
-def _free(place, direction, start, end, least: float) -> float:
-    """Distance from a place along a unit direction to the first edge that is farther away than `least`."""
-    along, offset = end - start, start - place
+def _is_free(position, direction, start, end, min_distance: float) -> float:
+    """Distance from a place along a unit direction to the first edge that is farther away than `min_distance`."""
+    along, offset = end - start, start - position
     across = direction[0] * along[:, 1] - direction[1] * along[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):  # edges parallel to the direction give infinity or NaN
         far = (offset[:, 0] * along[:, 1] - offset[:, 1] * along[:, 0]) / across
         where = (offset[:, 0] * direction[1] - offset[:, 1] * direction[0]) / across
-    return float(np.min(far[(far > least) & (where >= 0) & (where <= 1)], initial=np.inf))
+    return float(np.min(far[(far > min_distance) & (where >= 0) & (where <= 1)], initial=np.inf))

@@ -23,7 +23,7 @@ COLOURS = {
     "best-resolution": "#7b4fa3",
 }
 # Minimum distance of labelled points on the L-curve, relative to its width and height.
-_APART = 0.06
+_MIN_LABEL_DISTANCE = 0.06
 # For each rule: name of its criterion, scale of the axis, and which value is sought.
 _CRITERIA = {
     "gcv": ("prediction error (σ²)", "log", "least"),
@@ -55,7 +55,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
             ax.set_title(title or "", loc="left")
         else:
             _draw_criterion(ax, choices)
-            ax.set_title(title or _headline(choices), color=_colour(choices), fontsize=11, loc="left")
+            ax.set_title(title or _choice_title(choices), color=_rule_colour(choices), fontsize=11, loc="left")
             ax.set_xlabel("Hyperparameter λ")
         return ax
     rules = [choice for choice in several if choice.criterion.size]
@@ -77,7 +77,7 @@ def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = N
         place = (left, 1 - (row + 1) * height, 1 - left, (0.62 if len(rules) > 1 else 0.95) * height)
         panel = ax.inset_axes(place, sharex=panel)
         for other in several:
-            panel.axvline(float(other.hyperparameter), color=_colour(other), linewidth=0.6, alpha=0.45, zorder=0)
+            panel.axvline(float(other.hyperparameter), color=_rule_colour(other), linewidth=0.6, alpha=0.45, zorder=0)
         _draw_criterion(panel, choice, small=len(rules) > 1)
         panel.tick_params(labelbottom=row == len(rules) - 1)
     if panel is not None:
@@ -95,7 +95,7 @@ def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
     for exponent in exponents[::-1]:
         place = curve.read(residual, 10.0**exponent), curve.read(penalty, 10.0**exponent)
         where = np.log10(place) / extent
-        if np.linalg.norm(named - where, axis=1).min() < _APART:
+        if np.linalg.norm(named - where, axis=1).min() < _MIN_LABEL_DISTANCE:
             continue
         named = np.vstack([named, where])
         name = "λ = " if exponent == exponents[-1] else ""
@@ -106,20 +106,20 @@ def _draw_l_curve(ax: Axes, curve: Choice, choices: list[Choice]) -> None:
     for number, choice in enumerate(ordered):
         place = curve.read(residual, choice.hyperparameter), curve.read(penalty, choice.hyperparameter)
         ax.annotate(
-            _headline(choice),
+            _choice_title(choice),
             place,
             (0.36, 0.97 - 0.065 * number),
             textcoords="axes fraction",
-            color=_colour(choice),
+            color=_rule_colour(choice),
             va="center",
             fontsize=9,
-            arrowprops={"arrowstyle": "-", "color": _colour(choice), "linewidth": 0.7, "relpos": (0, 0.5)},
+            arrowprops={"arrowstyle": "-", "color": _rule_colour(choice), "linewidth": 0.7, "relpos": (0, 0.5)},
         )
-        ax.plot(*place, zorder=3, **_marker(choice, 8))
+        ax.plot(*place, zorder=3, **_marker_style(choice, 8))
     ax.margins(0.09, 0.05)
     ax.set_xlabel("Residual ‖w (v − Jx)‖ (standard deviations)")
     ax.set_ylabel("Penalty √(xᵀQx)")
-    _tidy(ax)
+    _style_axes(ax)
 
 
 def _draw_criterion(ax: Axes, choice: Choice, *, small: bool = False) -> None:
@@ -127,37 +127,37 @@ def _draw_criterion(ax: Axes, choice: Choice, *, small: bool = False) -> None:
     value = float(choice.hyperparameter)
     ax.set_xscale("log")
     ax.set_yscale(scale)
-    ax.plot(np.asarray(choice.candidates), np.asarray(choice.criterion), color=_colour(choice), linewidth=1.6)
+    ax.plot(np.asarray(choice.candidates), np.asarray(choice.criterion), color=_rule_colour(choice), linewidth=1.6)
     if choice.target is not None:
         ax.axhline(choice.target, color=INK, linewidth=0.8, linestyle=(0, (4, 3)), zorder=1)
-    ax.plot(value, choice.read(choice.criterion), clip_on=False, zorder=3, **_marker(choice, 6 if small else 8))
+    ax.plot(value, choice.read(choice.criterion), clip_on=False, zorder=3, **_marker_style(choice, 6 if small else 8))
     text = f"{label}, {aim}" if aim else label
     if small:
-        ax.set_title(f"{choice.rule}: {text}", fontsize=8.5, loc="left", pad=3, color=_colour(choice))
+        ax.set_title(f"{choice.rule}: {text}", fontsize=8.5, loc="left", pad=3, color=_rule_colour(choice))
         ax.tick_params(labelsize=7.5)
     else:
-        ax.axvline(value, color=_colour(choice), linewidth=0.6, alpha=0.45, zorder=0)
+        ax.axvline(value, color=_rule_colour(choice), linewidth=0.6, alpha=0.45, zorder=0)
         ax.set_ylabel(text[0].upper() + text[1:])
-    _tidy(ax, ticks=3 if small else 6)
+    _style_axes(ax, ticks=3 if small else 6)
 
 
-def _marker(choice: Choice, size: float) -> dict:
-    face = "white" if choice.edge else _colour(choice)
-    edge = _colour(choice) if choice.edge else "white"
+def _marker_style(choice: Choice, size: float) -> dict:
+    face = "white" if choice.edge else _rule_colour(choice)
+    edge = _rule_colour(choice) if choice.edge else "white"
     style = {"marker": "o", "markersize": size, "linestyle": "none"}
     return {**style, "markerfacecolor": face, "markeredgecolor": edge, "markeredgewidth": 1.6 if choice.edge else 0.8}
 
 
-def _headline(choice: Choice) -> str:
+def _choice_title(choice: Choice) -> str:
     edge = " (edge of the grid)" if choice.edge else ""
     return f"{choice.rule}: λ = {float(choice.hyperparameter):.3g}{edge}"
 
 
-def _colour(choice: Choice) -> str:
+def _rule_colour(choice: Choice) -> str:
     return COLOURS.get(choice.rule, INK)
 
 
-def _tidy(ax: Axes, ticks: int = 6) -> None:
+def _style_axes(ax: Axes, ticks: int = 6) -> None:
     soften_axes(ax)
     for axis, number in ((ax.xaxis, 8), (ax.yaxis, ticks)):
         if axis.get_scale() == "log":
@@ -209,10 +209,10 @@ def plot_figures_of_merit(
         for merit, colour, marker in zip(figures.values(), SERIES_COLOURS, SERIES_MARKERS, strict=False):
             distance, value = 1e3 * np.asarray(merit.distance), factor * np.asarray(getattr(merit, field))
             shown = np.isfinite(value)
-            place, mean = _means(distance[shown], value[shown], 1e-3 * reach)
+            place, mean = _binned_means(distance[shown], value[shown], 1e-3 * reach)
             panel.plot(place, mean, color=colour, linewidth=1.6, zorder=3)
             panel.plot(distance[shown], value[shown], marker, color=colour, markersize=3.2, zorder=3)
-        _dress(panel, heading, unit, reach)
+        _style_panel(panel, heading, unit, reach)
         if number >= 2:  # the lowest plot of its column
             panel.set_xlabel("Target's distance from the centre (mm)", fontsize=9, color=INK)
     styles = zip(figures, SERIES_COLOURS, SERIES_MARKERS, strict=False)
@@ -222,16 +222,16 @@ def plot_figures_of_merit(
     return ax
 
 
-def _means(distance: np.ndarray, value: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+def _binned_means(distance: np.ndarray, value: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     """Sorted distances, rounded to multiples of `tolerance`, and the mean of the values at each."""
     ring, inverse = np.unique(np.round(distance / tolerance), return_inverse=True)
     return ring * tolerance, np.bincount(inverse, value) / np.bincount(inverse)
 
 
-def _dress(panel: Axes, heading: str, unit: str, reach: float) -> None:
+def _style_panel(panel: Axes, heading: str, unit: str, max_distance: float) -> None:
     panel.set_title(heading, loc="left", fontsize=11, color=INK)
     panel.set_ylabel(unit, fontsize=9, color=INK)
-    panel.set_xlim(0, reach)
+    panel.set_xlim(0, max_distance)
     low, high = panel.get_ylim()
     panel.set_ylim(min(low, 0), high)  # from zero, so that small variations look small
     soften_axes(panel)

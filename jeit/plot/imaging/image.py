@@ -19,7 +19,17 @@ from jeit.electrodes import AbstractElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import Inclusion, Raster
 from jeit.mesh import Mesh, check_flat, measures
-from jeit.plot.axes import CHANGE, INK, SOFT, ColourScale, axes_or_new, bare, check_scale, draw_scale_bar, extent_of
+from jeit.plot.axes import (
+    CHANGE,
+    INK,
+    SOFT,
+    ColourScale,
+    axes_or_new,
+    check_scale,
+    draw_scale_bar,
+    extent_of,
+    hide_axes,
+)
 from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions
 
 
@@ -40,7 +50,7 @@ def plot_mesh(
     if electrodes is not None:
         draw_electrodes(mesh, electrodes, ax=ax)
     extent = extent_of(points)
-    bare(ax, extent)
+    hide_axes(ax, extent)
     draw_scale_bar(ax, extent)
     ax.set_title(f"{mesh.num_points:,} nodes, {mesh.num_cells:,} cells" if title is None else title)
     return ax
@@ -72,13 +82,13 @@ def draw_slice_outline(
     ax.contour(shown, [0.5], extent=wider, origin="upper", colors=INK, linewidths=0.9, zorder=2)
 
 
-def slice_text(mesh: Mesh, height: float | None = None, what: str = "slice") -> str:
+def slice_text(mesh: Mesh, height: float | None = None, subject: str = "slice") -> str:
     """Text for a slice at z = `height` metres (default: half the height), such as "slice at z = 20.0 mm"; empty for a
     plane mesh."""
     if mesh.dimension == 2:
         return ""
     z = np.asarray(mesh.points)[:, 2]
-    return f"{what} at z = {1e3 * ((z.min() + z.max()) / 2 if height is None else height):.1f} mm"
+    return f"{subject} at z = {1e3 * ((z.min() + z.max()) / 2 if height is None else height):.1f} mm"
 
 
 def plot_image(
@@ -132,7 +142,7 @@ def plot_image(
         flat = {"shading": "flat", "edgecolors": "face", "linewidth": 0.5}
         style = flat if image.shape == (mesh.num_cells,) else {"shading": "gouraud"}
         drawn = ax.tripcolor(triangles, colours.factor * image, **style, **colours.keywords)
-    _dress(ax, mesh, electrodes, inclusions, extent, title)
+    _finish_axes(ax, mesh, electrodes, inclusions, extent, title)
     colours.draw_bar(ax, drawn)
     return ax
 
@@ -166,18 +176,18 @@ def plot_raster(
     colours = scale.of(shown, "S")
     ax = axes_or_new(ax)
     drawn = ax.imshow(colours.factor * pixels, extent=extent, interpolation="nearest", **colours.keywords)
-    _dress(ax, mesh, electrodes, inclusions, extent, title)
+    _finish_axes(ax, mesh, electrodes, inclusions, extent, title)
     colours.draw_bar(ax, drawn)
     return ax
 
 
-def _dress(ax: Axes, mesh: Mesh | None, electrodes, inclusions, extent, title: str | None) -> None:
+def _finish_axes(ax: Axes, mesh: Mesh | None, electrodes, inclusions, extent, title: str | None) -> None:
     if mesh is not None and mesh.dimension == 2:
         draw_outline(mesh, ax)
     if mesh is not None and electrodes is not None:
         draw_electrodes(mesh, electrodes, ax=ax)
     draw_inclusions(inclusions, ax=ax)
-    bare(ax, extent, numbered=electrodes is not None)
+    hide_axes(ax, extent, numbered=electrodes is not None)
     draw_scale_bar(ax, extent)
     if title:
         ax.set_title(title)

@@ -24,11 +24,11 @@ from jeit.plot.axes import (
     SOFT,
     ColourScale,
     FittedScale,
-    bare,
     check_scale,
     draw_colour_bar,
     draw_scale_bar,
-    prefixed,
+    hide_axes,
+    with_si_prefix,
 )
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import check_body, draw_outline, draw_slice_outline, slice_text
@@ -38,10 +38,10 @@ from jeit_solvers.engines import as_array
 _PIXELS, _GREY = 160, "#dfe2e6"
 SHEET_FRAMES = 12
 """Default of the maximum number of frames of a contact sheet."""
-SERIES_FRAMES, _BESIDE = 12, 6
+SERIES_FRAMES, _FRAMES_PER_ROW = 12, 6
 """Number of frames at the beginning of the picture of a series."""
 # Maximum number of refused frames named below a contact sheet.
-_NAMED = 6
+_MAX_NAMED = 6
 
 
 class FrameCount(NamedTuple):
@@ -53,9 +53,9 @@ class FrameCount(NamedTuple):
     names: Sequence[str]
 
 
-def chosen_frames(number: int, most: int) -> list[int]:
-    """Numbers of at most `most` evenly spaced frames out of `number`, including the first and the last."""
-    return [int(one) for one in np.unique(np.linspace(0, number - 1, min(number, most)).round())]
+def chosen_frames(num_frames: int, max_frames: int) -> list[int]:
+    """Numbers of at most `max_frames` evenly spaced frames out of `num_frames`, including the first and the last."""
+    return [int(one) for one in np.unique(np.linspace(0, num_frames - 1, min(num_frames, max_frames)).round())]
 
 
 class FramePicture:
@@ -88,7 +88,7 @@ class FramePicture:
             draw_slice_outline(body, extent, ax)
         if electrodes is not None:
             draw_electrodes(mesh, electrodes, numbers=number, ax=ax)
-        bare(ax, extent, numbered=number and electrodes is not None)
+        hide_axes(ax, extent, numbered=number and electrodes is not None)
         if bar:
             draw_scale_bar(ax, extent)
         middle = (extent[0] + extent[1]) / 2, (extent[2] + extent[3]) / 2
@@ -154,7 +154,7 @@ def plot_frames(
         pictures[-1].show(values[frame], said[frame])
     if scale.bar:
         where = figure.add_subplot(places[:, -1])
-        draw_colour_bar(where, pictures[0].drawn, fitted.label, signed=scale.difference, place=where)
+        draw_colour_bar(where, pictures[0].drawn, fitted.label, signed=scale.difference, position=where)
     if count is None:
         refused = [title for title, row in zip(said, values, strict=True) if not np.isfinite(row).all()]
         count = FrameCount(len(values), len(refused), refused)
@@ -168,15 +168,15 @@ def _count_text(count: FrameCount, chosen: int, mesh: Mesh) -> str:
     """Text on the number of frames drawn and on refused frames."""
     parts = [] if chosen == count.number else [f"{chosen} of {count.number} frames"]
     if count.refused:
-        some = ", ".join(count.names[:_NAMED]) + (" …" if count.refused > _NAMED else "")
+        some = ", ".join(count.names[:_MAX_NAMED]) + (" …" if count.refused > _MAX_NAMED else "")
         parts.append(f"{count.refused} of {count.number} refused: {some}")
-    return "; ".join([*parts, *filter(None, [slice_text(mesh, what="slices")])])
+    return "; ".join([*parts, *filter(None, [slice_text(mesh, subject="slices")])])
 
 
 # Minimum amplitude for the phase to be drawn: as a share of the maximum amplitude, and as a multiple of its noise.
-_SHARE, _NOISE = 0.15, 3.0
+_MIN_PHASE_SHARE, _MIN_PHASE_SNR = 0.15, 3.0
 # Minimum number of frames for a spectrum, as for `jeit.image.oscillation`.
-_FEWEST = 5
+_MIN_FRAMES = 5
 
 
 def plot_series(
@@ -196,13 +196,13 @@ def plot_series(
     """
     check_body(series.mesh, electrodes)
     rows = len(oscillations)
-    lines = -(-min(len(series.times), SERIES_FRAMES) // _BESIDE)
+    lines = -(-min(len(series.times), SERIES_FRAMES) // _FRAMES_PER_ROW)
     figure = Figure(figsize=(11.0, 2.2 * lines + 3.4 * rows + 3.4), layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=[2.2 * lines, 3.4 * rows + 3.4])
     sheet, others = parts
     _draw_frames(sheet, series, electrodes, lines, height)
     grid = others.add_gridspec(rows + 1, 3, height_ratios=[1.0] * (rows + 1))
-    maps = _Maps(series, electrodes, height)
+    maps = _RegionMaps(series, electrodes, height)
     functional = ", ".join(filter(None, ["functional image", slice_text(series.mesh, height)]))
     deviation = ColourScale(difference=False, quantity="Standard deviation over time")
     maps.draw(others.add_subplot(grid[0, 0]), series.functional(), deviation, functional)
@@ -210,11 +210,11 @@ def plot_series(
         amplitude = ColourScale(difference=False, quantity=f"Amplitude at {one.frequency:.3g} Hz")
         said = f"{one.frequency:.4g} Hz (resolution {one.resolution:.2g} Hz)"
         maps.draw(others.add_subplot(grid[row, 1]), one.amplitude, amplitude, said)
-        clear = (one.amplitude > _SHARE * one.amplitude.max()) & (one.amplitude > _NOISE * one.noise)
+        clear = (one.amplitude > _MIN_PHASE_SHARE * one.amplitude.max()) & (one.amplitude > _MIN_PHASE_SNR * one.noise)
         maps.draw_phase(others.add_subplot(grid[row, 2]), np.where(clear, np.degrees(one.phase), np.nan))
     means = {name: series.mean_change(region) for name, region in regions.items()}
     largest = max((float(np.nanmax(np.abs(one))) for one in means.values()), default=0.0)
-    factor, unit = prefixed(largest or 1.0, series.unit)
+    factor, unit = with_si_prefix(largest or 1.0, series.unit)
     spectra = {name: _spectrum(factor * mean, series.times) for name, mean in means.items()} if series.timed else {}
     drawn = {name: one for name, one in spectra.items() if one is not None}
     # Without oscillations, curves stand beside the functional image.
@@ -231,17 +231,17 @@ def _draw_frames(
 ) -> None:
     """Draw evenly spaced frames in so many lines, on one colour scale."""
     chosen, fitted = chosen_frames(len(series.times), SERIES_FRAMES), fit_scale(series.changes, series.mesh)
-    places = figure.add_gridspec(lines, _BESIDE + 1, width_ratios=[1] * _BESIDE + [0.05])
+    places = figure.add_gridspec(lines, _FRAMES_PER_ROW + 1, width_ratios=[1] * _FRAMES_PER_ROW + [0.05])
     for place, frame in enumerate(chosen):
-        ax = figure.add_subplot(places[place // _BESIDE, place % _BESIDE])
+        ax = figure.add_subplot(places[place // _FRAMES_PER_ROW, place % _FRAMES_PER_ROW])
         picture = FramePicture(ax, series.mesh, electrodes, fitted, number=False, bar=place == 0, height=height)
         picture.show(series.changes[frame], series.titles[frame])
         if place == 0:
             where = figure.add_subplot(places[:, -1])
-            draw_colour_bar(where, picture.drawn, fitted.label, signed=True, place=where)
+            draw_colour_bar(where, picture.drawn, fitted.label, signed=True, position=where)
 
 
-class _Maps:
+class _RegionMaps:
     """Maps of values per cell, sampled on a common raster."""
 
     def __init__(self, series: ImageSeries, electrodes: AbstractElectrodes | None, height: float | None):
@@ -267,7 +267,7 @@ class _Maps:
             draw_slice_outline(np.where(np.asarray(self.raster.cell) >= 0, 0.0, np.nan), extent, ax)
         if self.electrodes is not None:
             draw_electrodes(self.mesh, self.electrodes, numbers=False, ax=ax)
-        bare(ax, extent, numbered=False)
+        hide_axes(ax, extent, numbered=False)
         draw_scale_bar(ax, extent)
         ax.set_title(title, fontsize=10)
         return drawn
@@ -275,7 +275,7 @@ class _Maps:
 
 def _spectrum(mean: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Frequencies and amplitudes of a curve; None if there are too few frames for more than one frequency."""
-    if np.isfinite(mean).sum() < _FEWEST:
+    if np.isfinite(mean).sum() < _MIN_FRAMES:
         return None
     frequencies, amplitude = amplitude_spectrum(mean, times)
     return (frequencies, amplitude) if len(frequencies) > 1 else None
@@ -288,7 +288,7 @@ def _draw_curves(ax: Axes, means: Mapping[str, np.ndarray], series: ImageSeries,
     ax.set(xlabel="Time (s)" if series.timed else "Frame", ylabel=f"Mean change ({unit})", title="regions over time")
     if means:
         ax.legend(fontsize=8, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.25), ncols=3)
-    _softened(ax)
+    _soften(ax)
 
 
 def _draw_spectra(ax: Axes, spectra: Mapping, oscillations: Sequence[Oscillation], unit: str) -> None:
@@ -298,9 +298,9 @@ def _draw_spectra(ax: Axes, spectra: Mapping, oscillations: Sequence[Oscillation
     for one in oscillations:
         ax.axvline(one.frequency, color=INK, linewidth=0.8, linestyle=":")
     ax.set(xlabel="Frequency (Hz)", ylabel=f"Amplitude ({unit})", title="their spectra")
-    _softened(ax)
+    _soften(ax)
 
 
-def _softened(ax: Axes) -> None:
+def _soften(ax: Axes) -> None:
     ax.title.set_fontsize(10)
     ax.spines[["top", "right"]].set_visible(False)

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
-from jeit.plot.axes import INK, SOFT, axes_or_new, prefixed
+from jeit.plot.axes import INK, SOFT, axes_or_new, with_si_prefix
 from jeit.protocol import Protocol
 
 MEASURED = "#1f6fb4"
@@ -41,7 +41,7 @@ def plot_voltages(
         raise ValueError("there must be channels to draw, and their voltages finite; mask those that are not.")
     channel = np.flatnonzero(used)
     level = np.sqrt(np.mean(measured[used] ** 2))
-    factor, unit = prefixed(float(np.abs(measured[used]).max()), "V")
+    factor, unit = with_si_prefix(float(np.abs(measured[used]).max()), "V")
     misfit = np.linalg.norm((modelled - measured)[used]) / np.linalg.norm(measured[used])
     ax = axes_or_new(ax, (8.4, 5.0))
     ax.set_axis_off()

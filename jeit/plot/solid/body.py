@@ -9,22 +9,22 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 
-from jeit.electrodes.electrode_shapes import Draped, ElectrodeShapes, surface_triangles
+from jeit.electrodes.electrode_shapes import ElectrodeShapes, ProjectionSurface, surface_triangles
 from jeit.mesh import Mesh
 from jeit.plot.axes import SOFT
 from jeit.plot.imaging.electrodes import METAL, at_one_place
 from jeit.plot.solid.scene import BODY, Scene, draw_number
 
-_HULL = 0.1
+_HULL_OPACITY = 0.1
 # Cosine of the angle between the normals of two facets, below which their common edge is drawn as an edge of the body.
-_SHARP = 0.85
+_EDGE_COSINE = 0.85
 # Divided by the size of the body: distance by which electrodes are drawn nearer to the viewer than the surface under
 # them, and distance of numbers from electrodes.
-_BEFORE, _AWAY = 0.06, 0.045
+_ELECTRODE_OFFSET, _NUMBER_DISTANCE = 0.06, 0.045
 # Minimum distance between numbers, so that they are readable, divided by the size of the body.
-_CLEAR = 0.03
+_MIN_NUMBER_DISTANCE = 0.03
 # Share of the visible body that electrodes may cover before they are drawn translucent, and their opacity then.
-_HIDES, _GLASS = 0.4, 0.16
+_MAX_COVERED_SHARE, _TRANSLUCENT_OPACITY = 0.4, 0.16
 
 
 def size_of(mesh: Mesh) -> float:
@@ -35,7 +35,7 @@ def size_of(mesh: Mesh) -> float:
 def add_hull(scene: Scene, mesh: Mesh) -> None:
     """Add the translucent boundary of a solid to a scene, with its edges and its outline."""
     points, triangles = np.asarray(mesh.points), surface_triangles(mesh)
-    scene.add_triangles(points, triangles, np.array(to_rgba(BODY, _HULL)), smooth=True, lit=False)
+    scene.add_triangles(points, triangles, np.array(to_rgba(BODY, _HULL_OPACITY)), smooth=True, lit=False)
     scene.add_lines(points[visible_edges(points, triangles, scene.camera.toward)], SOFT, 0.9)
 
 
@@ -55,7 +55,7 @@ def visible_edges(points, triangles, toward: Float[np.ndarray, "3"]) -> np.ndarr
     # Facets parallel to the line of sight, within rounding errors, face neither to the viewer nor away.
     side = np.stack([first @ toward, second @ toward])
     side = np.where(np.abs(side) < 1e-9, 0, side)
-    drawn = (np.sum(first * second, axis=1) < _SHARP) | ((side > 0).any(axis=0) & (side <= 0).any(axis=0))
+    drawn = (np.sum(first * second, axis=1) < _EDGE_COSINE) | ((side > 0).any(axis=0) & (side <= 0).any(axis=0))
     alone = np.ones(len(edges), bool)
     alone[pair] = alone[pair + 1] = False
     return np.concatenate([edges[pair[drawn]], edges[alone]])
@@ -67,12 +67,16 @@ def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, 
 
     `through`: whether the electrodes in front become translucent if they would hide much of the body.
     """
-    surface, size = Draped(points, triangles), float(np.ptp(points, axis=0).max())
+    surface, size = ProjectionSurface(points, triangles), float(np.ptp(points, axis=0).max())
     polygons = shapes.polygons()
     normals = surface.normals(np.array([corners.mean(axis=0) for corners in polygons]))
     rims = _rims(polygons, shapes.electrode, 1e-6 * size)
     front = [one for one, outward in zip(polygons, normals, strict=True) if outward @ scene.camera.toward > 0]
-    hides = through and sum(_seen_area(scene, one) for one in front) > _HIDES * _seen_area(scene, points[triangles]) / 2
+    hides = (
+        through
+        and sum(_visible_area(scene, one) for one in front)
+        > _MAX_COVERED_SHARE * _visible_area(scene, points[triangles]) / 2
+    )
     for corners, outward, rim in zip(polygons, normals, rims, strict=True):
         if len(corners) == 1:
             angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
@@ -80,23 +84,23 @@ def add_electrodes(scene: Scene, points, triangles, shapes: ElectrodeShapes, *, 
             corners = corners + 0.012 * size * (np.outer(np.cos(angle), across) + np.outer(np.sin(angle), up))
             rim = np.ones(12, bool)
         side = float(np.sign(outward @ scene.camera.toward))
-        colour = to_rgba(METAL, _GLASS if hides and side > 0 else 1.0)
-        scene.add_polygon(corners, colour, before=_BEFORE * size * side, rim=rim)
+        colour = to_rgba(METAL, _TRANSLUCENT_OPACITY if hides and side > 0 else 1.0)
+        scene.add_polygon(corners, colour, before=_ELECTRODE_OFFSET * size * side, rim=rim)
 
 
-def _seen_area(scene: Scene, corners: Float[np.ndarray, "*m k 3"]) -> float:
+def _visible_area(scene: Scene, corners: Float[np.ndarray, "*m k 3"]) -> float:
     """Total area of polygons as projected onto the page, m²."""
     x, y = np.moveaxis(scene.camera.on_page(corners.reshape(-1, 3)).reshape(*corners.shape[:-1], 2), -1, 0)
     twice = (x * np.roll(y, -1, axis=-1) - np.roll(x, -1, axis=-1) * y).sum(axis=-1)
     return float(np.abs(twice).sum() / 2)
 
 
-def _rims(polygons, electrode, near: float) -> list[np.ndarray]:
+def _rims(polygons, electrode, offset: float) -> list[np.ndarray]:
     """Whether each edge of each polygon is on the rim of its electrode: no other polygon of the electrode shares it.
-    Corners closer than `near` are taken as equal."""
+    Corners closer than `offset` are taken as equal."""
     keys = []
     for corners, number in zip(polygons, electrode.tolist(), strict=True):
-        places = [tuple(place) for place in np.round(corners / near).astype(np.int64).tolist()]
+        places = [tuple(place) for place in np.round(corners / offset).astype(np.int64).tolist()]
         others = [*places[1:], places[0]]
         keys.append([(number, *sorted(pair)) for pair in zip(places, others, strict=True)])
     count = Counter(key for one in keys for key in one)
@@ -112,11 +116,11 @@ def number_electrodes(
     Electrodes seen close to each other share one text.
     """
     middles = shapes.middles()
-    normals = Draped(points, triangles).normals(middles)
-    places = scene.camera.on_page(middles + _AWAY * float(np.ptp(points, axis=0).max()) * normals)
+    normals = ProjectionSurface(points, triangles).normals(middles)
+    places = scene.camera.on_page(middles + _NUMBER_DISTANCE * float(np.ptp(points, axis=0).max()) * normals)
     fontsize = 8 if len(places) <= 20 else 6.5
     faint = normals @ scene.camera.toward < -0.05
-    near, clear = places[~faint], _CLEAR * float(np.ptp(points, axis=0).max())
+    near, clear = places[~faint], _MIN_NUMBER_DISTANCE * float(np.ptp(points, axis=0).max())
     seen = scene.camera.on_page(points)[:, 0]
     left, right = seen.min() + clear, seen.max() - clear
     for side in (False, True) if behind else (False,):

@@ -10,7 +10,7 @@ from matplotlib.colors import to_rgba
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_kind
-from jeit.electrodes.electrode_shapes import Draped, shapes_of
+from jeit.electrodes.electrode_shapes import ProjectionSurface, shapes_of
 from jeit.layout import SurfaceLayout
 from jeit.mesh import measures
 from jeit.mesh.geodesic import Triangles
@@ -21,7 +21,7 @@ from jeit.plot.solid.scene import FROM_THE_CORNER, Camera, Scene, bare_in_space
 from jeit.plot.solid.shaded_surface import BODY, checked_values, colours_of, mappable
 
 # Tolerance for marks being hidden by the surface on which they lie: distance divided by the size of the skin.
-_BEFORE = 0.02
+_MARK_OFFSET = 0.02
 
 
 def plot_curved_skin(
@@ -56,7 +56,7 @@ def plot_curved_skin(
         fitted = scale.of(image, "S")
         colours = colours_of(fitted, image if len(image) == len(cells) else image[cells].mean(axis=1))
     scene.add_triangles(points, cells, colours, smooth=True)
-    surface = Draped(points, cells)
+    surface = ProjectionSurface(points, cells)
     # Pieces are sorted by the depth of their centres, so discs are moved in front of the triangles on which they lie.
     before = float(np.sqrt(np.asarray(measures(mesh)).max()))
     for corners in shapes_of(mesh, layout.discs(1.0)).polygons():
@@ -68,7 +68,7 @@ def plot_curved_skin(
     triangles = Triangles.of(mesh)
     for (name, places), colour in zip((marks or {}).items(), SERIES_COLOURS, strict=False):
         on_it = triangles.nearest(np.atleast_2d(np.asarray(places, float))).points
-        seen = _on_this_side(mesh, on_it, camera)
+        seen = _faces_viewer(mesh, on_it, camera)
         ax.plot(*camera.on_page(seen).T, "o", color=colour, markersize=5, markeredgecolor="white", label=name, zorder=5)
     bare_in_space(ax, camera, points, numbered=False)
     if marks:
@@ -88,7 +88,7 @@ def plot_curved_skin(
     return ax
 
 
-def _on_this_side(mesh, places, camera: Camera):
+def _faces_viewer(mesh, places, camera: Camera):
     """Select the points that the surface does not hide: no part of it is nearer to the viewer on the same ray."""
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
     flat, deep = camera.on_page(corners), camera.nearness(corners)
@@ -102,6 +102,6 @@ def _on_this_side(mesh, places, camera: Camera):
         share = areas / np.where(total == 0, 1.0, total)[:, None]
         over = (share >= 0).all(axis=1) & (total != 0)
         nearer = (share * deep).sum(axis=1)[over]
-        if not (nearer > depth + _BEFORE * size_of(mesh)).any():
+        if not (nearer > depth + _MARK_OFFSET * size_of(mesh)).any():
             seen.append(place)
     return np.array(seen).reshape(-1, 3)

@@ -26,7 +26,7 @@ from jeit.plot.solid.slices import cell_values
 if TYPE_CHECKING:
     import pyvista  # pyright: ignore[reportMissingImports]
 
-_SIZE = (1280, 860)
+_WINDOW_SIZE = (1280, 860)
 
 
 def view_solid(
@@ -54,7 +54,7 @@ def view_solid(
         "clim": (fitted.keywords["vmin"], fitted.keywords["vmax"]),
     }
     points = 1e3 * np.asarray(mesh.points)
-    plotter = pv.Plotter(off_screen=off_screen, window_size=list(_SIZE))
+    plotter = pv.Plotter(off_screen=off_screen, window_size=list(_WINDOW_SIZE))
     if not off_screen:
         # Depth peeling sorts translucent surfaces; without a graphics card it would make them disappear.
         plotter.enable_depth_peeling()
@@ -100,10 +100,10 @@ def can_view() -> str:
         return ""
     if not (display := os.environ.get("DISPLAY", "")):
         return "there is no display"
-    return "" if _answers(display) else f"nothing answers at DISPLAY={display[:40]}"
+    return "" if _display_responds(display) else f"nothing answers at DISPLAY={display[:40]}"
 
 
-def _answers(display: str) -> bool:
+def _display_responds(display: str) -> bool:
     """Whether an X server listens at a display of this machine; True for displays of other machines and for other
     texts."""
     host, _, rest = display.rpartition(":")

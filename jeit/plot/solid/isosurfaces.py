@@ -15,31 +15,31 @@ from jeit.arguments import check_kind, describe, is_number
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
-from jeit.image.plane import check_solid, passed_edges
+from jeit.image.plane import check_solid, crossed_edges
 from jeit.mesh import Mesh
 from jeit.plot.axes import CHANGE, INK, ColourScale, FittedScale, axes_or_new, check_scale
 from jeit.plot.solid.body import add_electrodes, add_hull, number_electrodes
 from jeit.plot.solid.scene import FROM_THE_CORNER, Camera, Scene, bare_in_space, mark_sign
 from jeit.plot.solid.shaded_surface import colours_of, mappable
 
-_DASHED = {"fill": False, "edgecolor": INK, "linewidth": 1, "linestyle": (0, (4, 3)), "zorder": 3}
+_DASH_PATTERN = {"fill": False, "edgecolor": INK, "linewidth": 1, "linestyle": (0, (4, 3)), "zorder": 3}
 
 
-def draw_seen(ax: Axes, camera: Camera, inclusion: Inclusion) -> None:
+def draw_visible_body(ax: Axes, camera: Camera, inclusion: Inclusion) -> None:
     """Draw the outline of an inclusion as seen by the camera, and its sign at its centroid."""
     x, y = camera.on_page(np.array(inclusion.centroid))
     if inclusion.form is None:  # a ball, whose outline is a circle from every side
-        ax.add_patch(Circle((x, y), inclusion.radius, **_DASHED))
+        ax.add_patch(Circle((x, y), inclusion.radius, **_DASH_PATTERN))
     else:
         _draw_round(ax, camera.on_page(inclusion.form.surface().points))
     mark_sign(ax, x, y, inclusion.sign)
 
 
-def draw_cut(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
+def draw_body_in_plane(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
     """Draw the outline of the section of an inclusion by a plane, and its sign in the middle."""
     if inclusion.form is not None:
         surface = inclusion.form.surface()
-        cut = passed_edges(surface.triangles, plane.distance(surface.points)).at_corners(surface.points)
+        cut = crossed_edges(surface.triangles, plane.distance(surface.points)).at_corners(surface.points)
         if len(cut):
             corners = _draw_round(ax, plane.on_page(cut.reshape(-1, 3)))
             x, y = (corners.min(axis=0) + corners.max(axis=0)) / 2
@@ -49,21 +49,21 @@ def draw_cut(ax: Axes, plane: Plane, inclusion: Inclusion) -> None:
     squared = inclusion.radius**2 - float(plane.distance(centre)) ** 2
     if squared > 0:
         x, y = plane.on_page(centre)
-        ax.add_patch(Circle((x, y), float(np.sqrt(squared)), **_DASHED))
+        ax.add_patch(Circle((x, y), float(np.sqrt(squared)), **_DASH_PATTERN))
         mark_sign(ax, x, y, inclusion.sign)
 
 
 def _draw_round(ax: Axes, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "k 2"]:
     """Draw the convex hull of points as a dashed line, and return its corners."""
     corners = points[ConvexHull(points, qhull_options="QJ").vertices]
-    ax.add_patch(Polygon(corners, **_DASHED))
+    ax.add_patch(Polygon(corners, **_DASH_PATTERN))
     return corners
 
 
 HALF = (0.5,)
 OUTER = 0.3
 # Minimum peak of a sign for its isosurfaces to be drawn, relative to the maximum change of either sign.
-_LEAST_PEAK = 0.3
+_MIN_PEAK = 0.3
 
 
 def plot_isosurfaces(
@@ -136,7 +136,7 @@ def draw_in_space(
     if shapes is not None:
         number_electrodes(ax, scene, points, wall, shapes)
     for one in inclusions:
-        draw_seen(ax, camera, one)
+        draw_visible_body(ax, camera, one)
     return ax
 
 
@@ -151,7 +151,7 @@ def level_surfaces(
     shares = check_levels(levels)
     image = node_values(mesh, np.asarray(values))
     base = 0.0 if both else float(image.min())
-    least = _LEAST_PEAK * float(np.abs(image - base).max())
+    least = _MIN_PEAK * float(np.abs(image - base).max())
     found = []
     for sign in (1.0, -1.0) if both else (1.0,):
         peak = float((sign * (image - base)).max())

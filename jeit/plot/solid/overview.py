@@ -20,9 +20,9 @@ from jeit.plot.solid.body import size_of
 from jeit.plot.solid.isosurfaces import HALF, check_drawn, draw_in_space
 from jeit.plot.solid.scene import FROM_THE_CORNER, Camera
 from jeit.plot.solid.shaded_surface import mappable
-from jeit.plot.solid.slices import cell_values, draw_slice, dress_slice
+from jeit.plot.solid.slices import cell_values, draw_slice, finish_slice
 
-_MOST_LISTED = 5
+_MAX_LISTED = 5
 """Maximum number of inclusions listed in the caption."""
 
 
@@ -64,11 +64,11 @@ def plot_solid(
         seen = plane.on_page(np.asarray(mesh.points))
         x, y = (seen.min(axis=0) + seen.max(axis=0)) / 2
         # All slices have the same scale of lengths.
-        dress_slice(panel, plane, (x - half, x + half, y - half, y + half), cross=True)
+        finish_slice(panel, plane, (x - half, x + half, y - half, y + half), cross=True)
     _caption(figure.add_subplot(grid[1, 2]), place, levels, inclusions, difference=scale.difference)
     if scale.bar:
         bar = figure.add_subplot(grid[:, 3])
-        draw_colour_bar(space, mappable(fitted), fitted.label, signed=scale.difference, place=bar)
+        draw_colour_bar(space, mappable(fitted), fitted.label, signed=scale.difference, position=bar)
     return figure
 
 
@@ -85,20 +85,20 @@ def _caption(ax: Axes, place, levels, inclusions: Sequence[Inclusion], *, differ
     ax.set_axis_off()
     shares = ", ".join(f"{100 * share:g}" for share in sorted(levels))
     of = "of the strongest change" if difference else "of the way from least to greatest"
-    lines = [f"slices through ({_millimetres(place)}) mm", f"surfaces at {shares} % {of}"]
+    lines = [f"slices through ({_position_text(place)}) mm", f"surfaces at {shares} % {of}"]
     if inclusions:
         balls = "" if all(one.form for one in inclusions) else ", drawn as balls of their volume"
         lines += ["", f"found, dashed{balls}:"]
-    for one in inclusions[:_MOST_LISTED]:
+    for one in inclusions[:_MAX_LISTED]:
         sign = "+" if one.sign > 0 else "−"
         column = "column of " if one.is_column else ""
-        lines.append(f"{sign}  {column}{1e6 * one.area:.3g} cm³ at ({_millimetres(one.centroid)}) mm")
+        lines.append(f"{sign}  {column}{1e6 * one.area:.3g} cm³ at ({_position_text(one.centroid)}) mm")
         if one.contrast_interval is not None:
             lines.append(f"    {interval_text(one.contrast_interval, signed_percent)}")
-    if len(inclusions) > _MOST_LISTED:
-        lines.append(f"and {len(inclusions) - _MOST_LISTED} more")
+    if len(inclusions) > _MAX_LISTED:
+        lines.append(f"and {len(inclusions) - _MAX_LISTED} more")
     ax.text(0, 0.9, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=8.5, color=INK, linespacing=1.6)
 
 
-def _millimetres(place) -> str:
-    return ", ".join(f"{1e3 * value:.0f}" for value in place).replace("-", "−")
+def _position_text(position) -> str:
+    return ", ".join(f"{1e3 * value:.0f}" for value in position).replace("-", "−")

@@ -20,9 +20,9 @@ from jeit.plot.axes import INK, draw_scale_bar
 
 # Direction towards the light, above and to the left of the viewer: components to the right and up on the page, and
 # towards the viewer.
-_LIGHT = np.array([-0.35, 0.5, 0.79])
+_LIGHT_DIRECTION = np.array([-0.35, 0.5, 0.79])
 # Minimum brightness of surfaces.
-_DARKEST = 0.66
+_MIN_BRIGHTNESS = 0.66
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,13 @@ class Camera:
         return points @ self.toward
 
     def light(self, normals: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, " m"]:
-        """Brightness (m,) of surfaces with the given normals of any length, from `_DARKEST` to 1; both sides of a
-        surface are lit alike."""
+        """Brightness (m,) of surfaces with the given normals of any length, from `_MIN_BRIGHTNESS` to 1; both sides of
+        a surface are lit alike."""
         length = np.maximum(np.linalg.norm(normals, axis=-1), 1e-300)
         direction = normals / length[:, None]
         direction = direction * np.where(direction @ self.toward < 0, -1.0, 1.0)[:, None]
-        lamp = _LIGHT[0] * self.right + _LIGHT[1] * self.up + _LIGHT[2] * self.toward
-        return _DARKEST + (1 - _DARKEST) * np.clip(direction @ lamp / np.linalg.norm(lamp), 0, 1)
+        lamp = _LIGHT_DIRECTION[0] * self.right + _LIGHT_DIRECTION[1] * self.up + _LIGHT_DIRECTION[2] * self.toward
+        return _MIN_BRIGHTNESS + (1 - _MIN_BRIGHTNESS) * np.clip(direction @ lamp / np.linalg.norm(lamp), 0, 1)
 
 
 FROM_THE_CORNER = Camera()
@@ -85,7 +85,7 @@ FROM_THE_CORNER = Camera()
 
 _RIM = [withStroke(linewidth=2.2, foreground="white")]
 _HALO = [withStroke(linewidth=3, foreground="white")]
-_LETTERS = ("x", "y", "z")
+_AXIS_NAMES = ("x", "y", "z")
 # Colour of surfaces without values.
 BODY = "#b9bec6"
 
@@ -207,7 +207,7 @@ def draw_axes_cross(ax: Axes, directions: Float[np.ndarray, "3 2"], place: tuple
 
     `directions`: (3, 2), projected unit vectors; `length`: length of an arrow that is not shortened by projection.
     """
-    for letter, direction in zip(_LETTERS, directions, strict=True):
+    for letter, direction in zip(_AXIS_NAMES, directions, strict=True):
         if np.hypot(*direction) < 0.15:
             continue
         tip = np.array(place) + length * direction

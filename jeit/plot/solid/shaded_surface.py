@@ -96,13 +96,13 @@ def checked_values(values: ArrayLike, num_points: int, num_triangles: int) -> Fl
 
 def colours_of(fitted: FittedScale, values: Float[np.ndarray, " m"]) -> Float[np.ndarray, "m 4"]:
     """Colours (m, 4) of values in a fitted colour scale."""
-    return colormaps[fitted.keywords["cmap"]](_normalised(fitted)(fitted.factor * np.asarray(values)))
+    return colormaps[fitted.keywords["cmap"]](_normalise(fitted)(fitted.factor * np.asarray(values)))
 
 
 def mappable(fitted: FittedScale) -> ScalarMappable:
     """Create a matplotlib mappable with the fitted colour scale, for a colour bar."""
-    return ScalarMappable(_normalised(fitted), fitted.keywords["cmap"])
+    return ScalarMappable(_normalise(fitted), fitted.keywords["cmap"])
 
 
-def _normalised(fitted: FittedScale) -> Normalize:
+def _normalise(fitted: FittedScale) -> Normalize:
     return Normalize(fitted.keywords["vmin"], fitted.keywords["vmax"])

@@ -15,12 +15,12 @@ from jeit.arguments import describe
 from jeit.electrodes import AbstractElectrodes
 from jeit.electrodes.electrode_shapes import ElectrodeShapes, shapes_of
 from jeit.image import Inclusion, Plane, cut_by_plane
-from jeit.image.plane import AXES, passed_edges
+from jeit.image.plane import AXES, crossed_edges
 from jeit.mesh import Mesh
 from jeit.plot.axes import CHANGE, INK, ColourScale, FittedScale, axes_or_new, draw_colour_bar, draw_scale_bar
 from jeit.plot.imaging.electrodes import METAL
 from jeit.plot.solid.body import size_of
-from jeit.plot.solid.isosurfaces import check_drawn, draw_cut
+from jeit.plot.solid.isosurfaces import check_drawn, draw_body_in_plane
 from jeit.plot.solid.scene import draw_axes_cross, draw_number
 
 MOST_SLICES = 64
@@ -50,7 +50,7 @@ def plot_slice(
     fitted = scale.of(image, "S/m")
     ax = axes_or_new(ax)
     drawn = draw_slice(ax, mesh, image, plane, electrodes, inclusions=inclusions, fitted=fitted)
-    dress_slice(ax, plane, window_of(ax), cross=True)
+    finish_slice(ax, plane, window_of(ax), cross=True)
     fitted.draw_bar(ax, drawn)
     return ax
 
@@ -75,10 +75,10 @@ def plot_slices(
     planes = planes_along(mesh, axis, at)
     image = cell_values(mesh, values)
     fitted = scale.of(image, "S/m")
-    shapes = _shapes(mesh, electrodes)
+    shapes = _electrode_shapes(mesh, electrodes)
     points = planes[0].on_page(np.asarray(mesh.points))
     (left, low), (right, high) = points.min(axis=0), points.max(axis=0)
-    columns = _columns(len(planes), (high - low) / (right - left))
+    columns = _num_columns(len(planes), (high - low) / (right - left))
     rows = -(-len(planes) // columns)
     width = min(3.2, 12 / columns)
     height = width * ((high - low) + 0.2 * (right - left)) / (right - left)
@@ -91,10 +91,10 @@ def plot_slices(
     panels = [figure.add_subplot(grid[divmod(k, columns)]) for k in range(len(planes))]
     for panel, plane in zip(panels, planes, strict=True):
         drawn = draw_slice(panel, mesh, image, plane, shapes, inclusions=inclusions, fitted=fitted)
-        dress_slice(panel, plane, (left, right, low, high), cross=panel is panels[0])
+        finish_slice(panel, plane, (left, right, low, high), cross=panel is panels[0])
         if scale.bar and panel is panels[-1]:
             bar = figure.add_subplot(grid[:, columns])
-            draw_colour_bar(panel, drawn, fitted.label, signed=scale.difference, place=bar)
+            draw_colour_bar(panel, drawn, fitted.label, signed=scale.difference, position=bar)
     return figure
 
 
@@ -134,15 +134,15 @@ def draw_slice(
     cells.set_clim(fitted.keywords["vmin"], fitted.keywords["vmax"])
     ax.add_collection(cells)
     ax.add_collection(LineCollection(list(cut.outline), colors=INK, linewidths=0.9, capstyle="round", zorder=2))
-    shapes = _shapes(mesh, electrodes)
+    shapes = _electrode_shapes(mesh, electrodes)
     if shapes is not None:
         _draw_cut_electrodes(ax, plane, shapes, 0.05 * size_of(mesh), cut.polygons.reshape(-1, 2).mean(axis=0))
     for one in inclusions:
-        draw_cut(ax, plane, one)
+        draw_body_in_plane(ax, plane, one)
     return cells
 
 
-def dress_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, float], *, cross: bool) -> None:
+def finish_slice(ax: Axes, plane: Plane, window: tuple[float, float, float, float], *, cross: bool) -> None:
     """Set equal scales over a `window` (left, right, low, high), and draw a title and, if `cross`, a scale bar and
     arrows of the axes."""
     left, right, low, high = window
@@ -179,13 +179,13 @@ def cell_values(mesh: Mesh, values: ArrayLike) -> np.ndarray:
     return image if len(image) == mesh.num_cells else image[np.asarray(mesh.cells)].mean(axis=1)
 
 
-def _shapes(mesh: Mesh, electrodes) -> ElectrodeShapes | None:
+def _electrode_shapes(mesh: Mesh, electrodes) -> ElectrodeShapes | None:
     if electrodes is None or isinstance(electrodes, ElectrodeShapes):
         return electrodes
     return shapes_of(mesh, electrodes)
 
 
-def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, away: float, middle) -> None:
+def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, distance: float, middle) -> None:
     """Draw a thick line where a plane intersects an electrode, and the number of the electrode outwards of it."""
     found: dict[int, list[np.ndarray]] = {}
     for corners, number in zip(shapes.polygons(), shapes.electrode, strict=True):
@@ -194,22 +194,22 @@ def _draw_cut_electrodes(ax: Axes, plane: Plane, shapes: ElectrodeShapes, away: 
             continue
         ring = np.arange(1, len(corners) - 1)
         fan = np.stack([np.zeros_like(ring), ring, ring + 1], axis=1)
-        lines = plane.on_page(passed_edges(fan, height).at_corners(corners))
+        lines = plane.on_page(crossed_edges(fan, height).at_corners(corners))
         if len(lines):
             found.setdefault(int(number), []).extend(lines)
     for number, lines in found.items():
         ax.add_collection(LineCollection(lines, colors=METAL, linewidths=4, capstyle="butt", zorder=3))
         ends = np.concatenate(lines)
         place = ends.mean(axis=0)
-        if np.ptp(ends, axis=0).max() < 0.1 * away:
+        if np.ptp(ends, axis=0).max() < 0.1 * distance:
             continue  # only a corner of the electrode is cut
         # The number is placed perpendicular to the line, away from the middle of the section.
         outward = np.linalg.svd(ends - place)[2][1]
-        place = place + away * outward * np.sign(outward @ (place - middle))
+        place = place + distance * outward * np.sign(outward @ (place - middle))
         draw_number(ax, place, str(number + 1), fontsize=7, faint=False)
 
 
-def _columns(number: int, tall: float) -> int:
+def _num_columns(number: int, tall: float) -> int:
     """Number of columns of a grid of `number` panels on a landscape page; `tall`: ratio of height to width of a
     panel."""
     best = max(1, round(float(np.sqrt(1.6 * number * tall))))

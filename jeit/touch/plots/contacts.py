@@ -13,7 +13,16 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind
 from jeit.electrodes import AbstractElectrodes
 from jeit.mesh import Mesh
-from jeit.plot.axes import CHANGE, INK, ColourScale, axes_or_new, bare, draw_colour_bar, draw_scale_bar, prefixed
+from jeit.plot.axes import (
+    CHANGE,
+    INK,
+    ColourScale,
+    axes_or_new,
+    draw_colour_bar,
+    draw_scale_bar,
+    hide_axes,
+    with_si_prefix,
+)
 from jeit.plot.imaging.image import plot_image
 from jeit.touch.contacts import Contact, RasterStages
 
@@ -91,13 +100,13 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     if axes.size != len(_TITLES):
         raise ValueError(f"axes: give six, one for each stage; there are {axes.size}.")
     inside = np.isfinite(stages.region)
-    factor, with_prefix = prefixed(largest(stages.region), unit)
+    factor, with_prefix = with_si_prefix(largest(stages.region), unit)
     strongest = factor * largest(stages.region) or 1.0
     keywords = {"cmap": "RdBu_r", "vmin": -strongest, "vmax": strongest}
     region = _drawn(axes[0], factor * stages.region, stages, keywords)
     # The colour bar is as tall as its image, whatever the height of the axes.
     bar = axes[0].inset_axes((1.02, 0.1, 0.035, 0.8))
-    draw_colour_bar(axes[0], region, f"Change ({with_prefix})", signed=True, place=bar)
+    draw_colour_bar(axes[0], region, f"Change ({with_prefix})", signed=True, position=bar)
     black = {"cmap": "gray", "vmin": 0, "vmax": 255}
     greys = (stages.grey, 255.0 * stages.threshold, 255.0 * stages.opened, stages.grey)
     for ax, pixels in zip(axes[1:5], greys, strict=True):
@@ -108,7 +117,7 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     _drawn(axes[5], factor * stages.region, stages, keywords)
     draw_contacts(stages.contacts, ax=axes[5])
     for ax, title in zip(axes, _TITLES, strict=True):
-        bare(ax, stages.extent, numbered=False)
+        hide_axes(ax, stages.extent, numbered=False)
         ax.set_title(title, fontsize=10)
         draw_scale_bar(ax, stages.extent)
     return axes

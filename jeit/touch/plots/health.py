@@ -15,9 +15,9 @@ from jeit.plot.axes import (
     SOFT,
     ColourScale,
     axes_or_new,
-    bare,
     draw_scale_bar,
     extent_of,
+    hide_axes,
     soften_axes,
 )
 from jeit.plot.imaging.electrodes import draw_electrodes
@@ -56,7 +56,7 @@ def plot_health(
         extent = extent_of(np.asarray(mesh.points))
         draw_outline(mesh, ax)
         draw_electrodes(mesh, electrodes, ax=ax)
-        bare(ax, extent)
+        hide_axes(ax, extent)
         draw_scale_bar(ax, extent)
         if title:
             ax.set_title(title)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from jeit.arguments import check_kind, real_array
-from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, bare, draw_colour_bar, draw_scale_bar, extent_of
+from jeit.plot.axes import INK, SEQUENTIAL, SOFT, axes_or_new, draw_colour_bar, draw_scale_bar, extent_of, hide_axes
 from jeit.touch.kohonen import MapTouch
 
 # Area of the mark of a neuron in points², in a map with 1024 neurons.
@@ -47,7 +47,7 @@ def plot_map(
     check_kind("touches", touches, (list, tuple), "a list of touches, as of touches_reported")
     ax = axes_or_new(ax)
     extent = extent_of(places[there])
-    bare(ax, extent, numbered=False)
+    hide_axes(ax, extent, numbered=False)
     lines = [
         ends
         for first, second in ((places[:-1], places[1:]), (places[:, :-1], places[:, 1:]))

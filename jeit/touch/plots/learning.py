@@ -11,10 +11,10 @@ from jeit.plot.axes import (
     SERIES_COLOURS,
     SOFT,
     axes_or_new,
-    bare,
     draw_colour_bar,
     draw_scale_bar,
     extent_of,
+    hide_axes,
     soften_axes,
 )
 from jeit.touch import Standing
@@ -31,7 +31,7 @@ def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | N
     ax = axes_or_new(ax)
     off = 1e3 * np.linalg.norm(place.held_out - place.right, axis=1)
     extent = extent_of(place.right)
-    bare(ax, extent, numbered=False)
+    hide_axes(ax, extent, numbered=False)
     most = float(np.quantile(off, 0.98)) or 1.0
     order = np.argsort(off)
     drawn = ax.scatter(*place.right[order, :2].T, c=off[order], s=22, cmap=SEQUENTIAL, vmin=0, vmax=most, linewidths=0)

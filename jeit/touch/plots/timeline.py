@@ -17,12 +17,12 @@ from jeit.plot.axes import (
     SERIES_COLOURS,
     SOFT,
     axes_or_new,
-    bare,
     draw_colour_bar,
     draw_scale_bar,
     extent_of,
-    prefixed,
+    hide_axes,
     soften_axes,
+    with_si_prefix,
 )
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import draw_outline
@@ -54,7 +54,7 @@ def plot_changes(
     if when.shape != values.shape or when.ndim != 1:
         raise ValueError(f"peaks have shape {values.shape} and seconds {when.shape}; give one of each for every frame.")
     ax = axes_or_new(ax, (9.0, 2.6))
-    factor, name = prefixed(float(np.nanmax(values, initial=level)), unit)
+    factor, name = with_si_prefix(float(np.nanmax(values, initial=level)), unit)
     ax.plot(*_thinned(*_broken(when, factor * values)), color=INK, linewidth=0.8)
     ax.axhline(factor * level, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
     ax.text(1, factor * level, " level", color=SOFT, fontsize=8, va="center", transform=ax.get_yaxis_transform())
@@ -138,7 +138,7 @@ def plot_touch_paths(
                 ax.annotate(
                     f"{one.number}", place[0], (4, 2), textcoords="offset points", color=INK, fontsize=7, zorder=5
                 )
-    bare(ax, extent)
+    hide_axes(ax, extent)
     draw_scale_bar(ax, extent)
     if title is not None:
         ax.set_title(title)

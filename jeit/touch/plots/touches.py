@@ -15,11 +15,11 @@ from jeit.plot.axes import (
     SEQUENTIAL,
     SERIES_COLOURS,
     axes_or_new,
-    bare,
     draw_colour_bar,
     draw_legend_above,
     draw_scale_bar,
     extent_of,
+    hide_axes,
     soften_axes,
 )
 from jeit.touch import Touches
@@ -45,7 +45,7 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
         return ax
     place, std = touches.position[there, :2], touches.position_std[there, :2]  # pyright: ignore[reportOptionalSubscript]
     extent = extent_of(np.vstack([place - std, place + std]))
-    bare(ax, extent, numbered=False)
+    hide_axes(ax, extent, numbered=False)
     some = np.linspace(0, len(there) - 1, min(len(there), _MOST)).astype(int)
     size = 2 * std[some]
     ax.add_collection(
@@ -119,7 +119,7 @@ def plot_depth_map(
     if depth.ndim != 2:
         raise ValueError(f"depth must be a map (rows, columns); it has shape {depth.shape}.")
     ax = axes_or_new(ax)
-    bare(ax, extent, numbered=False)
+    hide_axes(ax, extent, numbered=False)
     top = 1e3 * (float(depth.max()) if most is None else most) or 1.0
     drawn = ax.imshow(
         1e3 * depth, origin="lower", extent=extent, cmap=SEQUENTIAL, vmin=0.0, vmax=top, interpolation="nearest"

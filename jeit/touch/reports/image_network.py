@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 
 from jeit.arguments import counted
 from jeit.files import clear_unfinished, written_whole
-from jeit.report.folder import plain, results, results_folder, version_of, write_json
-from jeit.report.growing import GrowingRows, GrowingTable, Sample, saying_what_is_left
+from jeit.report.folder import as_plain_values, results, results_folder, version_of, write_json
+from jeit.report.growing import GrowingRows, GrowingTable, Sample, reporting_partial_results
 from jeit.report.stream import PICTURES
 from jeit.touch.networks import ImageNetwork, LearntImages
 from jeit.touch.networks.measured import FrameDepth
@@ -53,7 +53,7 @@ def report_learnt_images(learnt: LearntImages) -> dict[str, Any]:
         }
         for name, one in learnt.courses.items()
     }
-    return plain(
+    return as_plain_values(
         {
             "design": network.design,
             "made_for": network.made_for,
@@ -149,7 +149,7 @@ def write_depths(
         with GrowingTable(where / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
             for one in found:
                 line, depth = imaged.take(one)
-                with saying_what_is_left(rows):
+                with reporting_partial_results(rows):
                     table.write(line)
                     rows.append(depth)
                 if progress is not None:
@@ -161,7 +161,7 @@ def write_depths(
                 f"'{name}': {counted(rows.number, 'frame')}, and none could be imaged; the first: {reason}"
             )
         report("images")
-        with saying_what_is_left(rows):
+        with reporting_partial_results(rows):
             extent = np.array(network.extent)
             rows.write_npz(where / "depth.npz", "depth", {"extent": extent}, lambda far: report(f"images: {far}"))
         with results(where, ("report.json",)) as made:
@@ -208,7 +208,7 @@ class _FrameStatistics:
     def report(self, name: str, number: int) -> dict[str, Any]:
         """Report the statistics as plain numbers, strings, lists and dictionaries."""
         network = self.network
-        return plain(
+        return as_plain_values(
             {
                 "frames": name,
                 "number": number,

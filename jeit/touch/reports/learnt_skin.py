@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.report.folder import plain, results, version_of, write_json, write_rows
+from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
 from jeit.touch import LearntSkin, Standing, Touches, write_skin
 
 SKIN_FILES = ("skin.skops", "report.json", "learning.png")
@@ -51,13 +51,13 @@ def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str)
         report["labels"] = dict(zip(kinds.tolist(), counts.tolist(), strict=True))
     with results(folder, TOUCH_FILES) as made:
         write_rows(made / "touches.csv", list(columns), zip(*columns.values(), strict=True))
-        write_json(plain(report), made / "report.json")
+        write_json(as_plain_values(report), made / "report.json")
         draw_touches(touches).savefig(made / "touches.png", dpi=150)
 
 
 def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
     """Report how well a skin has learnt, as plain numbers, strings, lists and dictionaries."""
-    return plain(
+    return as_plain_values(
         {
             "presses": skin.name,
             "channels": len(skin.channels.used),

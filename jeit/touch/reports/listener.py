@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jeit.report.folder import plain, results, version_of, write_json, write_rows
+from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
 from jeit.touch.listening import Listener, SoundLabels
 from jeit.touch.listening.feature_images import EVERY, LENGTH
 
@@ -55,7 +55,7 @@ def report_listener(listener: Listener) -> dict[str, Any]:
             "right_of_each": {name: right[standing.right == name].mean() for name in np.unique(standing.right)},
             "tried": [{"method": name, "right": 1 - error} for name, error in standing.tried],
         }
-    return plain(
+    return as_plain_values(
         {
             "clips": listener.name,
             "classes": list(listener.names),
@@ -84,7 +84,7 @@ def report_sound_labels(labels: SoundLabels, *, model: str) -> dict[str, Any]:
         }
         for one in labels.events
     ]
-    return plain(
+    return as_plain_values(
         {
             "recording": labels.name,
             "model": model,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jeit.report.folder import plain, results, version_of, write_json, write_rows
+from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
 from jeit.touch.health import HealthEvent, SkinHealth
 
 HEALTH_FILES = ("events.csv", "report.json", "health.png")
@@ -45,7 +45,7 @@ def write_health(
 def report_health(health: SkinHealth, name: str, timed: bool) -> dict[str, Any]:
     """Report the detected events as plain numbers, strings, lists and dictionaries; unknown values are None."""
     held = health.held
-    return plain(
+    return as_plain_values(
         {
             "recording": name,
             "frames": health.frames,

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import counted
-from jeit.report.folder import plain, results, results_folder, version_of, write_json
+from jeit.report.folder import as_plain_values, results, results_folder, version_of, write_json
 from jeit.report.growing import GrowingTable
 from jeit.touch import LearntGestures, NamedTouch, TouchWatch, WatchedFrame
 from jeit.touch.gestures.gesture_model import GESTURE_FILE
@@ -52,7 +52,7 @@ def report_gestures(learnt: LearntGestures, name: str) -> dict[str, Any]:
             "right_by_gesture": {one: right[standing.right == one].mean() for one in model.names},
             "tried": [{"classifier": one, "right": 1 - error} for one, error in standing.tried],
         }
-    return plain(report)
+    return as_plain_values(report)
 
 
 def draw_gestures(learnt: LearntGestures):
@@ -159,7 +159,7 @@ def report_watch(written: WrittenWatch, watch: TouchWatch, name: str) -> dict[st
     """Report the detected touches as plain numbers, strings, lists and dictionaries; unknown values are None."""
     names, number = np.unique([one.gesture for one in written.touches if not one.unlike], return_counts=True)
     quick = written.latency
-    return plain(
+    return as_plain_values(
         {
             "stream": name,
             "frames": len(written.seconds),

@@ -44,28 +44,30 @@ class Status(StrEnum):
 
     @property
     def number(self) -> int:
-        """Index of the status, which represents it in compiled code, where strings are not available."""
+        """Integer that represents the status in arrays, because JAX has no arrays of strings: its position in
+        `list(Status)`."""
         return list(Status).index(self)
 
     @classmethod
     def of_number(cls, number: Any) -> "Status":
-        """The status with the given index. Raises `ValueError` inside `jax.jit`, where the index is not known yet, and
-        for a batch."""
+        """Return the status with the given `number`. Raises `ValueError` inside `jax.jit`, `jax.grad` and `jax.vmap`,
+        where the number has no value yet, and for an array of several numbers."""
         if not has_values(number) or np.shape(number) != ():
             raise ValueError(
-                "status: how a minimisation inside jax.jit or jax.vmap ends is known outside only, one by one; look at "
-                "`outcome`, an array of Status.number, instead."
+                "status: inside jax.jit, jax.grad or jax.vmap the status has no value yet. Return the result from "
+                "there, and read its status outside; for a batch, compare `outcome`, an array of integers, with "
+                "Status.CONVERGED.number."
             )
         return list(Status)[int(number)]
 
 
 def ended(result: optx.RESULTS) -> Status:
-    """Status of a result of optimistix; outside `jax.jit` only, where its value is known."""
+    """Status of an optimistix result. Works only outside `jax.jit`; see `ended_number`."""
     return Status.of_number(ended_number(result))
 
 
 def ended_number(result: optx.RESULTS) -> Int[Array, ""]:
-    """`Status.number` of a result of optimistix, also inside `jax.jit`."""
+    """`Status.number` of an optimistix result; works inside `jax.jit`, too."""
     limit = result == optx.RESULTS.nonlinear_max_steps_reached
     other = jnp.where(limit, Status.STEP_LIMIT.number, Status.STALLED.number)
     return jnp.where(result == optx.RESULTS.successful, Status.CONVERGED.number, other)
@@ -161,9 +163,9 @@ def scipy_lbfgsb(
 
 
 _LEAST_SCALE = 2.0**-20
-_SUFFICIENT = 1e-4
+_SUFFICIENT_DECREASE = 1e-4
 # Rounding error of a cost, which is a sum of many squares, in units of its machine precision.
-_ROUNDINGS = 100.0
+_ROUNDING_FACTOR = 100.0
 
 
 class DescentState(eqx.Module):
@@ -232,8 +234,8 @@ class Descent(optx.AbstractLeastSquaresSolver):
         cost, step = options["expand"](state.trial, args)
         predicted = -(state.scale * state.slope + 0.5 * state.scale**2 * state.curvature)
         # Close to the minimum steps change the cost by less than its rounding, and lead nearer all the same.
-        rounding = _ROUNDINGS * np.finfo(y.dtype).eps * state.cost
-        good = xp.isfinite(cost) & (cost <= state.cost + rounding - _SUFFICIENT * predicted)
+        rounding = _ROUNDING_FACTOR * np.finfo(y.dtype).eps * state.cost
+        good = xp.isfinite(cost) & (cost <= state.cost + rounding - _SUFFICIENT_DECREASE * predicted)
 
         def accepted():
             gain = xp.where(xp.isfinite(state.cost), (state.cost - cost) / predicted, 0.5)

@@ -23,35 +23,35 @@ from jeit_solvers.engines import undifferentiated
 
 # Relative tolerance of the linear system, and maximum number of conjugate-gradient steps; with a good model of the
 # Hessian about a dozen steps are taken.
-_TOLERANCE, _MOST_STEPS = 1e-11, 500
+_TOLERANCE, _MAX_STEPS = 1e-11, 500
 # Length below which a Newton step to the minimum is the last one, because the remaining error is of the order of its
 # square; measured as the square root of the decrease of the cost. And the maximum number of Newton steps.
-_AT_THE_MINIMUM, _MOST_NEWTON_STEPS = 1e-6, 8
+_LAST_STEP_LENGTH, _MAX_NEWTON_STEPS = 1e-6, 8
 
 Gradient = Callable[[Float[Array, " n"], Any], Float[Array, " n"]]
-Linear = Callable[[Float[Array, " n"]], Float[Array, " n"]]
-Preconditioner = Callable[[Float[Array, " n"], Any], Linear]
+LinearMap = Callable[[Float[Array, " n"]], Float[Array, " n"]]
+Preconditioner = Callable[[Float[Array, " n"], Any], LinearMap]
 
 
 def as_minimum(
-    found: Float[Array, " n"], problem: Any, gradient: Gradient, precondition: Preconditioner
+    point: Float[Array, " n"], problem: Any, gradient: Gradient, precondition: Preconditioner
 ) -> Float[Array, " n"]:
-    """`found` (n,) unchanged, with the derivatives that the nearby minimum has with respect to the arrays in the pytree
+    """`point` (n,) unchanged, with the derivatives that the nearby minimum has with respect to the arrays in the pytree
     `problem`.
 
     `gradient(x, problem)`: gradient (n,) of the cost, zero at the minimum; its derivative with respect to x must be
     symmetric and positive definite there. `precondition(x, problem)`: a function of a vector that applies the inverse
-    of a model of this derivative. The computation of `found` is not differentiated. Derivatives are evaluated at the
-    minimum itself, found by a few Newton steps from `found`, so they are as accurate as the gradient even if the solver
-    stopped early; if the Newton steps fail, they are evaluated at `found`. Differentiable any number of times, in
+    of a model of this derivative. The computation of `point` is not differentiated. Derivatives are evaluated at the
+    minimum itself, found by a few Newton steps from `point`, so they are as accurate as the gradient even if the solver
+    stopped early; if the Newton steps fail, they are evaluated at `point`. Differentiable any number of times, in
     forward and reverse mode, and under `jax.vmap`.
     """
-    return _minimum(jax.lax.stop_gradient(found), problem, gradient, precondition)
+    return _minimum(jax.lax.stop_gradient(point), problem, gradient, precondition)
 
 
 @eqx.filter_custom_jvp
-def _minimum(found, problem, gradient, precondition):
-    return found
+def _minimum(point, problem, gradient, precondition):
+    return point
 
 
 @_minimum.def_jvp
@@ -70,52 +70,67 @@ def _minimum_jvp(primals, tangents):
     return point, _solve(hessian, -slope, model)
 
 
-def _solve(hessian: Linear, right: Float[Array, " n"], model: Linear) -> Float[Array, " n"]:
-    """Solution of H x = `right`."""
+def _solve(hessian: LinearMap, right_hand_side: Float[Array, " n"], preconditioner: LinearMap) -> Float[Array, " n"]:
+    """Solve H x = `right_hand_side` by preconditioned conjugate gradients. `hessian`: returns H v for a vector v;
+    `preconditioner`: returns an approximation of H⁻¹ v."""
 
     def solve(multiply, vector):
-        return _conjugate_gradients(multiply, vector, model)
+        return _conjugate_gradients(multiply, vector, preconditioner)
 
-    return jax.lax.custom_linear_solve(hessian, right, solve, symmetric=True)
+    return jax.lax.custom_linear_solve(hessian, right_hand_side, solve, symmetric=True)
 
 
-def _conjugate_gradients(multiply: Linear, right: Float[Array, " n"], model: Linear) -> Float[Array, " n"]:
-    """Preconditioned conjugate gradients, started at zero; Golub and Van Loan, Matrix Computations (2013), 11.5."""
+def _conjugate_gradients(
+    hessian_product: LinearMap, right_hand_side: Float[Array, " n"], preconditioner: LinearMap
+) -> Float[Array, " n"]:
+    """Solve H x = `right_hand_side` by preconditioned conjugate gradients, started at zero (Golub and Van Loan, Matrix
+    Computations, 2013, 11.5). `hessian_product`: returns H v for a vector v; `preconditioner`: returns an approximation
+    of H⁻¹ v."""
 
     def go_on(state):
-        _, _, _, left, number = state
-        return (left > enough) & (number < _MOST_STEPS)
+        _, _, _, energy, number = state
+        return (energy > tolerance) & (number < _MAX_STEPS)
 
     def step(state):
-        x, rest, direction, left, number = state
-        image = multiply(direction)
-        length = left / (direction @ image)
-        rest = rest - length * image
-        new = model(rest)
-        ahead = rest @ new
-        return x + length * direction, rest, new + (ahead / left) * direction, ahead, number + 1
+        x, residual, direction, energy, number = state
+        hessian_direction = hessian_product(direction)
+        length = energy / (direction @ hessian_direction)
+        residual = residual - length * hessian_direction
+        preconditioned = preconditioner(residual)
+        new_energy = residual @ preconditioned
+        return (
+            x + length * direction,
+            residual,
+            preconditioned + (new_energy / energy) * direction,
+            new_energy,
+            number + 1,
+        )
 
-    first = model(right)
-    size = right @ first
-    enough = _TOLERANCE**2 * size
-    return jax.lax.while_loop(go_on, step, (jnp.zeros_like(right), right, first, size, 0))[0]
+    start = preconditioner(right_hand_side)
+    start_energy = right_hand_side @ start
+    tolerance = _TOLERANCE**2 * start_energy
+    return jax.lax.while_loop(go_on, step, (jnp.zeros_like(right_hand_side), right_hand_side, start, start_energy, 0))[
+        0
+    ]
 
 
-def _refine(point: Float[Array, " n"], problem: Any, gradient: Gradient, model: Linear) -> Float[Array, " n"]:
-    """The minimum, by Newton's method from a nearby point, which goes on as long as steps become shorter in the norm of
-    the Hessian."""
+def _refine(
+    point: Float[Array, " n"], problem: Any, gradient: Gradient, preconditioner: LinearMap
+) -> Float[Array, " n"]:
+    """Find the minimum by Newton's method, started at a nearby point. The iteration continues as long as the steps
+    become shorter in the norm of the Hessian."""
 
     def step(state):
         at, before, length, number, _ = state
         slope, hessian = jax.linearize(lambda x: gradient(x, problem), at)
-        direction = _conjugate_gradients(hessian, -slope, model)
+        direction = _conjugate_gradients(hessian, -slope, preconditioner)
         now = jnp.sqrt(jnp.abs(slope @ direction))
         better = now < length
         return jnp.where(better, at + direction, before), at, now, number + 1, better
 
     def go_on(state):
         _, _, length, number, better = state
-        return better & (number < _MOST_NEWTON_STEPS) & (length > _AT_THE_MINIMUM)
+        return better & (number < _MAX_NEWTON_STEPS) & (length > _LAST_STEP_LENGTH)
 
     start = point, point, jnp.asarray(jnp.inf, point.dtype), 0, jnp.bool_(True)
     return jax.lax.while_loop(go_on, step, start)[0]

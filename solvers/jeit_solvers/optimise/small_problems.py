@@ -23,13 +23,13 @@ from jeit_solvers.engines import complex_slope, host, namespace, set_at, slopes,
 # F), and a positive definite model (n, n, F) of the Hessian, for instance the Gauss-Newton or Fisher matrix.
 Expansion = Callable[[Array, Any], tuple[Array, Array, Array]]
 
-_MOST_DAMPING = 1e12
+_MAX_DAMPING = 1e12
 # Minimum number of functions for which gathering is worthwhile.
-_LEAST_PART = 32
+_MIN_GATHERED = 32
 # Number of steps that the whole batch takes before the unfinished functions are gathered.
-_WHOLE_STEPS = 8
+_STEPS_OF_WHOLE_BATCH = 8
 # Distance between points for finite differences of slopes in a Hessian.
-_APART = 1e-6
+_DIFFERENCE_STEP = 1e-6
 
 
 class Minimum(eqx.Module):
@@ -42,18 +42,18 @@ class Minimum(eqx.Module):
     steps: Int[Array, ""]
 
 
-def solve_small(matrix: Float[Array, "n n F"], right: Float[Array, "n F"]) -> Float[Array, "n F"]:
+def solve_small(matrix: Float[Array, "n n F"], right_hand_sides: Float[Array, "n F"]) -> Float[Array, "n F"]:
     """Solve F symmetric positive definite systems of n unknowns by Cholesky's method in explicit formulas."""
     number, lower = matrix.shape[0], _cholesky(matrix)
     forward: list[Array] = []
     for i in range(number):
-        rest = right[i] - sum(lower[i, k] * forward[k] for k in range(i))
+        rest = right_hand_sides[i] - sum(lower[i, k] * forward[k] for k in range(i))
         forward.append(rest / lower[i, i])
     solution: dict[int, Array] = {}
     for i in reversed(range(number)):
         rest = forward[i] - sum(lower[k, i] * solution[k] for k in range(i + 1, number))
         solution[i] = rest / lower[i, i]
-    return namespace(matrix, right).stack([solution[i] for i in range(number)])
+    return namespace(matrix, right_hand_sides).stack([solution[i] for i in range(number)])
 
 
 def gradient_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n F"]:
@@ -69,11 +69,11 @@ def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Fl
     NumPy uses central differences of complex steps, which are accurate to about eight digits.
     """
     if isinstance(x, np.ndarray):
-        apart = _APART * np.eye(len(x))[:, :, None]
+        apart = _DIFFERENCE_STEP * np.eye(len(x))[:, :, None]
 
         def second(k: int, m: int) -> Any:
             ahead, behind = (complex_slope(value, at, m) for at in (x + apart[k], x - apart[k]))
-            return (ahead - behind) / (2 * _APART)
+            return (ahead - behind) / (2 * _DIFFERENCE_STEP)
 
         return symmetric_small([[second(k, m) for m in range(k + 1)] for k in range(len(x))])
     directions = jnp.eye(len(x))[:, :, None] * jnp.ones_like(x)
@@ -173,31 +173,32 @@ def minimise_small(
         converged=nothing,
     )
     part = number if xp is np else number // 4
-    if part < _LEAST_PART:
-        state = _advance(state, data, max_steps + 1, finish or expand, limits)
+    if part < _MIN_GATHERED:
+        state = _take_steps(state, data, max_steps + 1, finish or expand, limits)
     else:
         if skip is None:
-            state = _advance(state, data, _WHOLE_STEPS + 1, expand, limits)
+            state = _take_steps(state, data, _STEPS_OF_WHOLE_BATCH + 1, expand, limits)
 
         def go_on_with_some(state: _State) -> _State:
-            index = _first_true(~state.done, part)
+            index = _first_true_indices(~state.done, part)
             gathered, mine = jax.tree.map(lambda array: xp.take(array, index, axis=-1, mode="clip"), (state, data))
             gathered = replace(gathered, done=gathered.done | (index == number))
-            ended = _advance(gathered, mine, max_steps + 1, finish or expand, limits)
+            ended = _take_steps(gathered, mine, max_steps + 1, finish or expand, limits)
             return jax.tree.map(lambda all, some: set_at(all, (..., index), some), state, ended)
 
         state = while_loop(lambda state: ~xp.all(state.done), go_on_with_some, state)
     return Minimum(state.x, state.value, state.converged, xp.max(state.taken, initial=0))
 
 
-def _first_true(which: Bool[Array, " F"], most: int) -> Int[Array, " i"]:
-    """Indices of the first true entries: in NumPy at most `most` of them; in JAX exactly `most`, filled up with F."""
-    if isinstance(which, np.ndarray):
-        return host.flatnonzero(which)[:most]
-    return jnp.nonzero(which, size=most, fill_value=which.size)[0]
+def _first_true_indices(flags: Bool[Array, " F"], max_count: int) -> Int[Array, " i"]:
+    """Indices of the first true entries: in NumPy at most `max_count` of them; in JAX exactly `max_count`, filled up
+    with F."""
+    if isinstance(flags, np.ndarray):
+        return host.flatnonzero(flags)[:max_count]
+    return jnp.nonzero(flags, size=max_count, fill_value=flags.size)[0]
 
 
-def _step_from(state: _State, limits: _Limits) -> tuple[Array, Array]:
+def _next_step(state: _State, limits: _Limits) -> tuple[Array, Array]:
     """End point of the next step, and the first-order prediction of the decrease of the value."""
     x, gradient, matrix, xp = state.x, state.gradient, state.matrix, namespace(state)
     held = ((x <= limits.lower) & (gradient > 0)) | ((x >= limits.upper) & (gradient < 0))
@@ -211,7 +212,7 @@ def _step_from(state: _State, limits: _Limits) -> tuple[Array, Array]:
     return new, -xp.sum((new - x) * gradient, axis=0)
 
 
-def _advance(state: _State, data, steps: int, expand: Expansion, limits: _Limits) -> _State:
+def _take_steps(state: _State, data, steps: int, expand: Expansion, limits: _Limits) -> _State:
     """Take up to `steps` steps of all functions, fewer if all are done."""
     xp = namespace(state, data)
 
@@ -219,7 +220,7 @@ def _advance(state: _State, data, steps: int, expand: Expansion, limits: _Limits
         count, state = loop
         # The first iteration only evaluates the start, from which no step has been computed yet.
         fresh = xp.isinf(state.value)
-        trial, promised = _step_from(state, limits)
+        trial, promised = _next_step(state, limits)
         value, gradient, matrix = expand(trial, data)
         better = (value <= state.value) & ~state.done
         # A step that is cut off at a bound may lead uphill; then a more damped one, closer to the gradient, is tried.
@@ -227,7 +228,7 @@ def _advance(state: _State, data, steps: int, expand: Expansion, limits: _Limits
         damping = xp.where(better, xp.maximum(state.damping / 10, 1e-12), 8 * xp.maximum(state.damping, 1e-4))
         taken = state.taken + ~(state.done | fresh)
         # The search also ends when steps become too small to change the value.
-        converged = state.converged | (~state.done & (settled | (damping > _MOST_DAMPING)))
+        converged = state.converged | (~state.done & (settled | (damping > _MAX_DAMPING)))
         broken = fresh & ~xp.isfinite(value)
         return count + 1, _State(
             x=xp.where(better, trial, state.x),

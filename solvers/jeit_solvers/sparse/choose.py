@@ -12,23 +12,24 @@ from jaxtyping import Array, Bool, Inexact, Int
 
 from jeit_solvers.cores import memory_of_machine
 from jeit_solvers.engines import has_values
-from jeit_solvers.sparse.frontal import solve_at_once
-from jeit_solvers.sparse.fronts import Fronts, find_fronts
-from jeit_solvers.sparse.multifrontal import Factor, factorise, solve
+from jeit_solvers.sparse.exact_fronts import Fronts, find_fronts
+from jeit_solvers.sparse.exact_fronts_numpy import solve_at_once
 from jeit_solvers.sparse.multigrid import Multigrid, multigrid_is_installed
 from jeit_solvers.sparse.operator import MatrixSolver, SparseSymmetric, require_sparse_symmetric
+from jeit_solvers.sparse.padded_fronts import FactorisationPlan, analyse
+from jeit_solvers.sparse.padded_fronts_jax import Factor, factorise, solve
 from jeit_solvers.sparse.pattern import SparsityPattern
-from jeit_solvers.sparse.plan import FactorisationPlan, analyse
 
-# Operations of a factorisation up to which a compiled program is made of it: on a CPU, compiling one of more takes
-# longer than it ever saves; on an accelerator, its padded index maps have to fit.
-_COMPILED_ON_CPU, _COMPILED = 5e7, 2e10
-# Operations of a factorisation in a second; seconds and bytes that multigrid takes for 32 solutions for each entry of
-# the matrix. Measured on two cores, solids of 50,000 to 1,000,000 nodes.
+# Maximum number of floating-point operations of a factorisation that is compiled, on a CPU and on an accelerator. On a
+# CPU, compiling a longer one takes more time than it saves; on an accelerator, its padded index maps must fit in
+# memory.
+_MAX_COMPILED_OPERATIONS_CPU, _MAX_COMPILED_OPERATIONS = 5e7, 2e10
+# Floating-point operations of a factorisation per second; time in seconds and memory in bytes that multigrid takes for
+# 32 right-hand sides, per entry of the matrix. Measured on two cores with solids of 50,000 to 1,000,000 nodes.
 _OPERATIONS_PER_SECOND = 4e10
 _MULTIGRID_SECONDS, _MULTIGRID_BYTES = 5e-6, 400.0
-# How much longer a factorisation may take than multigrid, which is less accurate.
-_PATIENCE = 1.5
+# A factorisation is chosen if it takes no longer than this factor times multigrid, which is less accurate.
+_DIRECT_TIME_FACTOR = 1.5
 
 
 class ConjugateGradient(MatrixSolver):
@@ -93,24 +94,24 @@ def conjugate_gradient(
     direction = inverse_diagonal * vector
     target = tolerance * jnp.linalg.norm(direction)
 
-    def keep_going(now: Iterate):
-        return ~now.converged & ~now.broken_down & (now.step < max_steps)
+    def keep_going(iterate: Iterate):
+        return ~iterate.converged & ~iterate.broken_down & (iterate.step < max_steps)
 
-    def one_step(now: Iterate) -> Iterate:
-        image = operator.mv(now.direction)
-        curvature = now.direction @ image
-        length = now.weight / curvature
-        residual = now.residual - length * image
+    def one_step(iterate: Iterate) -> Iterate:
+        image = operator.mv(iterate.direction)
+        curvature = iterate.direction @ image
+        length = iterate.weight / curvature
+        residual = iterate.residual - length * image
         preconditioned = inverse_diagonal * residual
         weight = residual @ preconditioned
         return Iterate(
-            now.solution + length * now.direction,
+            iterate.solution + length * iterate.direction,
             residual,
-            preconditioned + weight / now.weight * now.direction,
+            preconditioned + weight / iterate.weight * iterate.direction,
             weight,
-            now.step + 1,
+            iterate.step + 1,
             jnp.linalg.norm(preconditioned) <= target,
-            ~((jnp.vdot(now.direction, image).real > 0) & jnp.isfinite(curvature)),
+            ~((jnp.vdot(iterate.direction, image).real > 0) & jnp.isfinite(curvature)),
         )
 
     start = Iterate(
@@ -173,7 +174,7 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
 
 class FrontalCholesky(MatrixSolver):
     """Direct solver for large real or complex `SparseSymmetric` operators, with fronts of their own size, found by
-    `find_fronts`. It runs in NumPy: compiled programs call it, and are compiled in no time.
+    `find_fronts`. It runs in NumPy: compiled programs call it, which keeps their compilation short.
 
     A matrix that is not positive definite gives `RESULTS.singular`.
     """
@@ -237,22 +238,23 @@ def choose_solver(
     limit = memory_of_machine() / 2 if memory_limit is None else memory_limit
     memory = 8.0 * (fronts.num_factor_entries + fronts.num_waiting_entries)
     seconds, iterative = fronts.num_operations / _OPERATIONS_PER_SECOND, pattern.num_entries * _MULTIGRID_SECONDS
+    multigrid_memory = _format_bytes(pattern.num_entries * _MULTIGRID_BYTES)
     cost = (
-        f"a factorisation takes {fronts.num_operations:.1e} operations, about {seconds:.1g} s, and {_bytes(memory)}; "
-        f"multigrid takes about {iterative:.1g} s and {_bytes(pattern.num_entries * _MULTIGRID_BYTES)} for 32 solutions"
+        f"a factorisation takes {fronts.num_operations:.1e} operations, about {seconds:.1g} s, and "
+        f"{_format_bytes(memory)}; multigrid takes about {iterative:.1g} s and {multigrid_memory} for 32 solutions"
     )
-    if memory > limit or seconds > _PATIENCE * iterative:
-        why = f"{cost}; {_bytes(limit)} are allowed"
+    if memory > limit or seconds > _DIRECT_TIME_FACTOR * iterative:
+        why = f"{cost}; {_format_bytes(limit)} are allowed"
         if multigrid_is_installed():
             return Multigrid(tolerance, reason=f"iterative: {why}")
         if memory > limit:
             slower = "; without pyamg (pip install 'jeit[large]') conjugate gradients take several times as long"
             return ConjugateGradient(tolerance, reason=f"iterative: {why}{slower}")
     on_cpu = jax.default_backend() == "cpu"
-    if fronts.num_operations > (_COMPILED_ON_CPU if on_cpu else _COMPILED):
+    if fronts.num_operations > (_MAX_COMPILED_OPERATIONS_CPU if on_cpu else _MAX_COMPILED_OPERATIONS):
         return FrontalCholesky(fronts, f"direct: {cost}")
     return SparseCholesky(analyse(pattern, coordinates), reason=f"direct: {cost}")
 
 
-def _bytes(number: float) -> str:
-    return f"{number / 1e6:.0f} MB" if number < 1e9 else f"{number / 1e9:.1f} GB"
+def _format_bytes(num_bytes: float) -> str:
+    return f"{num_bytes / 1e6:.0f} MB" if num_bytes < 1e9 else f"{num_bytes / 1e9:.1f} GB"

@@ -4,10 +4,10 @@ The graph is halved recursively. Each halving removes a *separator*, a set of no
 two halves. Eliminating halves before separators keeps fill low: O(n log n) entries and O(n^1.5) operations for a planar
 mesh (George, SIAM J. Numer. Anal. 10, 1973).
 
-If coordinates of the nodes are given, a part is halved by a straight cut. Otherwise the cut is the perpendicular
-bisector, in graph distance, of two nodes that lie far apart. The nodes along the cut are reduced to the smallest
-possible separator by a maximum matching of the cut edges (König's theorem; Pothen and Fan, ACM Trans. Math. Softw. 16,
-1990).
+If coordinates of the nodes are given, a part is halved by a straight line (in three dimensions by a plane). Otherwise
+its halves are the nodes that are nearer, in graph distance, to one or to the other of two nodes that lie far apart. The
+smallest possible separator is found by a maximum matching of the edges between the halves (König's theorem; Pothen and
+Fan, ACM Trans. Math. Softw. 16, 1990).
 """
 
 from __future__ import annotations
@@ -18,57 +18,58 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, maxi
 
 # Coordinates are rounded to this number of decimals of their extent, so that the order does not depend on rounding
 # errors.
-_DIGITS = 7
+_COORDINATE_DECIMALS = 7
 
 
 def nested_dissection(graph: csr_array, depth: int, coordinates: np.ndarray | None = None) -> np.ndarray:
     """Split a symmetric graph (n, n) without diagonal into a complete binary tree of `depth` levels of separators.
 
     Returns for each node of the graph the tree node that it belongs to (n,): the root is 0, the children of t are 2 t +
-    1 and 2 t + 2; leaves hold the nodes that belong to no separator. With `coordinates` (n, d) of the nodes, cuts are
-    straight.
+    1 and 2 t + 2; leaves hold the nodes that belong to no separator. With `coordinates` (n, d) of the nodes, each
+    separator lies along a straight line or plane; without, separators are found from graph distances.
     """
     size = _num_nodes(graph)
     owner, halving = np.zeros(size, dtype=np.int64), np.arange(size)
     if coordinates is not None:
         low, extent = coordinates.min(axis=0), max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
-        coordinates = np.round((coordinates - low) / extent, _DIGITS)
+        coordinates = np.round((coordinates - low) / extent, _COORDINATE_DECIMALS)
     entries = graph.tocoo()
     rows, columns = entries.coords
     for _ in range(depth):
         # All parts of a level are halved at once; a separator belongs to the tree node that it separates.
         inside = np.full(size, -1)
         tree_nodes, inside[halving] = np.unique(owner[halving], return_inverse=True)
-        rows, columns = _within(inside, rows, columns)
-        side = _halve(graph, rows, columns, inside, tree_nodes.size, coordinates)
+        rows, columns = _edges_within_parts(inside, rows, columns)
+        side = _halve_parts(graph, rows, columns, inside, tree_nodes.size, coordinates)
         halving = halving[side[halving] < 2]
         owner[halving] = 2 * owner[halving] + 1 + side[halving]
     return owner
 
 
-def _within(part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _edges_within_parts(part: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The edges that connect two nodes of the same part."""
     same = (part[rows] == part[columns]) & (part[rows] >= 0)
     return rows[same], columns[same]
 
 
-def _halve(
-    graph: csr_array, rows: np.ndarray, columns: np.ndarray, part: np.ndarray, number: int, coordinates
+def _halve_parts(
+    graph: csr_array, rows: np.ndarray, columns: np.ndarray, part: np.ndarray, num_parts: int, coordinates
 ) -> np.ndarray:
     """Halve every part of a graph. Returns for every node (n,) 0 or 1 for the halves, 2 for the separator between them.
 
-    `part`: (n,) index of the part of each node, -1 for none; `rows`, `columns`: edges within parts. Several cuts are
-    tried for each part; the best one minimises the size of the separator plus a penalty for imbalance.
+    `part`: (n,) index of the part of each node, -1 for none; `num_parts`: number of parts; `rows`, `columns`: edges
+    within parts. Several separators are tried for each part; the best one minimises its size plus a penalty for
+    imbalance.
     """
     nodes = np.flatnonzero(part >= 0)
     own = part[nodes]
-    counts = np.bincount(own, minlength=number)
+    counts = np.bincount(own, minlength=num_parts)
     # Fronts are padded to the largest one of their stage. The smaller the part, the more an even split is worth, and
     # the less an additional node in the separator costs.
     small = counts < 400
     price_of_imbalance = np.where(small, 0.5, 0.1)
-    best, best_cost = np.full(part.size, 2), np.full(number, np.inf)
-    for key in _cut_keys(graph, nodes, own, number, coordinates):
+    best, best_cost = np.full(part.size, 2), np.full(num_parts, np.inf)
+    for key in _splitting_functions(graph, nodes, own, num_parts, coordinates):
         order = np.lexsort((key, own))
         rank = np.empty(nodes.size, dtype=np.int64)
         rank[order] = np.arange(nodes.size) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -78,8 +79,8 @@ def _halve(
             side = np.zeros(part.size, dtype=np.int64)
             side[nodes] = rank >= below[own]
             crossing = side[columns] > side[rows]
-            side[_smallest_cover(rows[crossing], columns[crossing])] = 2
-            halves = np.bincount(3 * own + side[nodes], minlength=3 * number).reshape(-1, 3)
+            side[_minimum_vertex_cover(rows[crossing], columns[crossing])] = 2
+            halves = np.bincount(3 * own + side[nodes], minlength=3 * num_parts).reshape(-1, 3)
             cost = halves[:, 2] + price_of_imbalance * np.abs(halves[:, 0] - halves[:, 1])
             better = cost < best_cost
             best_cost[better] = cost[better]
@@ -88,30 +89,32 @@ def _halve(
     return best
 
 
-def _cut_keys(graph: csr_array, nodes: np.ndarray, part: np.ndarray, number: int, coordinates) -> list[np.ndarray]:
-    """Functions on `nodes` (k,) whose level sets are sensible cuts of their parts."""
+def _splitting_functions(
+    graph: csr_array, nodes: np.ndarray, part: np.ndarray, num_parts: int, coordinates
+) -> list[np.ndarray]:
+    """Functions on `nodes` (k,): each part is split at a value of such a function, into nodes below and above it."""
     if coordinates is not None:
-        return _straight_cuts(coordinates[nodes], part, number)
+        return _projected_coordinates(coordinates[nodes], part, num_parts)
     order = np.argsort(part, kind="stable")
     key = np.empty(nodes.size)
-    for members in np.split(order, np.cumsum(np.bincount(part, minlength=number))[:-1]):
+    for members in np.split(order, np.cumsum(np.bincount(part, minlength=num_parts))[:-1]):
         chosen = nodes[members]
-        key[members] = _distance_cut(graph[chosen][:, chosen])
+        key[members] = _distance_function(graph[chosen][:, chosen])
     return [key]
 
 
-def _straight_cuts(coordinates: np.ndarray, part: np.ndarray, number: int) -> list[np.ndarray]:
+def _projected_coordinates(coordinates: np.ndarray, part: np.ndarray, num_parts: int) -> list[np.ndarray]:
     """Coordinates along the long axis of each part and along two directions on either side of it, because nearly square
     parts have no clear long axis."""
     dimension = coordinates.shape[1]
 
     def sums(values):
-        return np.stack([np.bincount(part, column, number) for column in values.T], axis=1)
+        return np.stack([np.bincount(part, column, num_parts) for column in values.T], axis=1)
 
-    counts = np.maximum(np.bincount(part, minlength=number), 1)[:, None]
+    counts = np.maximum(np.bincount(part, minlength=num_parts), 1)[:, None]
     centred = coordinates - (sums(coordinates) / counts)[part]
     spread = sums((centred[:, :, None] * centred[:, None]).reshape(-1, dimension**2))
-    _, axes = np.linalg.eigh(spread.reshape(number, dimension, dimension))
+    _, axes = np.linalg.eigh(spread.reshape(num_parts, dimension, dimension))
     projected = np.einsum("ni,nij->nj", centred, axes[part][:, :, ::-1])
     if dimension == 1:
         return [projected[:, 0]]
@@ -119,14 +122,15 @@ def _straight_cuts(coordinates: np.ndarray, part: np.ndarray, number: int) -> li
     return [long_axis, long_axis + 0.4 * next_axis, long_axis - 0.4 * next_axis]
 
 
-def _distance_cut(graph: csr_array) -> np.ndarray:
-    """Function whose level sets cut one part of a graph without coordinates, from graph distances."""
+def _distance_function(graph: csr_array) -> np.ndarray:
+    """Function on the nodes of one part of a graph, computed from graph distances, at a value of which the part is
+    split."""
     size = _num_nodes(graph)
     if size == 1:
         return np.zeros(1)
     count, label = connected_components(graph, directed=False)
     if count == 1:
-        return _far_ends(graph)
+        return _distance_difference(graph)
     # Unconnected components need no separator: whole components go to either side, the largest first.
     sizes = np.bincount(label)
     rank = np.empty(count, dtype=np.int64)
@@ -135,20 +139,21 @@ def _distance_cut(graph: csr_array) -> np.ndarray:
     if 2 * largest.size <= size:
         return rank[label].astype(float)
     key = np.full(size, np.inf)
-    key[largest] = _far_ends(graph[largest][:, largest])
+    key[largest] = _distance_difference(graph[largest][:, largest])
     return key
 
 
-def _far_ends(graph: csr_array) -> np.ndarray:
-    """Difference of the graph distances to two nodes that lie far apart; its level sets are nearly straight."""
+def _distance_difference(graph: csr_array) -> np.ndarray:
+    """Difference of the graph distances to two nodes that lie far apart. The nodes where it has a given value lie
+    nearly on a straight line."""
     start = breadth_first_order(graph, 0, directed=False, return_predecessors=False)[-1]
-    from_start = _distances(graph, start)
+    from_start = _graph_distances(graph, start)
     end = int(np.argmax(from_start))
-    from_end = _distances(graph, end)
+    from_end = _graph_distances(graph, end)
     return (from_start - from_end) + 1e-3 * from_start
 
 
-def _distances(graph: csr_array, start: int) -> np.ndarray:
+def _graph_distances(graph: csr_array, start: int) -> np.ndarray:
     """Number of edges between `start` and every node of a connected graph."""
     order, predecessor = breadth_first_order(graph, start, directed=False)
     position = np.empty(_num_nodes(graph), dtype=np.int64)
@@ -167,9 +172,9 @@ def _distances(graph: csr_array, start: int) -> np.ndarray:
     return result
 
 
-def _smallest_cover(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Minimum set of nodes that touches every edge between two sides (König: its size equals that of a maximum
-    matching)."""
+def _minimum_vertex_cover(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Smallest set of nodes that contains an end of every edge (lower[i], upper[i]). By König's theorem it has as many
+    nodes as a maximum matching has edges."""
     if lower.size == 0:
         return np.empty(0, dtype=np.int64)
     left, left_local = np.unique(lower, return_inverse=True)

@@ -112,7 +112,7 @@ class PaddedSum(NamedTuple):
     ) -> None:
         """In NumPy, add the sums with indices from `start` up to, but not including, `stop` to `total` (sums, k) in
         place. They are processed in chunks, so that temporary arrays stay in the cache."""
-        at_once = max(1, _AT_ONCE // math.prod(contributions.shape[1:]))
+        at_once = max(1, _NUMPY_CHUNK // math.prod(contributions.shape[1:]))
         gathered: Any = self.gather.read(indices)
         for first in range(start, stop, at_once) if len(gathered) else ():
             some = slice(first, min(first + at_once, stop))
@@ -142,7 +142,7 @@ class PaddedSum(NamedTuple):
 # Cost of a scattered contribution relative to a gathered one, measured on two Zen 4 cores.
 _SCATTER_COST = 4.0
 # Number of entries that NumPy gathers at a time.
-_AT_ONCE = 16384
+_NUMPY_CHUNK = 16384
 
 
 class IndexLayout:

@@ -28,10 +28,11 @@ from jeit_solvers.engines import call_numpy, has_values, host, on_host
 from jeit_solvers.sparse.operator import LastMatrix, MatrixSolver, SparseSymmetric
 from jeit_solvers.sparse.pattern import SparsityPattern
 
-# Most columns that are iterated together: more share the entries of the matrix that are read, fewer stay in the cache.
-_COLUMNS = 16
+# Maximum number of right-hand sides that are iterated together. More of them share each read of the matrix; fewer fit
+# in the cache.
+_MAX_COLUMNS = 16
 # Maximum number of unknowns of the coarsest level, of which the inverse is computed.
-_COARSEST = 500
+_MAX_COARSEST_SIZE = 500
 # The smoother damps the spectrum of the scaled matrix from an eighth of its bound on, by a Chebyshev polynomial of
 # degree 2, of which these are the inverse roots.
 _MIDDLE, _HALF = (1 + 1 / 8) / 2, (1 - 1 / 8) / 2
@@ -88,7 +89,7 @@ class Multigrid(MatrixSolver):
         """Solutions for several right-hand sides."""
         pattern, kind = state.pattern, jnp.result_type(state.values, columns)
         shape = jax.ShapeDtypeStruct(columns.shape, kind)
-        if has_values(pattern):  # no part of a program: they are many
+        if has_values(pattern):  # constants, kept out of the compiled program because they are large
             solve = partial(_solve_in_numpy, self, kind, on_host(pattern))
             if has_values(state, columns):
                 return host.asarray(solve(state.values, columns))
@@ -114,7 +115,7 @@ def multigrid_is_installed() -> bool:
 
 
 def hierarchy(matrix: csr_array) -> Hierarchy:
-    """Levels for a symmetric matrix (n, n) with positive definite real part."""
+    """Build the multigrid levels for a symmetric matrix (n, n) with positive definite real part."""
     diagonal = matrix.diagonal()
     if not (np.isfinite(matrix.data).all() and (diagonal.real > 0).all()):
         return Hierarchy(matrix, None)
@@ -125,110 +126,112 @@ def hierarchy(matrix: csr_array) -> Hierarchy:
         improve_candidates=None,
         presmoother=None,
         postsmoother=None,
-        max_coarse=_COARSEST,
+        max_coarse=_MAX_COARSEST_SIZE,
     )
-    return Hierarchy(matrix, [_level(one) for one in found.levels])
+    return Hierarchy(matrix, [_build_level(one) for one in found.levels])
 
 
-def _level(made: Any) -> Level:
-    matrix = csr_array(made.A)
+def _build_level(pyamg_level: Any) -> Level:
+    matrix = csr_array(pyamg_level.A)
     sums = abs(matrix).sum(axis=1).reshape(-1, 1)
     scale = (1 / np.where(sums > 0, sums, 1)).astype(np.float32)  # rows of zeros, as PyAMG makes of isolated nodes
-    if not hasattr(made, "P"):
+    if not hasattr(pyamg_level, "P"):
         return Level(matrix, scale, inverse=np.linalg.pinv(matrix.toarray(), hermitian=True).astype(np.float32))
-    prolongation = csr_array(made.P).astype(np.float32)
+    prolongation = csr_array(pyamg_level.P).astype(np.float32)
     return Level(matrix.astype(np.float32), scale, prolongation, csr_array(prolongation.T))
 
 
-def _cycle(levels: list[Level], load: np.ndarray) -> np.ndarray:
-    """One V-cycle for a load (n, k), from a start of zero."""
+def _v_cycle(levels: list[Level], right_hand_side: np.ndarray) -> np.ndarray:
+    """Apply one V-cycle to right-hand sides (n, k), started at zero."""
     level, *coarser = levels
     if level.inverse is not None:
-        return level.inverse @ load
+        return level.inverse @ right_hand_side
     first, second = _WEIGHTS
-    found = np.float32(first) * level.scale * load
-    _relax(level, found, load, second)
-    left = level.matrix @ found
-    np.subtract(load, left, out=left)
-    found += level.prolongation @ _cycle(coarser, level.restriction @ left)
+    solution = np.float32(first) * level.scale * right_hand_side
+    _relax(level, solution, right_hand_side, second)
+    residual = level.matrix @ solution
+    np.subtract(right_hand_side, residual, out=residual)
+    solution += level.prolongation @ _v_cycle(coarser, level.restriction @ residual)
     for weight in (second, first):
-        _relax(level, found, load, weight)
-    return found
-
-
-def _relax(level: Level, found: np.ndarray, load: np.ndarray, weight: float) -> None:
-    """Add a scaled residual to a solution (n, k)."""
-    change = level.matrix @ found
-    np.subtract(load, change, out=change)
-    change *= np.float32(weight) * level.scale
-    found += change
-
-
-def _preconditioned(levels: list[Level], residual: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """The V-cycle of residuals (n, k), scaled to about one, because single precision has a limited range, by their
-    `sizes` (k,)."""
-    scale = np.where(sizes > 0, sizes, 1) / np.sqrt(len(residual))
-    single = np.complex64 if np.iscomplexobj(residual) else np.float32
-    scaled = np.multiply(residual, 1 / scale, out=np.empty(residual.shape, single), casting="unsafe")
-    return _cycle(levels, scaled.view(np.float32)).view(single) * scale
-
-
-def _iterated(of: Hierarchy, load: np.ndarray, tolerance: float, max_steps: int) -> np.ndarray:
-    """Solutions (n, k) by conjugate gradients; NaN where they are not found."""
-    assert of.levels is not None
-    solution, residual, size = np.zeros_like(load), load.copy(), _norms(load)
-    preconditioned = _preconditioned(of.levels, residual, size)
-    direction, weight = preconditioned.copy(), _products(residual, preconditioned)
-    target, target_error = tolerance * size, tolerance * _norms(preconditioned)
-    found = size == 0
-    for _ in range(max_steps):
-        image = of.matrix @ direction
-        curvature = _products(direction, image)
-        if not (np.iscomplexobj(curvature) or (curvature[~found] > 0).all()):  # not positive definite
-            break
-        length = np.divide(weight, curvature, out=np.zeros_like(weight), where=~found)
-        image *= length
-        residual -= image
-        solution += np.multiply(direction, length, out=image)
-        size = _norms(residual)
-        preconditioned = _preconditioned(of.levels, residual, size)
-        before, weight = weight, _products(residual, preconditioned)
-        found |= (size <= target) & (_norms(preconditioned) <= target_error)
-        if found.all() or not np.isfinite(weight).all():
-            break
-        direction *= np.divide(weight, before, out=np.zeros_like(weight), where=~found)
-        direction += preconditioned
-    solution[:, ~found] = np.nan
+        _relax(level, solution, right_hand_side, weight)
     return solution
 
 
-def _products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return np.einsum("nk,nk->k", one, other)
+def _relax(level: Level, solution: np.ndarray, right_hand_side: np.ndarray, weight: float) -> None:
+    """Smooth a solution (n, k): add the residual, scaled by `weight` and the inverse row sums of the matrix."""
+    change = level.matrix @ solution
+    np.subtract(right_hand_side, change, out=change)
+    change *= np.float32(weight) * level.scale
+    solution += change
 
 
-def _norms(columns: Any) -> np.ndarray:
-    squares = _products(columns.real, columns.real)
-    return np.sqrt(squares + _products(columns.imag, columns.imag) if np.iscomplexobj(columns) else squares)
+def _precondition(levels: list[Level], residual: np.ndarray, norms: np.ndarray) -> np.ndarray:
+    """Apply a V-cycle to residuals (n, k). They are divided by their `norms` (k,) first, because single precision has a
+    limited range."""
+    scale = np.where(norms > 0, norms, 1) / np.sqrt(len(residual))
+    single = np.complex64 if np.iscomplexobj(residual) else np.float32
+    scaled = np.multiply(residual, 1 / scale, out=np.empty(residual.shape, single), casting="unsafe")
+    return _v_cycle(levels, scaled.view(np.float32)).view(single) * scale
 
 
-def _solve_in_numpy(solver: Multigrid, kind: Any, pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
+def _conjugate_gradients(
+    hierarchy: Hierarchy, right_hand_side: np.ndarray, tolerance: float, max_steps: int
+) -> np.ndarray:
+    """Solve for right-hand sides (n, k) by preconditioned conjugate gradients. Columns that do not converge are NaN."""
+    assert hierarchy.levels is not None
+    solution, residual, norm = np.zeros_like(right_hand_side), right_hand_side.copy(), _column_norms(right_hand_side)
+    preconditioned = _precondition(hierarchy.levels, residual, norm)
+    direction, weight = preconditioned.copy(), _column_products(residual, preconditioned)
+    target, target_error = tolerance * norm, tolerance * _column_norms(preconditioned)
+    is_converged = norm == 0
+    for _ in range(max_steps):
+        product = hierarchy.matrix @ direction
+        curvature = _column_products(direction, product)
+        if not (np.iscomplexobj(curvature) or (curvature[~is_converged] > 0).all()):  # not positive definite
+            break
+        length = np.divide(weight, curvature, out=np.zeros_like(weight), where=~is_converged)
+        product *= length
+        residual -= product
+        solution += np.multiply(direction, length, out=product)
+        norm = _column_norms(residual)
+        preconditioned = _precondition(hierarchy.levels, residual, norm)
+        before, weight = weight, _column_products(residual, preconditioned)
+        is_converged |= (norm <= target) & (_column_norms(preconditioned) <= target_error)
+        if is_converged.all() or not np.isfinite(weight).all():
+            break
+        direction *= np.divide(weight, before, out=np.zeros_like(weight), where=~is_converged)
+        direction += preconditioned
+    solution[:, ~is_converged] = np.nan
+    return solution
+
+
+def _column_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    return np.einsum("nk,nk->k", left, right)
+
+
+def _column_norms(columns: Any) -> np.ndarray:
+    squares = _column_products(columns.real, columns.real)
+    return np.sqrt(squares + _column_products(columns.imag, columns.imag) if np.iscomplexobj(columns) else squares)
+
+
+def _solve_in_numpy(solver: Multigrid, dtype: Any, pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
     columns, values = np.asarray(columns), np.asarray(values)
     key = hashlib.blake2b(np.ascontiguousarray(pattern.indices).tobytes(), digest_size=16).digest()
-    made = _LAST.of(key, values, lambda: hierarchy(pattern.to_scipy(values)))
-    load = np.ascontiguousarray(columns, np.result_type(kind, float))
+    made = _LAST_HIERARCHY.get_or_compute(key, values, lambda: hierarchy(pattern.to_scipy(values)))
+    load = np.ascontiguousarray(columns, np.result_type(dtype, float))
     if made.levels is None:
-        return np.full(load.shape, np.nan, kind)
+        return np.full(load.shape, np.nan, dtype)
     if np.iscomplexobj(load) and not np.iscomplexobj(values):
         load = load.view(float)  # real and imaginary parts are columns of their own
     solution = np.empty_like(load)
 
     def solve(part: slice) -> None:
         group = np.ascontiguousarray(load[:, part])
-        solution[:, part] = _iterated(made, group, solver.tolerance, solver.max_steps)
+        solution[:, part] = _conjugate_gradients(made, group, solver.tolerance, solver.max_steps)
 
-    together = max(1, min(_COLUMNS, -(-load.shape[1] // number_of_cores())))
+    together = max(1, min(_MAX_COLUMNS, -(-load.shape[1] // number_of_cores())))
     on_cores(solve, [slice(start, start + together) for start in range(0, load.shape[1], together)])
-    return solution.view(np.result_type(kind, float)).astype(kind)
+    return solution.view(np.result_type(dtype, float)).astype(dtype)
 
 
-_LAST = LastMatrix()
+_LAST_HIERARCHY = LastMatrix()

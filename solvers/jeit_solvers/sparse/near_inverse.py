@@ -1,7 +1,8 @@
-"""Entries of A⁻¹ between nearby unknowns of a sparse matrix A, by elimination from strip to strip.
+"""Entries of A⁻¹ between nearby unknowns of a sparse matrix A, by block elimination of a block tridiagonal matrix.
 
-Unknowns are partitioned into strips, each coupled only to its neighbours: the levels of a breadth-first search from one
-side. With blocks A_i of a strip and E_i between strips i and i + 1, elimination from the first strip on gives
+The unknowns are partitioned into blocks, called *strips*, such that A couples each strip only to the one before and the
+one after it: they are the levels of a breadth-first search that starts at one side of the body. With the diagonal
+blocks A_i of strip i and the blocks E_i between strips i and i + 1, elimination from the first strip on gives
 
     P_i = (A_i - Eᵀ_(i-1) P_(i-1) E_(i-1))⁻¹,  W_i = P_i E_i,
 
@@ -9,7 +10,7 @@ and then, from the last strip back, the blocks of G = A⁻¹ are (Takahashi, Fag
 
     G_ij = -W_i G_(i+1)j  for j > i,    G_ii = P_i + W_i G_(i+1)(i+1) W_iᵀ.
 
-Only blocks with j up to i + `reach` are computed. The work consists of products of a few large matrices.
+Only blocks with j - i up to `max_distance` are computed. Nearly all work is in products of large matrices.
 """
 
 from __future__ import annotations
@@ -29,56 +30,64 @@ from jeit_solvers.sparse.pattern import SparsityPattern
 
 
 class Strips(eqx.Module):
-    """Unknowns of a matrix, partitioned into strips, with the wanted unknowns first in each strip.
+    """Partition of the unknowns of a matrix into strips, each coupled only to its two neighbours, for `near_inverse`.
+    The selected unknowns, between which the inverse is computed, come first in each strip.
 
-    `position`: (n,) strip · `size` + index within the strip; `number`: number of strips; `size`: maximum number of
-    unknowns in a strip; `wanted`: maximum number of wanted unknowns in a strip, rounded up. The `place` of a wanted
-    unknown is strip · `wanted` + index within the strip.
+    **Fields**: `position`: (n,) strip · `strip_size` + index within the strip; `num_strips`: number of strips;
+    `strip_size`: maximum number of unknowns in a strip; `selected_per_strip`: maximum number of selected unknowns in a
+    strip, rounded up. The `place` of a selected unknown is strip · `selected_per_strip` + index within the strip.
     """
 
     position: Int[np.ndarray, " n"]
-    number: int = eqx.field(static=True)
-    size: int = eqx.field(static=True)
-    wanted: int = eqx.field(static=True)
+    num_strips: int = eqx.field(static=True)
+    strip_size: int = eqx.field(static=True)
+    selected_per_strip: int = eqx.field(static=True)
 
     @classmethod
     def create(
-        cls, pattern: SparsityPattern, coordinates: Inexact[np.ndarray, "n d"], wanted: Bool[np.ndarray, " n"]
+        cls, pattern: SparsityPattern, coordinates: Inexact[np.ndarray, "n d"], selected: Bool[np.ndarray, " n"]
     ) -> "Strips":
-        """Strips perpendicular to the longest extent of the unknowns' coordinates."""
+        """Partition the unknowns into strips perpendicular to the longest extent of their `coordinates` (n, d).
+        `selected` (n,): the unknowns between which the inverse is needed."""
         long, *others = coordinates.T[np.argsort(-np.ptp(coordinates, axis=0))]
-        strip = _levels(pattern, long)
+        strip = _breadth_first_levels(pattern, long)
         # Neighbours in a strip are neighbours in memory.
-        order = np.lexsort((*others[::-1], ~wanted, strip))
+        order = np.lexsort((*others[::-1], ~selected, strip))
         counts = np.bincount(strip)
         within = np.empty(len(strip), int)
         within[order] = np.arange(len(strip)) - np.repeat(np.cumsum(counts) - counts, counts)
         size = int(counts.max())
-        most = int(np.bincount(strip[wanted], minlength=1).max())
+        most = int(np.bincount(strip[selected], minlength=1).max())
         most = min(-(-max(most, 1) // 8) * 8, size)  # rounded to few sizes, because a program is compiled for each
         return cls((strip * size + within).astype(np.int32), len(counts), size, most)
 
     @property
     def place(self) -> Int[np.ndarray, " n"]:
-        """Places (n,) of the wanted unknowns, in 0 … `number` · `wanted` - 1; meaningless for other unknowns."""
-        return self.position // self.size * self.wanted + self.position % self.size
+        """Places (n,) of the selected unknowns, in 0 … `num_strips` · `selected_per_strip` - 1; meaningless for
+        others."""
+        return self.position // self.strip_size * self.selected_per_strip + self.position % self.strip_size
 
-    def reach(self, groups: Int[np.ndarray, "g k"]) -> int:
-        """Maximum number of strips between the first and the last place of a group, at least 1."""
-        strips = np.asarray(groups) // self.wanted
+    def max_strip_distance(self, groups: Int[np.ndarray, "g k"]) -> int:
+        """Largest difference between the strip numbers of two places in the same row of `groups` (g, k); at least 1."""
+        strips = np.asarray(groups) // self.selected_per_strip
         return max(1, int((strips.max(axis=1) - strips.min(axis=1)).max()))
 
     def spread(self, rows: Inexact[Array, "n *k"]) -> Inexact[Array, "p *k"]:
-        """Rows of the unknowns in the order of places; zeros where a strip has fewer wanted unknowns than `wanted`."""
-        shape = self.number * self.size, *rows.shape[1:]
-        spread = jnp.zeros(shape, rows.dtype).at[self.position].set(rows).reshape(self.number, self.size, *shape[1:])
-        return spread[:, : self.wanted].reshape(-1, *shape[1:])
+        """Reorder rows (n, …) of the unknowns to the order of places. Places without an unknown get zeros."""
+        shape = self.num_strips * self.strip_size, *rows.shape[1:]
+        spread = (
+            jnp.zeros(shape, rows.dtype)
+            .at[self.position]
+            .set(rows)
+            .reshape(self.num_strips, self.strip_size, *shape[1:])
+        )
+        return spread[:, : self.selected_per_strip].reshape(-1, *shape[1:])
 
 
 class NearInverse(eqx.Module):
-    """G between places at most a few strips apart. **Fields**: `band`: (strips, wanted, columns) blocks G_ij, with j
-    from the strip i of the row to a few strips further, because G is symmetric; `left` and `right`: (p, r) factors of a
-    term left rightᵀ that is added to G."""
+    """Entries of the inverse G = A⁻¹ between places that are at most a few strips apart. **Fields**: `band`: (strips,
+    selected unknowns, columns) blocks G_ij with j ≥ i, because G is symmetric; `left`, `right`: (p, r) factors of a
+    matrix left rightᵀ that is added to G."""
 
     band: Inexact[Array, "s p q"]
     left: Inexact[Array, "p r"]
@@ -86,13 +95,13 @@ class NearInverse(eqx.Module):
 
     def blocks(self, places: Int[Array, "g k"]) -> Inexact[Array, "g k k"]:
         """Blocks of G between the places of each group."""
-        _, wanted, width = self.band.shape
+        _, selected, width = self.band.shape
         added = self.left[places] @ jnp.swapaxes(self.right[places], 1, 2)
         if self.band.size >= 2**31:  # places are 32-bit integers, and their products would overflow
             places = places.astype(jnp.int64)
         row, column = places[:, :, None], places[:, None]
         row, column = jnp.minimum(row, column), jnp.maximum(row, column)
-        index = row * width + column - row // wanted * wanted
+        index = row * width + column - row // selected * selected
         return self.band.reshape(-1).at[index].get(mode="promise_in_bounds") + added
 
     def add(self, left: Inexact[Array, "p r"], right: Inexact[Array, "p r"]) -> "NearInverse":
@@ -102,14 +111,15 @@ class NearInverse(eqx.Module):
 
 
 @partial(jax.jit, static_argnums=2)
-def near_inverse(strips: Strips, operator: SparseSymmetric, reach: int) -> NearInverse:
-    """G = A⁻¹ between wanted unknowns of strips at most `reach` apart; NaN if A is not positive definite."""
-    size, wanted = strips.size, strips.wanted
-    blocks, couplings = _blocks(strips, operator)
+def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -> NearInverse:
+    """Compute the entries of A⁻¹ between selected unknowns whose strip numbers differ by at most `max_distance`. They
+    are NaN if A is not positive definite."""
+    size, selected = strips.strip_size, strips.selected_per_strip
+    blocks, couplings = _strip_blocks(strips, operator)
 
-    def eliminate(taken, strip):
+    def eliminate(schur_update, strip):
         block, coupling = strip
-        pivot = symmetric_inverse(block - taken)
+        pivot = symmetric_inverse(block - schur_update)
         weights = pivot @ coupling
         return coupling.T @ weights, (pivot, weights)
 
@@ -118,38 +128,39 @@ def near_inverse(strips: Strips, operator: SparseSymmetric, reach: int) -> NearI
         ahead = -weights @ following
         own = pivot - ahead[:, :size] @ weights.T
         own = (own + own.T) / 2
-        near = jnp.concatenate([own[:, :wanted], ahead[:, :wanted], ahead[:, size:]], axis=1)[:wanted]
-        kept = size + (reach - 1) * wanted
-        following = jnp.concatenate([own, ahead[:, :wanted], ahead[:, size:]], axis=1)[:, :kept]
+        near = jnp.concatenate([own[:, :selected], ahead[:, :selected], ahead[:, size:]], axis=1)[:selected]
+        kept = size + (max_distance - 1) * selected
+        following = jnp.concatenate([own, ahead[:, :selected], ahead[:, size:]], axis=1)[:, :kept]
         return following, near
 
     nothing = jnp.zeros((size, size), operator.values.dtype)
     _, eliminated = jax.lax.scan(eliminate, nothing, (blocks, couplings))
-    nothing = jnp.zeros((size, size + (reach - 1) * wanted), operator.values.dtype)
+    nothing = jnp.zeros((size, size + (max_distance - 1) * selected), operator.values.dtype)
     _, upper = jax.lax.scan(substitute, nothing, eliminated, reverse=True)
-    none = jnp.zeros((strips.number * wanted, 0), upper.dtype)
+    none = jnp.zeros((strips.num_strips * selected, 0), upper.dtype)
     return NearInverse(upper, none, none)
 
 
-def _blocks(strips: Strips, operator: SparseSymmetric):
-    """A_i and E_i (number, size, size). Strips are filled up with unknowns that are not coupled to others."""
-    shape = strips.number, strips.size, strips.size
+def _strip_blocks(strips: Strips, operator: SparseSymmetric):
+    """Diagonal blocks A_i and blocks E_i between neighbouring strips, both (num_strips, strip_size, strip_size). Strips
+    are filled up with unknowns that are not coupled to others."""
+    shape = strips.num_strips, strips.strip_size, strips.strip_size
     position = jnp.asarray(strips.position)
     rows, columns = position[operator.pattern.rows], position[operator.pattern.columns]
     first, last = jnp.minimum(rows, columns), jnp.maximum(rows, columns)
-    strip, row, column = first // strips.size, first % strips.size, last % strips.size
-    inside = jnp.where(last // strips.size == strip, strip, strips.number)
-    across = jnp.where(last // strips.size == strip, strips.number, strip)
-    filler = jnp.ones(strips.number * strips.size).at[position].set(0).reshape(shape[:2])
-    blocks = jnp.eye(strips.size, dtype=operator.values.dtype) * filler[:, None]
+    strip, row, column = first // strips.strip_size, first % strips.strip_size, last % strips.strip_size
+    inside = jnp.where(last // strips.strip_size == strip, strip, strips.num_strips)
+    across = jnp.where(last // strips.strip_size == strip, strips.num_strips, strip)
+    filler = jnp.ones(strips.num_strips * strips.strip_size).at[position].set(0).reshape(shape[:2])
+    blocks = jnp.eye(strips.strip_size, dtype=operator.values.dtype) * filler[:, None]
     blocks = blocks.at[inside, row, column].set(operator.values, mode="drop")
     blocks = blocks.at[inside, column, row].set(operator.values, mode="drop")
     couplings = jnp.zeros(shape, operator.values.dtype).at[across, row, column].set(operator.values, mode="drop")
     return blocks, couplings
 
 
-def _levels(pattern: SparsityPattern, along: np.ndarray) -> Int[np.ndarray, " n"]:
-    """Levels (n,) of a breadth-first search that starts where the coordinate `along` is smallest, in each connected
+def _breadth_first_levels(pattern: SparsityPattern, coordinate: np.ndarray) -> Int[np.ndarray, " n"]:
+    """Levels (n,) of a breadth-first search that starts where `coordinate` (n,) is smallest, in each connected
     component."""
     rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
     graph = csr_array((np.ones(len(rows), np.float32), (rows, columns)), shape=(pattern.size, pattern.size))
@@ -158,9 +169,9 @@ def _levels(pattern: SparsityPattern, along: np.ndarray) -> Int[np.ndarray, " n"
     frontier = np.zeros(pattern.size, bool)
     while (unseen := level < 0).any():
         if not frontier.any():
-            end = np.flatnonzero(unseen)[along[unseen].argmin()]
+            end = np.flatnonzero(unseen)[coordinate[unseen].argmin()]
             neighbours = graph.indices[graph.indptr[end] : graph.indptr[end + 1]]
-            frontier = unseen & (along <= (along[end] + along[neighbours].max()) / 2)
+            frontier = unseen & (coordinate <= (coordinate[end] + coordinate[neighbours].max()) / 2)
         level[frontier] = number
         number += 1
         frontier = (graph @ frontier.astype(np.float32) > 0) & (level < 0)

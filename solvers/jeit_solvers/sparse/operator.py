@@ -136,20 +136,21 @@ class MatrixSolver(lineax.AbstractLinearSolver[SparseSymmetric]):
 
 
 class LastMatrix:
-    """What was made of the matrix that was solved last: derivatives solve with the same matrix again."""
+    """Cache of one result, such as a factor, for the matrix that was used last: derivatives solve with the same matrix
+    again."""
 
     def __init__(self) -> None:
-        self._kept: tuple[bytes, Any] | None = None
+        self._last: tuple[bytes, Any] | None = None
 
-    def of(self, key: bytes, values: np.ndarray, make: Callable[[], Any], *, keep: bool = True) -> Any:
-        """What `make` returns for a matrix with the given values (nnz,), made or taken from the last call; `key`
-        distinguishes patterns."""
+    def get_or_compute(self, key: bytes, values: np.ndarray, compute: Callable[[], Any], *, keep: bool = True) -> Any:
+        """Return what `compute` returns for the matrix with the given values (nnz,), from the cache if the last call
+        was for the same matrix. `key` distinguishes sparsity patterns; with `keep` False the result is not cached."""
         digest = hashlib.blake2b(np.ascontiguousarray(values).tobytes(), digest_size=16).digest()
         key += values.dtype.str.encode() + digest
-        kept = self._kept  # another thread may replace it meanwhile
-        if kept is not None and kept[0] == key:
-            return kept[1]
-        self._kept = kept = None  # its memory serves the next
-        made = make()
-        self._kept = (key, made) if keep else None
-        return made
+        cached = self._last  # another thread may replace it meanwhile
+        if cached is not None and cached[0] == key:
+            return cached[1]
+        self._last = cached = None  # its memory serves the next
+        result = compute()
+        self._last = (key, result) if keep else None
+        return result

@@ -143,7 +143,7 @@ class SparsityPattern(eqx.Module):
         return pattern, pattern.assemble(jnp.asarray(entries.data[lower]))
 
     @classmethod
-    def _from_contributions(cls, row_lists, column_lists, shapes, size, where, what) -> Self:
+    def _from_contributions(cls, row_lists, column_lists, shapes, size, caller, reason) -> Self:
         """Pattern of the unique entries of all groups, with a map from the values of each group to the entries."""
         keys = []
         for rows, columns in zip(row_lists, column_lists, strict=True):
@@ -156,8 +156,8 @@ class SparsityPattern(eqx.Module):
         if not on_diagonal.all():
             missing = np.flatnonzero(~on_diagonal)
             raise ValueError(
-                f"{where}: {missing.size} of {size} rows {what}, the first are {missing[:5].tolist()}. A matrix with "
-                "this pattern cannot be positive definite: leave these unknowns out, and number the rest 0..n-1."
+                f"{caller}: {missing.size} of {size} rows {reason}, the first are {missing[:5].tolist()}. A matrix "
+                "with this pattern cannot be positive definite: leave these unknowns out, and number the rest 0..n-1."
             )
         below = unique[size:]
         rows = np.concatenate([np.arange(size), below // size])
@@ -185,7 +185,7 @@ class SparsityPattern(eqx.Module):
                 f"and {len(element_matrices)} arrays were given; use None for a group that adds nothing."
             )
         parts = [
-            group.apply(self.indices, _numbers(matrices), f"assemble: argument {number}")
+            group.apply(self.indices, _as_numeric(matrices), f"assemble: argument {number}")
             for number, (group, matrices) in enumerate(zip(self._assembly, element_matrices, strict=True))
             if matrices is not None
         ]
@@ -226,7 +226,7 @@ class SparsityPattern(eqx.Module):
         return csr_array(coo_array((data, coordinates), shape=(self.size, self.size)))
 
 
-def _numbers(values: Any) -> Any:
+def _as_numeric(values: Any) -> Any:
     return values if isinstance(values, np.ndarray) else jnp.asarray(values)
 
 

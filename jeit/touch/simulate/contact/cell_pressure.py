@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from jeit.design.skin.reached_cells import said
-from jeit.design.skin.touched_cells import padded
+from jeit.design.skin.reached_cells import millimetre_text
+from jeit.design.skin.touched_cells import pad_rows
 from jeit.touch.simulate.contact.indenters import Disc
 from jeit.touch.simulate.contact.press import AbstractSupport, Press
 from jeit.touch.simulate.contact.samples import Samples
@@ -86,7 +86,7 @@ def _of_each(
     if empty.size:
         raise ValueError(
             f"position: {empty.size} of {len(presses)} presses lie off the skin, the first at "
-            f"{said(position[empty[0]])} mm; places are in metres."
+            f"{millimetre_text(position[empty[0]])} mm; places are in metres."
         )
     rows: list = [None] * len(presses)
     pressures: list = [None] * len(presses)
@@ -95,7 +95,7 @@ def _of_each(
         same = np.flatnonzero(shapes == shape)
         same = same[np.argsort(number[same], kind="stable")]
         for some in np.split(same, range(_AT_ONCE, len(same), _AT_ONCE)):
-            cells, there = padded([np.asarray(near[one], int) for one in some])
+            cells, there = pad_rows([np.asarray(near[one], int) for one in some])
             pressure = _alike(samples, support, [presses[one] for one in some], cells, there)
             for one, own, pressed in zip(some, cells, pressure, strict=True):
                 kept = pressed.any(axis=-1)
@@ -169,7 +169,8 @@ def _between(samples: Samples, support: AbstractSupport, press: Press, cells, th
     cell = np.where(there, distance, np.inf).argmin()
     if not (distance[cell] < _FOUND * samples.radius and np.isfinite(press.indenter.gap(np.zeros(2)))):
         raise ValueError(
-            f"position: the press at {said(press.position)} mm touches no skin, or does with less than a tenth of a "
+            f"position: the press at {millimetre_text(press.position)} mm touches no skin, or does with less than a "
+            "tenth of a "
             "cell's width; move it, or give a wider indenter or a finer mesh."
         )
     nearest = np.linalg.norm(samples.points[cells[cell]] - press.position, axis=-1).argmin()
@@ -184,7 +185,7 @@ def _bulge(samples: Samples, fall):
 
 
 def _joined(rows: list, pressures: list) -> PressedCells:
-    cells, there = padded(rows)
+    cells, there = pad_rows(rows)
     pressure = np.zeros((*cells.shape, pressures[0].shape[-1]))
     pressure[there] = np.concatenate(pressures)
     return PressedCells(cells, pressure)

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from jeit.arguments import check_key, check_kind, check_metres, describe, is_number, real_array
 from jeit.design import Skin
 from jeit.design.skin.resting_skin import RestingSkin
-from jeit.design.skin.touched_cells import TouchedCells, padded
+from jeit.design.skin.touched_cells import TouchedCells, pad_rows
 from jeit.mesh import Domain, centroids
 from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indenter
 from jeit.touch.simulate.contact.joined import check_angle, check_position
@@ -217,7 +217,7 @@ def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCe
         kept = share > 0
         rows.append(cells[kept])
         changes.append(-share[kept])
-    cells, there = padded(rows)
+    cells, there = pad_rows(rows)
     change = np.zeros(cells.shape)
     change[there] = np.concatenate(changes)
     places = np.array([touch[0].position if touch else np.zeros(2) for touch in touches])

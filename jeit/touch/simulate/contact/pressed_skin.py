@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, check_name, describe, is_number, real_array
 from jeit.design.skin.reached_cells import is_curved
-from jeit.design.skin.touched_cells import TouchedCells, padded
+from jeit.design.skin.touched_cells import TouchedCells, pad_rows
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
 from jeit.forward.changes import ContactSensitivity
@@ -342,7 +342,7 @@ class PressedSkin(eqx.Module):
 def _touched(places, cells, change, number: int) -> TouchedCells:
     """Collect the changes that are not negligible as `TouchedCells`, padded with zeros at the end of each row."""
     kept = np.abs(change) > _LEAST * np.abs(change).max(axis=1, keepdims=True)
-    rows, there = padded([row[one] for row, one in zip(cells, kept, strict=True)])
+    rows, there = pad_rows([row[one] for row, one in zip(cells, kept, strict=True)])
     wide = _even(rows.shape[1]) - rows.shape[1]
     changes = np.zeros(rows.shape)
     changes[there] = change[kept]

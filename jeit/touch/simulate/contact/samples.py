@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.design.skin.reached_cells import is_curved, said, touched_surface
+from jeit.design.skin.reached_cells import is_curved, millimetre_text, touched_surface
 from jeit.mesh import Mesh, check_flat, measures
 from jeit.mesh.geodesic import Triangles
 from jeit.touch.simulate.contact.press import Press
@@ -103,7 +103,8 @@ class Samples(NamedTuple):
         if lost.size:
             raise ValueError(
                 f"position: {lost.size} of {len(presses)} presses lie off the skin, the first at "
-                f"{said(position[lost[0]])} mm, by {1e3 * away[lost[0]]:.3g} mm; places are in metres, on the touched "
+                f"{millimetre_text(position[lost[0]])} mm, by {1e3 * away[lost[0]]:.3g} mm; places are in metres, on "
+                "the touched "
                 "face."
             )
 

@@ -22,7 +22,7 @@ from jeit_solvers import (
     find_fronts,
     on_cores,
 )
-from jeit_solvers.sparse import choose, frontal, fronts
+from jeit_solvers.sparse import choose, exact_fronts, exact_fronts_numpy
 from jeit_solvers.sparse.operator import LastMatrix
 
 TOLERANCE = 5e-15
@@ -31,10 +31,10 @@ SPREAD = (sparse_problems.disk, sparse_problems.box)
 
 def of_many_fronts(monkeypatch):
     """Leaves of a few rows, so that small problems have trees of several levels, and threads for any work."""
-    monkeypatch.setattr(fronts, "_LEAF_SIZE", 8)
-    monkeypatch.setattr(frontal, "_WORTH_A_THREAD", 0)
-    monkeypatch.setattr(frontal, "_ROWS", 3)
-    monkeypatch.setattr(fronts, "_FRONTS", {})
+    monkeypatch.setattr(exact_fronts, "_LEAF_SIZE", 8)
+    monkeypatch.setattr(exact_fronts_numpy, "_MIN_PARALLEL_OPERATIONS", 0)
+    monkeypatch.setattr(exact_fronts_numpy, "_ADDED_ROWS", 3)
+    monkeypatch.setattr(exact_fronts, "_CACHED_FRONTS", {})
 
 
 def problem(case):
@@ -64,10 +64,14 @@ def test_every_problem_is_solved_to_roundoff(case, small_fronts, monkeypatch):
 def test_fronts_are_a_tree_that_holds_every_entry_once(case, monkeypatch):
     of_many_fronts(monkeypatch)
     pattern, _, coordinates, _ = problem(case)
-    found = fronts._fronts(pattern.size, *map(np.asarray, (pattern.rows, pattern.columns)), coordinates, b"")
+    found = exact_fronts._build_fronts(
+        pattern.size, *map(np.asarray, (pattern.rows, pattern.columns)), coordinates, b""
+    )
     assert sorted(found.order) == list(range(pattern.size))
     assert sorted(found.entry_order) == list(range(pattern.num_entries))
-    assert [one.entries.stop - one.entries.start for one in found.fronts] == [len(one.place) for one in found.fronts]
+    assert [one.entries.stop - one.entries.start for one in found.fronts] == [
+        len(one.panel_indices) for one in found.fronts
+    ]
     children = [child for one in found.fronts for child in one.children]
     assert sorted(children) == list(range(len(found.fronts) - 1))
     assert all(child < number for number, one in enumerate(found.fronts) for child in one.children)
@@ -166,7 +170,7 @@ def test_more_programs_than_cores_may_call_numpy_at_once(monkeypatch):
     """From threads of XLA's, where programs have work beside them; with arrays of over 100 kB, which JAX copies in such
     threads; inside parts on cores and outside."""
     of_many_fronts(monkeypatch)
-    monkeypatch.setattr(fronts, "_LEAF_SIZE", 128)
+    monkeypatch.setattr(exact_fronts, "_LEAF_SIZE", 128)
     size = 8000
     rows = np.concatenate([np.arange(size), np.arange(1, size)])
     columns = np.concatenate([np.arange(size), np.arange(size - 1)])
@@ -175,8 +179,8 @@ def test_more_programs_than_cores_may_call_numpy_at_once(monkeypatch):
     chain, vectors = find_fronts(pattern, np.arange(size)[:, None]), np.random.default_rng(0).normal(size=(size, 20))
     twice = jax.jit(
         lambda given, b: (
-            frontal.solve_at_once(chain, given, b).sum(),
-            frontal.solve_at_once(chain, 2 * given, jnp.sin(b)).sum(),
+            exact_fronts_numpy.solve_at_once(chain, given, b).sum(),
+            exact_fronts_numpy.solve_at_once(chain, 2 * given, jnp.sin(b)).sum(),
         )
     )
     found = np.full((12, 2), np.nan)
@@ -213,18 +217,18 @@ def test_right_hand_sides_of_every_kind():
 
 def test_the_last_factor_serves_again_unless_it_is_large(monkeypatch):
     made = []
-    monkeypatch.setattr(frontal, "_LAST", LastMatrix())
+    monkeypatch.setattr(exact_fronts_numpy, "_LAST_FACTOR", LastMatrix())
     plain = factorise_fronts
-    monkeypatch.setattr(frontal, "factorise_fronts", lambda *given: made.append(1) or plain(*given))
+    monkeypatch.setattr(exact_fronts_numpy, "factorise_fronts", lambda *given: made.append(1) or plain(*given))
     given = find_fronts(Compiled.pattern, Compiled.coordinates), Compiled.values, Compiled.vectors
     for _ in range(2):
-        frontal.solve_at_once(*given)
+        exact_fronts_numpy.solve_at_once(*given)
     assert len(made) == 1
-    frontal.solve_at_once(given[0], 2 * Compiled.values, Compiled.vectors)
+    exact_fronts_numpy.solve_at_once(given[0], 2 * Compiled.values, Compiled.vectors)
     assert len(made) == 2
-    monkeypatch.setattr(frontal, "_MOST_KEPT", 0)
+    monkeypatch.setattr(exact_fronts_numpy, "_MAX_CACHED_ENTRIES", 0)
     for _ in range(2):
-        frontal.solve_at_once(*given)
+        exact_fronts_numpy.solve_at_once(*given)
     assert len(made) == 4
 
 
@@ -239,7 +243,7 @@ def test_the_choice_follows_size_memory_and_device(monkeypatch):
     small = choose_solver(pattern, coordinates)
     assert isinstance(small, SparseCholesky)
     assert small.reason.startswith("direct: a factorisation takes")
-    monkeypatch.setattr(choose, "_COMPILED_ON_CPU", 0)
+    monkeypatch.setattr(choose, "_MAX_COMPILED_OPERATIONS_CPU", 0)
     large = choose_solver(pattern, coordinates)
     assert isinstance(large, FrontalCholesky)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

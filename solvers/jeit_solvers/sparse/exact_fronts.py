@@ -1,4 +1,5 @@
-"""Fronts of a sparsity pattern, each of its own size: the order of elimination for matrices at hand.
+"""Order of elimination with exact fronts, each of its own size; matrices are factorised in it by NumPy
+(`exact_fronts_numpy.py`).
 
 A *front* is a small dense matrix: its *pivots* are rows that are eliminated together, and its *border* consists of the
 later rows that their elimination changes (multifrontal method; Duff and Reid, ACM Trans. Math. Softw. 9, 1983). Rows
@@ -18,45 +19,49 @@ import numpy as np
 from jaxtyping import Int
 
 from jeit_solvers.sparse.dissection import nested_dissection
+from jeit_solvers.sparse.padded_fronts import checked_coordinates, graph_of
 from jeit_solvers.sparse.pattern import SparsityPattern
-from jeit_solvers.sparse.plan import checked_coordinates, graph_of
 
 # Size of the fronts at the leaves of the tree: small enough to be treated as dense, and large enough for the time of
 # BLAS to exceed that of calling it.
 _LEAF_SIZE = 128
-# Levels of the tree above the independent subtrees.
-_SPLIT = 3
-# Bits of each coordinate in the order of a front's rows.
-_BITS = 10
+# Number of levels of the elimination tree above the subtrees that are eliminated in parallel.
+_LEVELS_ABOVE_SUBTREES = 3
+# Number of bits to which coordinates are rounded for the order of rows along a space-filling curve.
+_CURVE_BITS = 10
 
 
 class Front(NamedTuple):
-    """**Fields**: `pivots`: number p; `border`: number b; `first`: number of the first pivot; `rows`: (b,) numbers of
-    the rows of the border, ascending; `entries`: range of the matrix entries of its pivots; `place`: their indices in
-    the flattened panel (p, p + b); `children`: numbers of the fronts whose parent it is; `into`: (b,) indices of the
-    rows of the border among the rows of the parent, pivots first, of which `among_pivots` are its pivots; `in_subtree`:
-    number of rows of the border that the front's own subtree eliminates."""
+    """Dense matrix of one elimination step. **Fields**: `pivots`: number p of its pivots; `border`: number b of its
+    border rows; `first`: number of the first pivot; `rows`: (b,) numbers of the rows of the border, ascending;
+    `entries`: range of the matrix entries of its pivots; `panel_indices`: indices of these entries in the flattened
+    panel (p, p + b), the rows of the pivots; `children`: numbers of the fronts that have this front as their parent;
+    `rows_in_parent`: (b,) indices of the border rows among the rows of the parent, whose pivots come first;
+    `num_parent_pivots`: number of border rows that are pivots of the parent; `num_subtree_rows`: number of border rows
+    that are eliminated within the front's independent subtree."""
 
     pivots: int
     border: int
     first: int
     rows: Int[np.ndarray, " b"]
     entries: slice
-    place: Int[np.ndarray, " e"]
+    panel_indices: Int[np.ndarray, " e"]
     children: tuple[int, ...]
-    into: Int[np.ndarray, " b"]
-    among_pivots: int
-    in_subtree: int
+    rows_in_parent: Int[np.ndarray, " b"]
+    num_parent_pivots: int
+    num_subtree_rows: int
 
 
 @dataclass(frozen=True, eq=False)
 class Fronts:
-    """Fronts of a sparsity pattern, in the order of their elimination; equal if pattern and order are.
+    """Fronts of a sparsity pattern, in the order of their elimination. Two objects are equal if their patterns and
+    orders are.
 
-    **Fields**: `size`, `num_entries`: of the pattern; `order`: (n,) row of the matrix of each number; `entry_order`:
-    (nnz,) entries of the matrix in the order of the fronts that hold them; `fronts`; `steps`: slices of fronts that do
-    not depend on each other, first the subtrees and then the fronts of each level above them; `top`: number of the
-    first row that a front above the subtrees eliminates; `key`: by which fronts are compared.
+    **Fields**: `size`, `num_entries`: rows and entries of the pattern; `order`: (n,) matrix rows in the order of
+    elimination; `entry_order`: (nnz,) entries of the matrix in the order of the fronts that hold them; `fronts`: all
+    fronts; `steps`: for each step the slices of fronts that can be eliminated in parallel, first the subtrees and then
+    the fronts of each level above them; `top`: number of the first row that a front above the subtrees eliminates;
+    `key`: digest of the pattern and the order, by which objects are compared.
     """
 
     size: int
@@ -80,7 +85,7 @@ class Fronts:
     @property
     def num_operations(self) -> float:
         """Number of floating-point operations of a factorisation."""
-        return float(sum(_operations(one.pivots, one.border) for one in self.fronts))
+        return float(sum(_num_front_operations(one.pivots, one.border) for one in self.fronts))
 
     @property
     def num_factor_entries(self) -> int:
@@ -98,40 +103,43 @@ class Fronts:
         return most
 
 
-def _operations(pivots: Any, border: Any) -> Any:
+def _num_front_operations(pivots: Any, border: Any) -> Any:
     return pivots**3 / 3 + pivots**2 * border + 1.0 * pivots * border**2
 
 
 def find_fronts(pattern: SparsityPattern, coordinates: Any = None) -> Fronts:
-    """Fronts of a pattern, in NumPy and SciPy, once per pattern. `coordinates` (n, d) of the unknowns give a better
-    order than the pattern alone. Raises `ValueError` if their shape does not fit or they are not finite."""
+    """Find the order of elimination of a sparsity pattern and its fronts, in NumPy and SciPy, once per pattern.
+    `coordinates` (n, d) of the unknowns give a better order than the pattern alone. Raises `ValueError` if their shape
+    does not fit or they are not finite."""
     coordinates = checked_coordinates(pattern, coordinates)
     rows, columns = (np.asarray(one, dtype=np.int64) for one in (pattern.rows, pattern.columns))
     found = hashlib.blake2b(digest_size=16)
     for one in (rows, columns, coordinates if coordinates is not None else np.zeros(0), np.array(_LEAF_SIZE)):
         found.update(np.ascontiguousarray(one).tobytes())
     key = found.digest()
-    if (known := _FRONTS.get(key)) is None:
-        _FRONTS[key] = known = _fronts(pattern.size, rows, columns, coordinates, key)
+    if (known := _CACHED_FRONTS.get(key)) is None:
+        _CACHED_FRONTS[key] = known = _build_fronts(pattern.size, rows, columns, coordinates, key)
     return known
 
 
-# Fronts in use, for models that are made again on the same mesh.
-_FRONTS: WeakValueDictionary[bytes, Fronts] = WeakValueDictionary()
+# Fronts in use, shared by models that are created again on the same mesh.
+_CACHED_FRONTS: WeakValueDictionary[bytes, Fronts] = WeakValueDictionary()
 
 
-def _fronts(size: int, rows: np.ndarray, columns: np.ndarray, coordinates: np.ndarray | None, key: bytes) -> Fronts:
+def _build_fronts(
+    size: int, rows: np.ndarray, columns: np.ndarray, coordinates: np.ndarray | None, key: bytes
+) -> Fronts:
     depth = max(0, int(np.ceil(np.log2(size / _LEAF_SIZE))))
     owner = nested_dissection(graph_of(rows, columns, size), depth, coordinates)
     nodes, owner = np.unique(owner, return_inverse=True)
     level = np.floor(np.log2(nodes + 1)).astype(int)
-    split = min(_SPLIT, depth)
+    split = min(_LEVELS_ABOVE_SUBTREES, depth)
     # Steps: the subtrees are number 0, the levels above them 1, 2, …
     step = np.maximum(split - level, 0)
     subtree = np.where(step, 0, (nodes + 1) >> np.maximum(level - split, 0))
-    by_number = np.lexsort((_post_order(nodes, level, depth), subtree, step))
+    by_number = np.lexsort((_post_order_positions(nodes, level, depth), subtree, step))
     number = np.argsort(by_number)
-    tree = _Tree(size, rows, columns, number[owner], level[by_number], coordinates)
+    tree = _EliminationTree(size, rows, columns, number[owner], level[by_number], coordinates)
     part = np.where(step, nodes, subtree)[by_number]
     starts = np.flatnonzero(np.diff(part, prepend=-1))
     slices = [slice(*both) for both in itertools.pairwise([*starts.tolist(), len(nodes)])]
@@ -141,8 +149,8 @@ def _fronts(size: int, rows: np.ndarray, columns: np.ndarray, coordinates: np.nd
     return Fronts(size, len(rows), tree.order, tree.entry_order, tree.fronts(top), steps, top, key)
 
 
-def _post_order(nodes: np.ndarray, level: np.ndarray, depth: int) -> np.ndarray:
-    """Position of nodes of a complete binary tree in an order in which each follows all below it."""
+def _post_order_positions(nodes: np.ndarray, level: np.ndarray, depth: int) -> np.ndarray:
+    """Positions of nodes of a complete binary tree in post-order: every node comes after all nodes below it."""
     position = np.full(len(nodes), 2 ** (depth + 1) - 2)
     for above in range(depth):
         # The ancestor of a node just below level `above`: a left one comes before its whole right sibling.
@@ -152,13 +160,14 @@ def _post_order(nodes: np.ndarray, level: np.ndarray, depth: int) -> np.ndarray:
     return position
 
 
-class _Tree:
-    """Elimination tree of fronts that are numbered in the order of elimination. `pivots`, `border`, `parent`, `level`:
-    of each front; `order`, `entry_order`: as of `Fronts`."""
+class _EliminationTree:
+    """Elimination tree of fronts that are numbered in the order of elimination. For each front it has the number of
+    `pivots`, the number of `border` rows, the index of its `parent` and its `level` (0 at the root). `order`,
+    `entry_order`: as in `Fronts`."""
 
     def __init__(self, size: int, rows, columns, front_of_row, level, coordinates):
         self.size, self.level = size, level
-        keys = (front_of_row,) if coordinates is None else (_along_a_curve(coordinates), front_of_row)
+        keys = (front_of_row,) if coordinates is None else (_morton_positions(coordinates), front_of_row)
         self.order = np.lexsort(keys)
         number = np.empty(size, dtype=np.int64)
         number[self.order] = np.arange(size)
@@ -171,7 +180,7 @@ class _Tree:
         self._find_borders(count)
         self.border = np.bincount(self.border_front, minlength=count)
         self.border_first = np.cumsum(self.border) - self.border
-        self.into = self._place(self.parent[self.border_front], self.border_row)
+        self.rows_in_parent = self._local_indices(self.parent[self.border_front], self.border_row)
         holder = self.front[self.early]
         self.entry_order = np.argsort(holder, kind="stable")
 
@@ -194,8 +203,8 @@ class _Tree:
         self.keys = np.sort(np.concatenate(borders))
         self.border_front, self.border_row = np.divmod(self.keys, size)
 
-    def _place(self, fronts: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Indices of rows in fronts: pivots first, then the border."""
+    def _local_indices(self, fronts: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Index of each matrix row within the given front, which lists its pivots first and then its border."""
         in_border = np.searchsorted(self.keys, fronts * self.size + rows) - self.border_first[fronts]
         own = self.front[rows] == fronts
         return np.where(own, rows - self.first[fronts], self.pivots[fronts] + in_border)
@@ -204,10 +213,10 @@ class _Tree:
         """All fronts; `top`: number of the first row above the subtrees."""
         holder = self.front[self.early]
         height = self.pivots + self.border
-        place = (self.early - self.first[holder]) * height[holder] + self._place(holder, self.late)
+        place = (self.early - self.first[holder]) * height[holder] + self._local_indices(holder, self.late)
         place = place[self.entry_order]
         ends = np.searchsorted(holder[self.entry_order], np.arange(len(height) + 1)).tolist()
-        among = self.into < self.pivots[self.parent[self.border_front]]
+        among = self.rows_in_parent < self.pivots[self.parent[self.border_front]]
         among_pivots = np.bincount(self.border_front[among], minlength=len(height)).tolist()
         below = np.bincount(self.border_front[self.border_row < top], minlength=len(height)).tolist()
         children: list[list[int]] = [[] for _ in height]
@@ -221,19 +230,19 @@ class _Tree:
             entries = slice(ends[number], ends[number + 1])
             one = Front(
                 pivots, counts[number], first, self.border_row[rows], entries, place[entries],
-                tuple(children[number]), self.into[rows], among_pivots[number], below[number],
+                tuple(children[number]), self.rows_in_parent[rows], among_pivots[number], below[number],
             )  # fmt: skip
             made.append(one)
         return tuple(made)
 
 
-def _along_a_curve(coordinates: np.ndarray) -> np.ndarray:
-    """Position of points along a curve that fills space (Morton's): rows that are near each other in space are near
-    each other in a front, so that the rows of a child are runs of those of its parent."""
+def _morton_positions(coordinates: np.ndarray) -> np.ndarray:
+    """Positions of points along a space-filling curve (Morton order). Rows that are near each other in space are then
+    near each other in a front, so that the rows of a child are nearly consecutive rows of its parent."""
     extent = max(np.ptp(coordinates, axis=0).max(), np.finfo(float).tiny)
-    cells = ((coordinates - coordinates.min(axis=0)) / extent * (2**_BITS - 1)).astype(np.int64)
+    cells = ((coordinates - coordinates.min(axis=0)) / extent * (2**_CURVE_BITS - 1)).astype(np.int64)
     position = np.zeros(len(cells), dtype=np.int64)
-    for bit in range(_BITS - 1, -1, -1):
+    for bit in range(_CURVE_BITS - 1, -1, -1):
         for axis in cells.T:
             position = 2 * position + ((axis >> bit) & 1)
     return position

@@ -1,4 +1,5 @@
-"""The plan of a factorisation: elimination tree, fronts and stages.
+"""Plan of a factorisation with padded fronts: elimination tree, fronts and stages. `padded_fronts_jax.py` carries it
+out.
 
 A *front* is a small dense matrix: its *pivots* are rows that are eliminated together, and its *border* consists of the
 later rows that their elimination changes (multifrontal method; Duff and Reid, ACM Trans. Math. Softw. 9, 1983). Fronts
@@ -103,9 +104,9 @@ class EliminationTree:
         return np.where(self.front[rows] == fronts, self.place[rows], self.pivots[stage] + in_border)
 
 
-def _merged_levels(largest: np.ndarray) -> list[int]:
-    """Number of levels of the tree in each stage, from the leaves up. `largest`: size of the largest separator of each
-    level.
+def _merged_levels(largest_separators: np.ndarray) -> list[int]:
+    """Number of levels of the tree in each stage, from the leaves up. `largest_separators`: size of the largest
+    separator of each level.
 
     Eliminating a separator together with the two separators below it saves a stage, but wastes operations on the zeros
     between these two. They are merged if the waste costs less than a stage.
@@ -114,13 +115,13 @@ def _merged_levels(largest: np.ndarray) -> list[int]:
     def operations(batch: int, pivots: int, border: int) -> float:
         return batch * (4 / 3 * pivots**3 + 2 * pivots**2 * border + 2 * pivots * border**2)
 
-    heights, level = [1], len(largest) - 2
+    heights, level = [1], len(largest_separators) - 2
     while level >= 0:
-        height, pivots = 1, int(largest[level])
+        height, pivots = 1, int(largest_separators[level])
         while level > 0:
             # About half of a front's surroundings are separators of the next levels above, so its border is a few times
             # as long as these.
-            batch, above = 2 ** (level - 1), int(largest[level - 1])
+            batch, above = 2 ** (level - 1), int(largest_separators[level - 1])
             border = 3 * above
             apart = operations(2 * batch, pivots, border) + operations(batch, above, border)
             if operations(batch, 2 * pivots + above, border) - apart > _OPERATIONS_WORTH_A_STAGE:
@@ -241,16 +242,16 @@ def _plan_of_tree(pattern: SparsityPattern, tree: EliminationTree) -> Factorisat
     """Make the plan with all index maps for an elimination tree. If a plan of the same tree is in use, for example in a
     forward model on the mesh of which a prior also needs matrices, its index maps are shared."""
     known = _plan_key(pattern, tree)
-    indices, layout = _INDICES.get(known), _LAYOUTS.get(known)
+    indices, layout = _CACHED_INDICES.get(known), _CACHED_LAYOUTS.get(known)
     if indices is None or layout is None:
         store = IndexStore()
-        stages = tuple(_stage(store, pattern, tree, stage) for stage in range(tree.num_stages))
+        stages = tuple(_build_stage(store, pattern, tree, stage) for stage in range(tree.num_stages))
         offsets = np.cumsum([0, *(stage.batch * stage.pivots for stage in stages)])
         stage_of_row = tree.stage[tree.front]
         solution = offsets[stage_of_row] + tree.slot[tree.front] * np.asarray(tree.pivots)[stage_of_row] + tree.place
         layout = IndexLayout(stages, store.add(solution))
         indices = store.pack()
-        _INDICES[known], _LAYOUTS[known] = indices, layout
+        _CACHED_INDICES[known], _CACHED_LAYOUTS[known] = indices, layout
     return FactorisationPlan(indices, layout, pattern.size, pattern.num_entries)
 
 
@@ -263,11 +264,11 @@ def _plan_key(pattern: SparsityPattern, tree: EliminationTree) -> bytes:
 
 
 # Index maps of plans in use, because making a plan of a solid takes seconds, and storing it hundreds of megabytes.
-_INDICES: WeakValueDictionary[bytes, Array] = WeakValueDictionary()
-_LAYOUTS: WeakValueDictionary[bytes, IndexLayout] = WeakValueDictionary()
+_CACHED_INDICES: WeakValueDictionary[bytes, Array] = WeakValueDictionary()
+_CACHED_LAYOUTS: WeakValueDictionary[bytes, IndexLayout] = WeakValueDictionary()
 
 
-def _stage(store: IndexStore, pattern: SparsityPattern, tree: EliminationTree, stage: int) -> Stage:
+def _build_stage(store: IndexStore, pattern: SparsityPattern, tree: EliminationTree, stage: int) -> Stage:
     batch, pivots, border = int(tree.batch[stage]), tree.pivots[stage], tree.border[stage]
     height = pivots + border
     rows = np.flatnonzero(tree.stage[tree.front] == stage)
@@ -290,15 +291,15 @@ def _stage(store: IndexStore, pattern: SparsityPattern, tree: EliminationTree, s
         batch,
         pivots,
         border,
-        _matrix_entries(store, pattern, tree, stage, height),
-        tuple(_link(store, tree, int(source), stage) for source in sources if tree.border[source]),
+        _plan_matrix_entries(store, pattern, tree, stage, height),
+        tuple(_plan_link(store, tree, int(source), stage) for source in sources if tree.border[source]),
         store.add(right_hand_side),
         parent,
         store.add(above),
     )
 
 
-def _matrix_entries(
+def _plan_matrix_entries(
     store: IndexStore, pattern: SparsityPattern, tree: EliminationTree, stage: int, height: int
 ) -> PaddedSum:
     """Sums that add the values of the matrix to the fronts that eliminate them, and ones to the diagonal of padded
@@ -321,7 +322,7 @@ def _matrix_entries(
     )
 
 
-def _link(store: IndexStore, tree: EliminationTree, source: int, stage: int) -> Link:
+def _plan_link(store: IndexStore, tree: EliminationTree, source: int, stage: int) -> Link:
     batch, pivots, border = int(tree.batch[stage]), tree.pivots[stage], tree.border[stage]
     height, count, width = pivots + border, int(tree.batch[source]), tree.border[source]
     child, row = np.divmod(tree.borders[source], tree.size)

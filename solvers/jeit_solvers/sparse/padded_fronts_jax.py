@@ -1,6 +1,7 @@
-"""The numerical part of the direct solver: factorisation, solution, and products with the inverse.
+"""Factorisation, solution and products with the inverse, in batches of padded fronts (`padded_fronts.py`).
 
-Computed in NumPy if the matrix is a NumPy array, else in compiled programs.
+Runs as compiled JAX programs, which can be batched and differentiated; for NumPy arrays, which need no compilation, in
+NumPy.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from jeit_solvers.cores import on_cores, parts_for_cores
 from jeit_solvers.dense import inverse_cholesky
 from jeit_solvers.engines import differentiable_batches, gather_or_zero, has_values, in_turn, namespace, one_by_one
 from jeit_solvers.sparse.index_store import IndexLayout
-from jeit_solvers.sparse.plan import FactorisationPlan, Stage
+from jeit_solvers.sparse.padded_fronts import FactorisationPlan, Stage
 
 # Minimum number of entries of the fronts of a stage for which threads are used; number of entries of the fronts that
 # are updated together.
-_WORTH_A_THREAD, _TOGETHER = 200_000, 100_000
+_MIN_PARALLEL_ENTRIES, _UPDATED_ENTRIES = 200_000, 100_000
 
 
 class Factor(eqx.Module):
@@ -45,7 +46,8 @@ class Factor(eqx.Module):
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(diagonal), axis=(-2, -1)) for diagonal in diagonals]), axis=0)
 
     def require_positive_definite(self) -> None:
-        """Raise a ValueError if the matrix was not positive definite; does nothing if values are traced by JAX."""
+        """Raise a ValueError if the matrix was not positive definite. Does nothing inside `jax.jit`, `jax.grad` or
+        `jax.vmap`, where values are not known yet."""
         verdict = self.positive_definite
         if has_values(verdict) and not verdict.all():
             raise ValueError(
@@ -69,12 +71,12 @@ def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor
             f"got {values.shape}. Use jax.vmap for a batch of matrices."
         )
     if isinstance(values, np.ndarray):
-        return _in_numpy(plan.layout, plan.indices, values)
+        return _factorise_in_numpy(plan.layout, plan.indices, values)
     numeric = in_turn(partial(_factorise, plan.layout))
     return numeric(plan.indices, values)
 
 
-def _by_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
+def _factorise_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[Array, " nnz"]) -> Factor:
     stages, _ = layout.content
     dtype = values.dtype
     extended = jnp.concatenate([values, jnp.ones(1, dtype)])
@@ -99,11 +101,13 @@ def _by_stages(layout: IndexLayout, indices: Int[Array, " total"], values: Inexa
 
 
 # Compiled separately, so that a second program with the same plan does not trace it again.
-_factorise = jax.jit(_by_stages, static_argnums=0)
+_factorise = jax.jit(_factorise_stages, static_argnums=0)
 
 
-def _in_numpy(layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[np.ndarray, " nnz"]) -> Factor:
-    """`_by_stages` in NumPy, in place, with the fronts of a stage distributed over the cores."""
+def _factorise_in_numpy(
+    layout: IndexLayout, indices: Int[Array, " total"], values: Inexact[np.ndarray, " nnz"]
+) -> Factor:
+    """The same as `_factorise_stages`, in NumPy and in place, with the fronts of a stage distributed over the cores."""
     stages, _ = layout.content
     extended = np.concatenate([values, np.ones(1, values.dtype)])
     inverses, lowers, left = [], [], []
@@ -112,8 +116,8 @@ def _in_numpy(layout: IndexLayout, indices: Int[Array, " total"], values: Inexac
         panel = np.zeros((batch, pivots + border, pivots), values.dtype)
         corner = np.zeros((batch, border, border), values.dtype)
         inverse, lower = np.empty_like(panel, shape=(batch, pivots, pivots)), np.empty_like(panel[:, pivots:])
-        some = partial(_some_fronts, stage, indices, extended, left, panel, corner, inverse, lower)
-        many = batch * (pivots + border) ** 2 > _WORTH_A_THREAD
+        some = partial(_eliminate_fronts, stage, indices, extended, left, panel, corner, inverse, lower)
+        many = batch * (pivots + border) ** 2 > _MIN_PARALLEL_ENTRIES
         on_cores(some, parts_for_cores(batch) if many else [slice(0, batch)])
         inverses.append(inverse)
         lowers.append(lower)
@@ -121,47 +125,52 @@ def _in_numpy(layout: IndexLayout, indices: Int[Array, " total"], values: Inexac
     return Factor(tuple(inverses), tuple(lowers))
 
 
-def _some_fronts(stage: Stage, indices, extended, left, panel, corner, inverse, lower, some: slice) -> None:
-    """Assemble and eliminate the fronts `some` of a stage, in place."""
+def _eliminate_fronts(
+    stage: Stage, indices, extended, schur_complements, panel, corner, inverse, lower, front_slice: slice
+) -> None:
+    """Assemble and eliminate the fronts `front_slice` of a stage, in place. `schur_complements`: those of all earlier
+    stages."""
 
-    def add(sums, values, total):
-        size = total[0].size
-        sums.add_some(indices, values, total.reshape(-1), some.start * size, some.stop * size)
+    def add(padded_sum, contributions, target):
+        size = target[0].size
+        padded_sum.add_some(
+            indices, contributions, target.reshape(-1), front_slice.start * size, front_slice.stop * size
+        )
 
     add(stage.entries, extended, panel)
     for link in stage.links:
-        schur = left[link.source].reshape(-1)
+        schur = schur_complements[link.source].reshape(-1)
         add(link.panel, schur, panel)
         add(link.corner, schur, corner)
-    inverse[some] = inverse_cholesky(panel[some, : stage.pivots])
-    np.matmul(panel[some, stage.pivots :], _transposed(inverse[some]), out=lower[some])
-    together = max(1, _TOGETHER // max(stage.border**2, 1))
-    for first in range(some.start, some.stop, together):
-        few = slice(first, min(first + together, some.stop))
+    inverse[front_slice] = inverse_cholesky(panel[front_slice, : stage.pivots])
+    np.matmul(panel[front_slice, stage.pivots :], _transposed(inverse[front_slice]), out=lower[front_slice])
+    together = max(1, _UPDATED_ENTRIES // max(stage.border**2, 1))
+    for first in range(front_slice.start, front_slice.stop, together):
+        few = slice(first, min(first + together, front_slice.stop))
         corner[few] -= lower[few] @ _transposed(lower[few])
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
     """Solution x of A x = b for one right-hand side (n,) or several (n, k). Raises `ValueError` for other shapes."""
-    vectors = _columns(plan, right_hand_sides, "solve")
+    vectors = _check_columns(plan, right_hand_sides, "solve")
     if isinstance(vectors, np.ndarray):
-        return _both_ways(plan.layout, plan.indices, factor, vectors).reshape(right_hand_sides.shape)
-    numeric = differentiable_batches(partial(_solve, plan.layout), _batch_of_solves)
+        return _solve_stages(plan.layout, plan.indices, factor, vectors).reshape(right_hand_sides.shape)
+    numeric = differentiable_batches(partial(_solve, plan.layout), _solve_batch)
     return numeric(plan.indices, factor, vectors).reshape(right_hand_sides.shape)
 
 
-def _both_ways(
+def _solve_stages(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> Inexact[Array, "n k"]:
     stages, solution = layout.content
-    reduced = _half_way(layout, indices, factor, vectors)
-    return _backward(stages, indices, factor, reduced)[solution.read(indices)]
+    reduced = _forward_stages(layout, indices, factor, vectors)
+    return _backward_stages(stages, indices, factor, reduced)[solution.read(indices)]
 
 
-_solve = jax.jit(_both_ways, static_argnums=0)
+_solve = jax.jit(_solve_stages, static_argnums=0)
 
 
-def _batch_of_solves(batchable, plain, axis_size, batched, indices, factor, vectors):
+def _solve_batch(batchable, plain, axis_size, batched, indices, factor, vectors):
     """Batching rule: a batch of right-hand sides for one factor is solved as more columns, a batch of factors one by
     one."""
     if any(jax.tree.leaves(batched[:2])):
@@ -178,8 +187,8 @@ def half_solve(
 
     Takes half the work of `solve`, if only products with the inverse are needed. Raises `ValueError` for other shapes.
     """
-    vectors = _columns(plan, right_hand_sides, "half_solve")
-    forward = _half_way if isinstance(vectors, np.ndarray) else _forward
+    vectors = _check_columns(plan, right_hand_sides, "half_solve")
+    forward = _forward_stages if isinstance(vectors, np.ndarray) else _compiled_forward
     reduced = forward(plan.layout, plan.indices, factor, vectors)
     return namespace(vectors).concatenate([rows.reshape(-1, rows.shape[-1]) for rows in reduced])
 
@@ -201,8 +210,8 @@ def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "
     if rows.ndim != 2 or rows.shape[0] != plan.num_pivots:
         raise ValueError(f"inverse_root: rows must have shape ({plan.num_pivots}, k); got {rows.shape}.")
     if isinstance(rows, np.ndarray):
-        return _other_half(plan.layout, plan.indices, factor, rows)
-    return _compiled_other_half(plan.layout, plan.indices, factor, rows)
+        return _backward_solve(plan.layout, plan.indices, factor, rows)
+    return _compiled_backward_solve(plan.layout, plan.indices, factor, rows)
 
 
 def inverse_entries(plan: FactorisationPlan, factor: Factor) -> Inexact[Array, " nnz"]:
@@ -234,7 +243,7 @@ def _inverse_entries(
         whole = mine
         if stage.border:
             above = fronts[stage.parent]
-            corner = _within(above, stage.above.read(indices))
+            corner = _border_block(above, stage.above.read(indices))
             pulled = factor.lowers[number] @ inverse
             side = corner @ pulled
             mine = mine + _transposed(pulled) @ side
@@ -248,7 +257,7 @@ def _inverse_entries(
     return entries[:num_entries]
 
 
-def _within(above: Inexact[Array, "parents height height"], rows: Int[Array, "batch border"]):
+def _border_block(above: Inexact[Array, "parents height height"], rows: Int[Array, "batch border"]):
     """Entries of the inverse between the rows of the children's borders, read from the parents' fronts; zero for
     padding."""
     height = above.shape[-1]
@@ -263,33 +272,35 @@ def _within(above: Inexact[Array, "parents height height"], rows: Int[Array, "ba
 _compiled_inverse_entries = jax.jit(_inverse_entries, static_argnums=(0, 1))
 
 
-def _other_half(
+def _backward_solve(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, rows: Inexact[Array, "rows k"]
 ) -> Inexact[Array, "n k"]:
     stages, solution = layout.content
     ends = np.cumsum([stage.batch * stage.pivots for stage in stages])
     parts = namespace(rows).split(rows, ends[:-1])
     parts = [part.reshape(stage.batch, stage.pivots, -1) for part, stage in zip(parts, stages, strict=True)]
-    return _backward(stages, indices, factor, parts)[solution.read(indices)]
+    return _backward_stages(stages, indices, factor, parts)[solution.read(indices)]
 
 
-_compiled_other_half = jax.jit(_other_half, static_argnums=0)
+_compiled_backward_solve = jax.jit(_backward_solve, static_argnums=0)
 
 
 def _transposed(matrices: Inexact[Array, "batch a b"]) -> Inexact[Array, "batch b a"]:
     return namespace(matrices).swapaxes(matrices, -1, -2)
 
 
-def _columns(plan: FactorisationPlan, right_hand_sides: Inexact[Array, "n *k"], where: str) -> Inexact[Array, "n k"]:
+def _check_columns(
+    plan: FactorisationPlan, right_hand_sides: Inexact[Array, "n *k"], function_name: str
+) -> Inexact[Array, "n k"]:
     if right_hand_sides.ndim not in (1, 2) or right_hand_sides.shape[0] != plan.size:
         raise ValueError(
-            f"{where}: right-hand sides must have shape (n,) or (n, k) with n = {plan.size}; "
+            f"{function_name}: right-hand sides must have shape (n,) or (n, k) with n = {plan.size}; "
             f"got {right_hand_sides.shape}."
         )
     return right_hand_sides.reshape(plan.size, -1)
 
 
-def _half_way(
+def _forward_stages(
     layout: IndexLayout, indices: Int[Array, " total"], factor: Factor, vectors: Inexact[Array, "n k"]
 ) -> list[Inexact[Array, "batch pivots k"]]:
     """L^-1 times the vectors, stage by stage. The pivot rows of a front gather the updates of its children."""
@@ -308,10 +319,10 @@ def _half_way(
     return reduced
 
 
-_forward = jax.jit(_half_way, static_argnums=0)
+_compiled_forward = jax.jit(_forward_stages, static_argnums=0)
 
 
-def _backward(
+def _backward_stages(
     stages: tuple[Stage, ...],
     indices: Int[Array, " total"],
     factor: Factor,

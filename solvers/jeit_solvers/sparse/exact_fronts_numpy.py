@@ -1,0 +1,224 @@
+"""Factorisation and solution of sparse symmetric matrices in NumPy, front by front, in the order of `exact_fronts.py`.
+
+Matrices are real, or complex symmetric. Fronts that do not depend on each other are distributed over the cores.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Inexact
+
+from jeit_solvers.blas import eliminate, solve_triangle
+from jeit_solvers.cores import on_cores, one_thread_of_blas
+from jeit_solvers.engines import call_numpy, has_values, host
+from jeit_solvers.sparse.exact_fronts import Fronts
+from jeit_solvers.sparse.operator import LastMatrix
+
+# Number of operations from which fronts are distributed over the cores; a product with k vectors takes k operations for
+# each entry of the factor.
+_MIN_PARALLEL_OPERATIONS = 5e9
+# Number of rows of a child's Schur complement that are added to its parent together. Each such block includes some
+# entries below the diagonal, which are not needed.
+_ADDED_ROWS = 64
+# Maximum number of entries of a factor that is cached for the next call.
+_MAX_CACHED_ENTRIES = 100_000_000
+
+
+class FrontalFactor(NamedTuple):
+    """A factorised matrix A = L Lᵀ. **Fields**: `fronts`: the fronts of its pattern; `panels`: for each front the rows
+    (p, p + b) of Lᵀ that belong to its pivots. `panels` is None if A (for a complex matrix, its real part) is not
+    positive definite; solutions are then NaN."""
+
+    fronts: Fronts
+    panels: list[Any] | None
+
+    @property
+    def positive_definite(self) -> bool:
+        """Whether the matrix was positive definite."""
+        return self.panels is not None
+
+    def solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
+        """Solution x of A x = b. Raises `ValueError` for another shape."""
+        if self._splits_complex(right_hand_sides):
+            return self.solve(np.real(right_hand_sides)) + 1j * self.solve(np.imag(right_hand_sides))
+        vectors = self.half_solve(right_hand_sides)
+        if self.panels is not None:
+            for slices in reversed(self.fronts.steps):
+                _for_each_slice(
+                    lambda some: self._substitute_back(vectors, some), slices, self._num_operations(vectors)
+                )
+        solution = np.empty_like(vectors)
+        solution[self.fronts.order] = vectors
+        return solution
+
+    def quadratic_form(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "k k"]:
+        """bᵀ A⁻¹ b (for complex values not conjugated), from `half_solve` alone."""
+        half = self.half_solve(right_hand_sides)
+        return half.T @ half
+
+    def half_solve(self, right_hand_sides: Inexact[np.ndarray, "n k"]) -> Inexact[np.ndarray, "n k"]:
+        """Y = L⁻¹ P b, rows in the order of elimination, so that Yᵀ Y = bᵀ A⁻¹ b. Raises `ValueError` for another
+        shape."""
+        shape, size = np.shape(right_hand_sides), self.fronts.size
+        if len(shape) != 2 or shape[0] != size:
+            raise ValueError(f"right-hand sides must have shape (n, k) with n = {size}; got {shape}.")
+        if self.panels is None:
+            return np.full(right_hand_sides.shape, np.nan, np.result_type(right_hand_sides, np.float32))
+        if self._splits_complex(right_hand_sides):
+            return self.half_solve(np.real(right_hand_sides)) + 1j * self.half_solve(np.imag(right_hand_sides))
+        vectors = right_hand_sides[self.fronts.order].astype(self.panels[0].dtype)
+        subtrees, *levels = self.fronts.steps
+        later_rows = vectors[self.fronts.top :]
+        # Subtrees run in parallel, so each collects its contributions to the rows above the subtrees in an array of its
+        # own.
+        subtree_updates = [np.zeros_like(later_rows) for _ in subtrees]
+        numbers = {front_slice.start: number for number, front_slice in enumerate(subtrees)}
+
+        def forward(front_slice: slice) -> None:
+            self._eliminate_forward(vectors, subtree_updates[numbers[front_slice.start]], front_slice)
+
+        _for_each_slice(forward, subtrees, self._num_operations(vectors))
+        for one in subtree_updates:
+            later_rows += one
+        for level in levels:  # one after the other, for their borders overlap
+            _for_each_slice(lambda front_slice: self._eliminate_forward(vectors, later_rows, front_slice), level, 0.0)
+        return vectors
+
+    def _splits_complex(self, right_hand_sides: np.ndarray) -> bool:
+        """Whether the factor is real and the right-hand sides are complex, so that their real and imaginary parts are
+        solved for separately."""
+        return self.panels is not None and np.iscomplexobj(right_hand_sides) and not np.iscomplexobj(self.panels[0])
+
+    def _num_operations(self, vectors: np.ndarray) -> float:
+        return float(vectors.shape[1] * self.fronts.num_factor_entries)
+
+    def _eliminate_forward(self, vectors: np.ndarray, later: np.ndarray, front_slice: slice) -> None:
+        """Forward elimination for some fronts: replace the rows of their pivots by those of L⁻¹ P b, and subtract their
+        contributions from the rows of their borders. Border rows above the subtrees are in `later`."""
+        assert self.panels is not None
+        top = self.fronts.top
+        for front, panel in zip(self.fronts.fronts[front_slice], self.panels[front_slice], strict=True):
+            own = vectors[front.first : front.first + front.pivots]
+            if not own.any():  # as in a part of the body without electrodes
+                continue
+            solve_triangle(panel, own, transposed=False)
+            if front.border:
+                passed_on, inside = panel[:, front.pivots :].T @ own, front.num_subtree_rows
+                vectors[front.rows[:inside]] -= passed_on[:inside]
+                later[front.rows[inside:] - top] -= passed_on[inside:]
+
+    def _substitute_back(self, vectors: np.ndarray, front_slice: slice) -> None:
+        """Back substitution for some fronts: replace the rows of their pivots by those of the solution. Later rows of
+        the solution are already known."""
+        assert self.panels is not None
+        for front, panel in zip(
+            reversed(self.fronts.fronts[front_slice]), reversed(self.panels[front_slice]), strict=True
+        ):
+            own = vectors[front.first : front.first + front.pivots]
+            if front.border:
+                own -= panel[:, front.pivots :] @ vectors[front.rows]
+            solve_triangle(panel, own, transposed=True)
+
+
+def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> FrontalFactor:
+    """Factorise the matrix with the given values (nnz,), in the order of the pattern that `fronts` was made for.
+
+    Raises `ValueError` for values of another shape.
+    """
+    if np.shape(values) != (fronts.num_entries,):
+        raise ValueError(
+            f"values must have shape {(fronts.num_entries,)}, the entries of the pattern; got {np.shape(values)}."
+        )
+    ordered_values = values[fronts.entry_order].astype(complex if np.iscomplexobj(values) else float)
+    panels: list[Any] = [None] * len(fronts.fronts)
+    schur_complements: list[Any] = [None] * len(fronts.fronts)
+
+    def eliminate_slice(some: slice) -> None:
+        for number in range(some.start, some.stop):
+            if not _eliminate_front(fronts, ordered_values, panels, schur_complements, number):
+                return
+
+    for slices in fronts.steps:
+        _for_each_slice(eliminate_slice, slices, fronts.num_operations)
+        if any(panels[number] is None for some in slices for number in range(some.start, some.stop)):
+            return FrontalFactor(fronts, None)
+    return FrontalFactor(fronts, panels)
+
+
+def solve_at_once(
+    fronts: Fronts, values: Inexact[Array, " nnz"], columns: Inexact[Array, "n k"]
+) -> Inexact[Array, "n k"]:
+    """Solve for k right-hand sides (n, k), also inside `jax.jit`, where the compiled program calls NumPy. The last
+    factor is cached, because derivatives solve with the same matrix again."""
+    dtype = jnp.result_type(values, columns)
+    if has_values(values, columns):
+        return host.asarray(_solve_in_numpy(fronts, dtype, values, columns))
+    shape = jax.ShapeDtypeStruct(columns.shape, dtype)
+    return call_numpy(partial(_solve_in_numpy, fronts, dtype), shape, values, columns)
+
+
+def _solve_in_numpy(fronts: Fronts, dtype: Any, values: Any, columns: Any) -> np.ndarray:
+    with np.errstate(all="ignore"):
+        values, keep = np.asarray(values), fronts.num_factor_entries < _MAX_CACHED_ENTRIES
+        factor = _LAST_FACTOR.get_or_compute(fronts.key, values, lambda: factorise_fronts(fronts, values), keep=keep)
+        return factor.solve(np.asarray(columns)).astype(dtype)
+
+
+_LAST_FACTOR = LastMatrix()
+
+
+def _eliminate_front(
+    fronts: Fronts, ordered_values: np.ndarray, panels: list[Any], schur_complements: list[Any], front_index: int
+) -> bool:
+    """Assemble and eliminate one front, and store its panel and the Schur complement for its parent. Returns False if
+    the front is not positive definite."""
+    front = fronts.fronts[front_index]
+    pivots, border = front.pivots, front.border
+    panel = np.zeros((pivots, pivots + border), ordered_values.dtype)
+    panel.reshape(-1)[front.panel_indices] = ordered_values[front.entries]
+    corner = np.zeros((border, border), ordered_values.dtype)
+    for child in front.children:
+        schur, schur_complements[child] = schur_complements[child], None
+        into, split = fronts.fronts[child].rows_in_parent, fronts.fronts[child].num_parent_pivots
+        if split:
+            _add_rows(panel, into[:split], into, schur[:split])
+        into = into[split:] - pivots
+        for first in range(0, len(into), _ADDED_ROWS):
+            last, start = min(first + _ADDED_ROWS, len(into)), into[first]
+            lower = schur[split + first : split + last, split + first :]
+            _add_rows(corner[:, start:], into[first:last], into[first:] - start, lower)
+    if not eliminate(panel, corner):
+        return False
+    panels[front_index] = panel
+    schur_complements[front_index] = corner
+    return True
+
+
+def _add_rows(matrix: np.ndarray, rows: np.ndarray, columns: np.ndarray, block: np.ndarray) -> None:
+    """Add a block (r, c) to the given rows and columns of a matrix, both in ascending order."""
+    first, last = int(rows[0]), int(rows[-1]) + 1
+    start, stop = int(columns[0]), int(columns[-1]) + 1
+    if stop - start > len(columns):
+        spread = np.zeros((len(rows), stop - start), matrix.dtype)
+        spread[:, columns - start] = block
+        block = spread
+    if last - first == len(rows):
+        matrix[first:last, start:stop] += block
+    else:
+        matrix[rows, start:stop] += block
+
+
+def _for_each_slice(function: Any, slices: tuple[slice, ...], operations: float) -> None:
+    """Apply `function` to each slice of fronts, on several cores if there are enough operations. BLAS is limited to one
+    thread: its own threads are ten times slower when another program occupies a core."""
+    if operations > _MIN_PARALLEL_OPERATIONS and len(slices) > 1:
+        on_cores(function, slices)
+        return
+    with one_thread_of_blas(), np.errstate(all="ignore"):
+        for front_slice in slices:
+            function(front_slice)
