@@ -353,7 +353,7 @@ def test_impossible_skins_are_refused(make, message):
         (lambda skin: pat(skin, KEY, (0.0, 0.0), interval=-1.0), "interval must be"),
         (lambda skin: tickle(skin, KEY, (0.0, 0.0), radius=0.0), "radius must be"),
         (lambda skin: stroke(skin, KEY, [(0.0, 0.0), (0.2, 0.0)]), "path: row 1"),
-        (lambda skin: stroke(skin, KEY, [(0.0, 0.0)]), "stands still"),
+        (lambda skin: stroke(skin, KEY, [(0.0, 0.0)]), "its length is zero"),
         (lambda skin: stroke(skin, KEY, lambda t: np.zeros((3, 2))), "one for each"),
         (lambda skin: quiet(skin, KEY, duration=0.0), "duration must be"),
         (lambda skin: calibration_taps(skin, KEY, [(0.0, 0.0)], repeats=0), "repeats"),
