@@ -150,7 +150,7 @@ def test_other_files_are_refused(model, tmp_path):
         ({"labels": ["tap"] * 16}, "two gestures, or more"),
         ({"labels": ["tap"] * 15 + ["pat"]}, "only one touch of 'pat'"),
         ({"people": [1, 2]}, "people must be 16"),
-        ({"people": [0] * 8 + [1] * 8, "labels": ["tap"] * 8 + ["pat"] * 8}, "one gesture only"),
+        ({"people": [0] * 8 + [1] * 8, "labels": ["tap"] * 8 + ["pat"] * 8}, "only one gesture"),
         ({"method": "logitboost"}, "did you mean 'logit-boost'"),
         ({"form": "eight"}, "form must be one of"),
         ({"touches": "tap"}, "touches must be a list"),
