@@ -111,5 +111,5 @@ def test_silence_that_makes_no_sense(skin, vibration, silent, heard_before):
     with pytest.raises(ValueError, match="'hush' has 8 microphones"):
         locate(vibration, heard_before, silence=recorded(skin, silent.samples[:8], "hush"))
     for pair in ((intensities(vibration), silent), (vibration, intensities(silent))):
-        with pytest.raises(ValueError, match="silence is for a recording of samples"):
+        with pytest.raises(ValueError, match="silence applies to a recording of samples"):
             locate(pair[0], heard_before, silence=pair[1])

@@ -307,7 +307,7 @@ def test_pats_and_tickles_are_where_and_when_they_say(small):
         (lambda: MicrophoneModel(depth=0.0), "depth must be a positive"),
         (lambda: MicrophoneModel(reach=np.nan), "reach must be a positive"),
         (lambda: Elastomer(attenuation=-1.0), "attenuation must be zero or positive"),
-        (lambda: ElastomerLayer(reflection=1.5), "reflection: an edge"),
+        (lambda: ElastomerLayer(reflection=1.5), "reflection: the amplitude"),
         (lambda: Readout(coupling_db=3.0), "coupling_db"),
         (lambda: MicrophoneModel(snr_db=np.inf), "snr_db"),
         (lambda: SoundingSkin(KEY, spectral_slope=np.nan), "spectral_slope must be finite"),
