@@ -326,7 +326,7 @@ def instead(command, **changes):
         ([*LOCATE, "--method", "magic"], "likelihood, consistency"),
         ([*LOCATE, "--gap", "0"], "--gap"),
         ([*LOCATE, "--low", "100"], "for samples"),
-        ([*LOCATE, "--silence", "touch.npz"], "--silence is for samples"),
+        ([*LOCATE, "--silence", "touch.npz"], "--silence applies to recordings of samples"),
         (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--silence", "recording.npz"], "must hold samples"),
         (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--silence", "none.npz"], "none.npz"),
         (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--high", "5000"], "2000"),
