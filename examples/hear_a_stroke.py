@@ -31,7 +31,7 @@ def main() -> float:
     heard = intensities(Recording(samples, skin.rate))
     found = locate(heard, calibration)
     localiser = Localiser.create(calibration.microphone_array, method="consistency", map_shape=(100, 100))
-    images = brightness(localiser.maps(heard.power), method="consistency") * found.located[:, None, None]
+    images = brightness(localiser.maps(heard.power), method="consistency") * found.has_position[:, None, None]
 
     figure = Figure(figsize=(13.5, 4.8), layout="compressed")
     paths = {}

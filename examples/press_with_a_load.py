@@ -9,14 +9,16 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.touch.simulate import Bar, Joined, MovingPress, Placed, PressedSkin, ball, material
+from jeit.touch.simulate import Bar, JoinedIndenters, MovingPress, PlacedIndenter, PressedSkin, ball, material
 
 
 def main() -> float:
     electrodes = BoundaryElectrodes(ring(0.05, 16), width=0.008, contact_impedance=300.0)
     model = ForwardModel(Disk(0.05).mesh(num_points=3000), electrodes, adjacent(16))
     skin = PressedSkin(jax.random.key(0), model, material("velostat"))
-    tool = Joined(Placed(ball(0.016), (0.012, 0.0)), Placed(Bar(0.016, 0.005), (-0.01, 0.0), 0.6))
+    tool = JoinedIndenters(
+        PlacedIndenter(ball(0.016), (0.012, 0.0)), PlacedIndenter(Bar(0.016, 0.005), (-0.01, 0.0), 0.6)
+    )
 
     # Pressed for four seconds, held, lifted; read 20 times a second.
     seconds = np.arange(0, 12, 0.05)

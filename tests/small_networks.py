@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.touch.networks import Preset, learn, sensed
+from jeit.touch.networks import Preset, learn, linear_channels
 from jeit.touch.simulate import Disc
 from jeit.touch.training import Plan
 
@@ -30,9 +30,9 @@ def small_maps():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learn, "SHAPE", SHAPE)
         patch.setattr(learn, "_PLACES", 5)
-        patch.setattr(sensed, "_PLACES", 5)
-        patch.setattr(sensed, "_AT_ONCE", 1)
-        patch.setattr(sensed, "bodies", lambda: [Disc(0.02)])
+        patch.setattr(linear_channels, "_PLACES", 5)
+        patch.setattr(linear_channels, "_AT_ONCE", 1)
+        patch.setattr(linear_channels, "touching_bodies", lambda: [Disc(0.02)])
         yield
 
 

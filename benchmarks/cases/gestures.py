@@ -21,9 +21,9 @@ from jeit.data import GestureSet
 from jeit.touch import TouchImages, TouchWatch, WatchedFrame, learn_gestures
 from jeit.touch.gestures import GestureModel, StreamTouch
 from jeit.touch.gestures.gesture_classifiers import (
-    FORMS,
+    FEATURE_FORMS,
     GESTURE_CLASSIFIERS,
-    forms_of,
+    feature_forms,
     held_out_odds,
     person_folds,
     random_folds,
@@ -66,7 +66,7 @@ class Experiment:
 
     def confusion(self, method: str, form: str, folds: np.ndarray) -> np.ndarray:
         """Shares (6, 6), per cent, of each gesture that were told as each."""
-        odds = held_out_odds(method, FORMS[form](self.touches).values, self.right, folds)
+        odds = held_out_odds(method, FEATURE_FORMS[form](self.touches).values, self.right, folds)
         counts = np.zeros((len(GESTURES), len(GESTURES)))
         np.add.at(counts, (self.right, odds.argmax(axis=1)), 1)
         return 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
@@ -90,8 +90,8 @@ def run(options: Options) -> Result:
         experiments[name] = Experiment.of(name, sheet, sets[name])
     one, many = experiments.values()
     found, rows = {}, []
-    for form in FORMS:
-        for method in (one for one in names if form in forms_of(one)):
+    for form in FEATURE_FORMS:
+        for method in (one for one in names if form in feature_forms(one)):
             accuracies = []
             for experiment in (one, many):
                 at_random = experiment.confusion(method, form, random_folds(experiment.right, folds))
@@ -102,7 +102,7 @@ def run(options: Options) -> Result:
             rows.append([method, form, *(f"{one:.0f} %" for one in (*accuracies, by_person.diagonal().mean()))])
             say(" | ".join(rows[-1]))
     best = max(
-        ((method, form) for method in names for form in forms_of(method)),
+        ((method, form) for method in names for form in feature_forms(method)),
         key=lambda own: found["by person", *own].diagonal().mean(),
     )
     each = [_gestures(name, found[name, THEIRS, HIS], PAPER[name]) for name in experiments]

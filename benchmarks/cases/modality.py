@@ -22,7 +22,7 @@ from benchmarks.problems.sounding_people import FEWER, LOUDER, HeardPeople, hear
 from jeit.acoustic import Recording
 from jeit.acoustic.simulate.people import MODALITIES
 from jeit.touch.listening import Levels, ModalityNetwork, SoundImages, sound_images
-from jeit.touch.listening.learners import LEARNERS, Lesson, NetworkListener
+from jeit.touch.listening.learners import LEARNERS, NetworkListener, TrainingSet
 from jeit.touch.listening.modality_network import COPIES
 
 # Where sets and trainings are kept from one run to the next.
@@ -51,7 +51,9 @@ class Experiment:
         batches = OWN_BATCHES if method == "network" else BATCHES
         batches = 3 if self.quick else SHUFFLED_BATCHES if "shuffled" in name else batches
         kept = None if self.folder is None else self.folder / f"{name}-{batches}.training"
-        return LEARNERS[method].learn(Lesson(images, right, groups, len(MODALITIES), jax.random.key(0), batches, kept))
+        return LEARNERS[method].learn(
+            TrainingSet(images, right, groups, len(MODALITIES), jax.random.key(0), batches, kept)
+        )
 
     def by_person(self, method: str, variants: list[tuple[float, int]], number: int = 25) -> np.ndarray:
         """Confusions (V, C, C), counts, of the windows of each fold's people when they were held out, in each of the
@@ -94,7 +96,7 @@ class Experiment:
         """Share that a network is right of before it is trained."""
         images = self.heard.images[0.0, 25]
         network = ModalityNetwork.draw(jax.random.key(0), images.intensity.shape[1] + 64, 41, len(MODALITIES))
-        said = NetworkListener.of(network, Levels.of(images)).log_odds(images).argmax(axis=1)
+        said = NetworkListener.from_network(network, Levels.from_images(images)).log_odds(images).argmax(axis=1)
         return float(np.mean(said == self.heard.right))
 
 

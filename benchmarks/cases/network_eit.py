@@ -26,7 +26,7 @@ from jeit.inverse import Gaussian, Laplace, one_step
 from jeit.inverse.streaming.imager import Imager
 from jeit.mesh import centroids
 from jeit.touch.networks import DESIGNS, PRESETS, ImageNetwork, learn_images, read_network
-from jeit.touch.networks.sensed import centroids_of, detection_noise, errors, peaks
+from jeit.touch.networks.linear_channels import deepest_positions, depth_centroids, detection_noise, error_statistics
 from jeit.touch.simulate import depth_maps
 from jeit.touch.simulate.contact.indent_sets import image_places
 
@@ -62,7 +62,9 @@ def run(options: Options) -> Result:
     for name, way in ways.items():
         say(name)
         maps = way(frames)
-        by_centroid, by_peak = (errors(find(maps, places), right) for find in (centroids_of, peaks))
+        by_centroid, by_peak = (
+            error_statistics(find(maps, places), right) for find in (depth_centroids, deepest_positions)
+        )
         mean[name] = by_centroid["mean"]
         rows.append([name, *(f"{1e3 * one[key]:.2f}" for one in (by_centroid, by_peak) for key in by_centroid)])
     header = ["by", "centroid: mean", "SD", "RMS", "peak: mean", "SD", "RMS"]
@@ -145,7 +147,7 @@ def _linear(told: Skin, prior, noise: float, places: np.ndarray, tuning: np.ndar
         def maps(changes, matrix=matrix):
             return ((changes * rest) @ matrix).reshape(-1, *SHAPE)
 
-        own[errors(centroids_of(maps(tuning), places), right)["mean"]] = maps
+        own[error_statistics(depth_centroids(maps(tuning), places), right)["mean"]] = maps
         say(f"λ {times:g} × {chosen:.3g}: {1e3 * list(own)[-1]:.2f} mm")
     return own[min(own)]
 
@@ -192,7 +194,7 @@ def _wrong(ways, touches, right, clean, noise: float, places, quick: bool) -> tu
     for name, (changes, deviation) in cases.items():
         frames = changes + deviation * random.normal(size=changes.shape)
         known = right if len(changes) == len(right) else right[some]
-        means = [errors(centroids_of(way(frames), places), known)["mean"] for way in ways.values()]
+        means = [error_statistics(depth_centroids(way(frames), places), known)["mean"] for way in ways.values()]
         rows.append([name, *(f"{1e3 * one:.2f}" for one in means)])
         say(" | ".join(rows[-1]))
     caption = "A fifth of the places but for noise; on a mesh of 4.5 mm, three skins in turn, but for noise."

@@ -12,7 +12,17 @@ import numpy as np
 
 from jeit.design import Skin, touches_away_from_the_edge
 from jeit.layout import Layout, named_layout
-from jeit.touch.simulate import Bar, DepthMap, Disc, Indent, Joined, Placed, Ring, ball, relative_changes
+from jeit.touch.simulate import (
+    Bar,
+    DepthMap,
+    Disc,
+    Indent,
+    JoinedIndenters,
+    PlacedIndenter,
+    Ring,
+    ball,
+    relative_changes,
+)
 from jeit.touch.simulate.contact.indents import relative_to
 
 CELL, SKINS = 3e-3, 5
@@ -102,11 +112,14 @@ def unseen_shapes() -> dict[str, object]:
     bar = Bar(0.06, 0.012)
     return {
         "ring": Ring(0.060, 0.036),
-        "cross": Joined(bar, Placed(bar, (0.0, 0.0), np.pi / 2)),
-        "L": Joined(Placed(Bar(0.06, 0.014), (0.0, -0.023)), Placed(Bar(0.06, 0.014), (-0.023, 0.0), np.pi / 2)),
+        "cross": JoinedIndenters(bar, PlacedIndenter(bar, (0.0, 0.0), np.pi / 2)),
+        "L": JoinedIndenters(
+            PlacedIndenter(Bar(0.06, 0.014), (0.0, -0.023)), PlacedIndenter(Bar(0.06, 0.014), (-0.023, 0.0), np.pi / 2)
+        ),
         "triangle": DepthMap(triangle, 0.0018),
-        "hand": Joined(
-            Disc(0.045), *(Placed(Disc(0.016), (0.05 * np.cos(a), 0.05 * np.sin(a))) for a in (0.2, 0.9, 1.6, 2.3, 3.3))
+        "hand": JoinedIndenters(
+            Disc(0.045),
+            *(PlacedIndenter(Disc(0.016), (0.05 * np.cos(a), 0.05 * np.sin(a))) for a in (0.2, 0.9, 1.6, 2.3, 3.3)),
         ),
     }
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from benchmarks.opponents.plain_consistency import PlainConsistency
 from benchmarks.problems.heard_arrays import BURST, ONSET, RATE, SAMPLES, SILENT, HeardArray
 from jeit.acoustic import Intensities, Recording, Taps, locate
-from jeit.acoustic.calibration.calibrate import CalibrationFit, calibrate_each, choose
+from jeit.acoustic.calibration.calibrate import CalibrationFit, fit_each_decay, select_fit
 
 # χ² of two degrees of freedom that 68 and 95 % stay under.
 ELLIPSES = (-2 * np.log(1 - 0.68), -2 * np.log(1 - 0.95))
@@ -58,12 +58,12 @@ def touches_of(array: HeardArray) -> tuple[Recording | Intensities, np.ndarray]:
 
 def located_by_each(array: HeardArray) -> dict[str, Located]:
     """By jeit, with every decay model, and with that which "auto" takes: a recording located with the defaults."""
-    fits, refused = calibrate_each(taps_of(array))
+    fits, refused = fit_each_decay(taps_of(array))
     far = np.full(len(array.touches), np.inf)
     found = {name: located(array, fit) for name, fit in fits.items()}
     found |= {name: Located(far, far, said=why) for name, why in refused.items()}
     try:
-        chosen = choose(fits, refused).left_out[0][0]
+        chosen = select_fit(fits, refused).left_out[0][0]
     except ValueError as error:
         return found | {"auto": Located(far, far, said=str(error))}
     return found | {"auto": found[chosen]}

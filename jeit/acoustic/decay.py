@@ -85,7 +85,7 @@ class InverseSquare(AbstractDecay):
 
     def logarithms(self):
         """Logarithms of the parameters: log a, log b."""
-        return _logarithms(self.a, self.b)
+        return _stack_logarithms(self.a, self.b)
 
     @classmethod
     def from_logarithms(cls, values):
@@ -131,7 +131,7 @@ class Exponential(AbstractDecay):
 
     def logarithms(self):
         """Logarithms of the parameters: log a, log l."""
-        return _logarithms(self.a, self.length)
+        return _stack_logarithms(self.a, self.length)
 
     @classmethod
     def from_logarithms(cls, values):
@@ -181,7 +181,7 @@ class AttenuatedInverseSquare(AbstractDecay):
 
     def logarithms(self):
         """Logarithms of the parameters: log a, log b, log l."""
-        return _logarithms(self.a, self.b, self.length)
+        return _stack_logarithms(self.a, self.b, self.length)
 
     @classmethod
     def from_logarithms(cls, values):
@@ -201,7 +201,8 @@ class AttenuatedInverseSquare(AbstractDecay):
         return (*low[0], high[0][1]), (*low[1], high[1][1])
 
 
-def _logarithms(*parameters: Float[Array, " M"]) -> Float[Array, "K M"]:
+def _stack_logarithms(*parameters: Float[Array, " M"]) -> Float[Array, "K M"]:
+    """Natural logarithms of the parameters, one row for each."""
     xp = namespace(parameters)
     return xp.log(xp.stack(parameters))
 

@@ -76,12 +76,12 @@ class IntensityNoise(eqx.Module):
         return self.variance(received) / (received + column(self.floor, received)) ** 2
 
 
-def column(values: Float[Array, " M"], like: Array) -> Array:
-    """Reshape values (M,), one per microphone, so that they broadcast along the first axis of `like`."""
-    return values.reshape((-1,) + (1,) * (like.ndim - 1))
+def column(values: Float[Array, " M"], broadcast_to: Array) -> Array:
+    """Reshape values (M,), one per microphone, so that they broadcast along the first axis of `broadcast_to`."""
+    return values.reshape((-1,) + (1,) * (broadcast_to.ndim - 1))
 
 
-def below_nothing(power: np.ndarray, usable: np.ndarray) -> np.ndarray:
+def noise_from_negative_powers(power: np.ndarray, usable: np.ndarray) -> np.ndarray:
     """Standard deviation (M,) of the noise, estimated from the negative values among the intensities `power` (F, M).
     Only noise can make intensities negative."""
     below = np.where(usable & (power < 0), power, 0.0)

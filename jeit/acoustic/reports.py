@@ -66,8 +66,8 @@ def write_track(found: LocatedTouches, folder: str | Path) -> None:
     are empty. Raises `ValueError` if the folder cannot be created.
     """
     with results(folder, ("track.csv", "report.json", "track.png")) as made:
-        columns = _columns(found.locations.position.shape[1])
-        write_rows(made / "track.csv", columns, _rows(found.locations, found.track))
+        columns = _column_names(found.locations.position.shape[1])
+        write_rows(made / "track.csv", columns, _track_rows(found.locations, found.track))
         write_json(report_track(found), made / "report.json")
         draw_track(found).savefig(made / "track.png", dpi=150)
 
@@ -138,39 +138,39 @@ def draw_track(found: LocatedTouches):
     figure = Figure(figsize=(6.6, 5.8), layout="constrained")
     title = found.locations.name
     plot_track(
-        found.track, found.locations, found.calibration, overlay=_overlay(found), title=title, ax=figure.subplots()
+        found.track, found.locations, found.calibration, overlay=_overlay_maps(found), title=title, ax=figure.subplots()
     )
     return figure
 
 
-def _overlay(found: LocatedTouches) -> np.ndarray | None:
+def _overlay_maps(touches: LocatedTouches) -> np.ndarray | None:
     """Overlay (rows, columns) of the maps of all located frames, in which older frames are fainter; None if no frame is
     located."""
-    locations, intensities = found.locations, found.intensities
-    located = np.flatnonzero(locations.located & (locations.status != LocationStatus.TWO_TOUCHES))
+    locations, intensities = touches.locations, touches.intensities
+    located = np.flatnonzero(locations.has_position & (locations.status != LocationStatus.TWO_TOUCHES))
     if not located.size:
         return None
-    microphone_array, use, _ = microphones_in_use(intensities, found.calibration)
-    localiser = Localiser.create(microphone_array, method=found.method, map_shape=(_PIXELS, _PIXELS), compiled=False)
+    microphone_array, use, _ = microphones_in_use(intensities, touches.calibration)
+    localiser = Localiser.create(microphone_array, method=touches.method, map_shape=(_PIXELS, _PIXELS), compiled=False)
     times = locations.times[located]
     time_constant = max(0.3, 0.5 * float(times[-1] - times[0]))
     image = np.zeros((_PIXELS, _PIXELS))
     for start in range(0, located.size, _FRAMES):
         some = located[start : start + _FRAMES]
-        bright = brightness(localiser.maps(intensities.power[some], use[some]), method=found.method)
+        bright = brightness(localiser.maps(intensities.power[some], use[some]), method=touches.method)
         image = np.maximum(image, fade(bright, locations.times[some], at=times[-1], time_constant=time_constant))
     return image
 
 
-def _columns(d: int) -> list[str]:
+def _column_names(dimension: int) -> list[str]:
     names = ["time_s", "x_m", "y_m", "std_x_m", "std_y_m", "covariance", "strength", "status"]
     names += ["track_x_m", "track_y_m", "track_std_x_m", "track_std_y_m", "touch"]
-    if d == 3:
+    if dimension == 3:
         names += ["z_m", "std_z_m", "covariance_xz", "covariance_yz", "track_z_m", "track_std_z_m"]
     return names
 
 
-def _rows(locations: Locations, track: Track):
+def _track_rows(locations: Locations, track: Track):
     d = locations.position.shape[1]
     number = np.zeros(len(locations.times), int)
     for index, touch in enumerate(track.touches, 1):
@@ -180,28 +180,38 @@ def _rows(locations: Locations, track: Track):
         place, spread = locations.position[k], locations.covariance[k]
         row = [
             f"{time:.6f}",
-            *_texts(place[:2]),
-            *_texts(raw[k, :2]),
-            _text(spread[0, 1]),
-            _text(locations.strength[k]),
+            *_format_numbers(place[:2]),
+            *_format_numbers(raw[k, :2]),
+            _format_number(spread[0, 1]),
+            _format_number(locations.strength[k]),
         ]
-        row += [locations.status[k], *_texts(track.position[k, :2]), *_texts(smooth[k, :2]), number[k] or ""]
+        row += [
+            locations.status[k],
+            *_format_numbers(track.position[k, :2]),
+            *_format_numbers(smooth[k, :2]),
+            number[k] or "",
+        ]
         if d == 3:
-            row += [_text(place[2]), _text(raw[k, 2]), _text(spread[0, 2]), _text(spread[1, 2])]
-            row += [_text(track.position[k, 2]), _text(smooth[k, 2])]
+            row += [
+                _format_number(place[2]),
+                _format_number(raw[k, 2]),
+                _format_number(spread[0, 2]),
+                _format_number(spread[1, 2]),
+            ]
+            row += [_format_number(track.position[k, 2]), _format_number(smooth[k, 2])]
         yield row
 
 
 def _median_deviation(locations: Locations) -> float:
     """Median over the located frames of the standard deviation along the major axis of the error ellipse, in metres."""
-    if not locations.located.any():
+    if not locations.has_position.any():
         return math.nan
-    return float(np.median(np.sqrt(np.linalg.eigvalsh(locations.covariance[locations.located])[:, -1])))
+    return float(np.median(np.sqrt(np.linalg.eigvalsh(locations.covariance[locations.has_position])[:, -1])))
 
 
-def _text(value) -> str:
+def _format_number(value) -> str:
     return f"{value:.9g}" if np.isfinite(value) else ""
 
 
-def _texts(values) -> list[str]:
-    return [_text(value) for value in values]
+def _format_numbers(values) -> list[str]:
+    return [_format_number(value) for value in values]

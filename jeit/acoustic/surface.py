@@ -113,7 +113,7 @@ def make_surface(outline: Domain | ArrayLike, points: ArrayLike | None = None) -
     known = vertices if points is None else np.vstack([vertices, np.asarray(points, float)])
     if not np.isfinite(known).all():
         raise ValueError("outline: every coordinate of the outline and of the points on it must be finite.")
-    return _curved(vertices, np.unique(known, axis=0))
+    return _curved_surface(vertices, np.unique(known, axis=0))
 
 
 def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
@@ -122,7 +122,7 @@ def bounding_box(surface: AbstractSurface) -> tuple[Float[Array, " 2"], Float[Ar
     return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def in_space(
+def to_space(
     surface: AbstractSurface, chart: Float[Array, "2 F"], covariance: Float[Array, "2 2 F"]
 ) -> tuple[Float[Array, "F d"], Float[Array, "F d d"]]:
     """Transform positions (2, F) and covariances (2, 2, F) in the chart to positions (F, d) and covariances (F, d, d)
@@ -166,9 +166,9 @@ def _thin_plate(squared):
     return xp.where(positive, 0.5 * safe * xp.log(safe), 0.0)
 
 
-def _curved(vertices: np.ndarray, known: np.ndarray) -> CurvedSurface:
-    origin = known.mean(axis=0)
-    _, spread, directions = np.linalg.svd(known - origin, full_matrices=False)
+def _curved_surface(vertices: np.ndarray, points_on_surface: np.ndarray) -> CurvedSurface:
+    origin = points_on_surface.mean(axis=0)
+    _, spread, directions = np.linalg.svd(points_on_surface - origin, full_matrices=False)
     if spread[1] <= 1e-6 * spread[0]:
         raise ValueError("outline: its vertices lie on one line; give the outline of a surface, in metres.")
     normal = directions[2] * (1.0 if directions[2][np.argmax(np.abs(directions[2]))] > 0 else -1.0)
@@ -177,9 +177,9 @@ def _curved(vertices: np.ndarray, known: np.ndarray) -> CurvedSurface:
     first = leading - normal * (normal @ leading)
     first /= np.linalg.norm(first)
     axes = np.stack([first, np.cross(normal, first)], axis=1)
-    chart, height = (known - origin) @ axes, (known - origin) @ normal
+    chart, height = (points_on_surface - origin) @ axes, (points_on_surface - origin) @ normal
     scale = np.ptp(chart, axis=0).max()
-    keep = _spread(chart, _MOST_KNOTS)
+    keep = _farthest_points(chart, _MOST_KNOTS)
     chart, height = chart[keep], height[keep]
     apart = np.linalg.norm(chart[:, None] - chart, axis=-1) + 2 * scale * np.eye(len(chart))
     first_of, second_of = np.unravel_index(apart.argmin(), apart.shape)
@@ -198,12 +198,12 @@ def _curved(vertices: np.ndarray, known: np.ndarray) -> CurvedSurface:
     return CurvedSurface(Polygon((vertices - origin) @ axes), *(as_array(array) for array in arrays))
 
 
-def _spread(points: np.ndarray, most: int) -> np.ndarray:
-    """Indices of at most `most` points that are far from each other (farthest-point sampling)."""
-    if len(points) <= most:
+def _farthest_points(points: np.ndarray, max_points: int) -> np.ndarray:
+    """Indices of at most `max_points` points that are far from each other (farthest-point sampling)."""
+    if len(points) <= max_points:
         return np.arange(len(points))
     chosen, distance = [0], np.full(len(points), np.inf)
-    while len(chosen) < most:
+    while len(chosen) < max_points:
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
         chosen.append(int(distance.argmax()))
     return np.array(chosen)

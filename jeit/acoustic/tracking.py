@@ -21,7 +21,7 @@ from jeit_solvers.engines import at_once, namespace, scan
 # Candidate spectral densities of acceleration in m²/s³, from a finger at rest to one that moves violently.
 _DENSITIES = np.geomspace(1e-5, 10.0, 13)
 # Probability that a correct position is rejected as too far from its prediction.
-_BELIEVED = 1e-4
+_FALSE_REJECTION = 1e-4
 # Standard deviation of each component of the initial velocity of a touch, in m/s.
 _FIRST_SPEED = 0.5
 
@@ -70,10 +70,10 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
     if acceleration is not None and not (np.isfinite(acceleration) and acceleration > 0):
         raise ValueError(f"acceleration must be positive, in m²/s³; it is {acceleration}.")
     frames, d = locations.position.shape
-    times, located = locations.times, locations.located
+    times, located = locations.times, locations.has_position
     position, velocity = np.full((frames, d), np.nan), np.full((frames, d), np.nan)
     covariance, rejected = np.full((frames, d, d), np.nan), np.zeros(frames, bool)
-    runs = _runs(times, located, gap)
+    runs = _touch_intervals(times, located, gap)
     densities = _DENSITIES if acceleration is None else np.array([acceleration])
     touches = []
     for first, last in runs:
@@ -93,7 +93,7 @@ def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None
     return Track(np.asarray(times), position, covariance, velocity, tuple(touches), rejected)
 
 
-def _runs(times, located, gap: float) -> list[tuple[int, int]]:
+def _touch_intervals(times, located, gap: float) -> list[tuple[int, int]]:
     """Indices of the first and last located frame of each touch."""
     index = np.flatnonzero(located)
     if not index.size:
@@ -130,10 +130,10 @@ def _smooth(step, measured, spread, located, densities):
     best = xp.argmax(score)
     mean, error, predicted_mean, predicted_error, believed = (array[:, best] for array in filtered)
 
-    def back(later, now):
+    def smooth_step(later, now):
         later_mean, later_error = later
         mean, error, next_mean, next_error, next_step = now
-        move = _move(next_step, d)
+        move = _transition_matrix(next_step, d)
         gain = xp.linalg.solve(next_error, move @ error).T
         mean = mean + gain @ (later_mean - next_mean)
         error = error + gain @ (later_error - next_error) @ gain.T
@@ -143,7 +143,7 @@ def _smooth(step, measured, spread, located, densities):
     # unchanged.
     beyond = predicted_mean[-1], predicted_error[-1]
     later = (xp.concatenate([array[1:], array[-1:]]) for array in (predicted_mean, predicted_error, step))
-    _, (means, errors) = scan(back, beyond, (mean, error, *later), reverse=True)
+    _, (means, errors) = scan(smooth_step, beyond, (mean, error, *later), reverse=True)
     return means, errors, believed
 
 
@@ -154,13 +154,13 @@ def _filter(step, measured, spread, located, densities):
     the state, the predicted mean and covariance, and whether the position was accepted.
     """
     xp, d = namespace(measured), measured.shape[1]
-    limit = float(chdtri(d, _BELIEVED))
+    limit = float(chdtri(d, _FALSE_REJECTION))
 
-    def forward(state, now):
+    def filter_step(state, now):
         mean, error = state
         step, place, spread, there = now
-        move = _move(step, d)
-        mean, error = mean @ move.T, move @ error @ move.T + densities[:, None, None] * _noise(step, d)
+        move = _transition_matrix(step, d)
+        mean, error = mean @ move.T, move @ error @ move.T + densities[:, None, None] * _process_noise(step, d)
         off, inner = place - mean[:, :d], error[:, :d, :d] + spread
         gain = xp.swapaxes(xp.linalg.solve(inner, error[:, :d]), 1, 2)
         square = xp.sum(off * xp.linalg.solve(inner, off[:, :, None])[:, :, 0], axis=1)
@@ -180,18 +180,18 @@ def _filter(step, measured, spread, located, densities):
     wide = xp.concatenate([1e4 * xp.trace(spread[0]) * xp.ones(d), xp.full(d, _FIRST_SPEED**2)])
     many = len(densities)
     first = xp.tile(begin, (many, 1)), xp.tile(xp.diag(wide), (many, 1, 1))
-    _, (score, *rest) = scan(forward, first, (step, measured, spread, located))
+    _, (score, *rest) = scan(filter_step, first, (step, measured, spread, located))
     return xp.sum(score, axis=0), rest
 
 
-def _move(step, d: int) -> Float[Array, "s s"]:
+def _transition_matrix(step, dimension: int) -> Float[Array, "s s"]:
     """Transition matrix (2 d, 2 d) of position and velocity for a time step in seconds."""
     xp = namespace(step)
-    return xp.kron(xp.eye(2) + step * xp.eye(2, k=1), xp.eye(d))
+    return xp.kron(xp.eye(2) + step * xp.eye(2, k=1), xp.eye(dimension))
 
 
-def _noise(step, d: int) -> Float[Array, "s s"]:
+def _process_noise(step, dimension: int) -> Float[Array, "s s"]:
     """Covariance (2 d, 2 d) of position and velocity after a time step with white acceleration of spectral density
     1."""
     xp = namespace(step)
-    return xp.kron(xp.stack([step**3 / 3, step**2 / 2, step**2 / 2, step]).reshape(2, 2), xp.eye(d))
+    return xp.kron(xp.stack([step**3 / 3, step**2 / 2, step**2 / 2, step]).reshape(2, 2), xp.eye(dimension))

@@ -40,7 +40,7 @@ _MOVED = {
         "pat quiet room_sound sound_clips stroke tap tickle wind",
         "jeit.data": "RoundSkin simulate_press",
         "jeit.touch.simulate": "Bar DepthMap Disc Foundation GestureStream HalfSpace Indent IndentDraws IndentSet "
-        "Joined Material MovingPress Person Placed Press PressDraws PressSet PressedSkin Prism Revolved "
+        "Material MovingPress Person Press PressDraws PressSet PressedSkin Prism Revolved "
         "Ring TwoSheets ball depth_maps indented_cells material open_presses relative_changes "
         "simulate_gesture_stream simulate_gestures simulate_presses",
     },
@@ -48,8 +48,18 @@ _MOVED = {
 _RENAMED = {
     "jeit.touch.attributes.least_told": "jeit.touch.attributes.least_detected",
     "jeit.touch.kohonen.touches_told": "jeit.touch.kohonen.touches_reported",
+    "jeit.touch.training.Trained": "jeit.touch.training.TrainingResult",
     "jeit.touch.listening.Heard": "jeit.touch.listening.SoundLabels",
     "jeit.plot.plot_heard": "jeit.touch.plots.plot_sound_labels",
+    **{
+        f"{page}.{old}": f"{home}.{new}"
+        for page, home in (
+            ("jeit.simulate", "jeit.touch.simulate"),
+            ("jeit.touch.simulate", "jeit.touch.simulate"),
+            ("jeit.touch.simulate.contact", "jeit.touch.simulate.contact"),
+        )
+        for old, new in (("Joined", "JoinedIndenters"), ("Placed", "PlacedIndenter"))
+    },
     **{f"jeit.report.{verb}_heard": f"jeit.touch.reports.{verb}_sound_labels" for verb in ("draw", "report", "write")},
 }
 MOVED = _RENAMED | {

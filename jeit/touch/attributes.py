@@ -23,7 +23,7 @@ from jeit.touch.contacts.finder import AbstractFinder
 # Minimum number of different loads; minimum number of touches with each.
 _LEVELS, _REPEATS = 3, 3
 # Fractions of the maximum response between which rise and fall times are measured.
-_BEGUN, _DONE = 0.1, 0.9
+_RISE_START, _RISE_END = 0.1, 0.9
 
 
 class Localisation(NamedTuple):
@@ -60,7 +60,7 @@ def weber_ratio(load: ArrayLike, response: ArrayLike) -> tuple[Float[np.ndarray,
     times or more; `response` (n,), in any unit, such as the peak of an image. Returns the loads (k,), newtons, and the
     ratios (k,). Raises `ValueError` for fewer loads, loads that are not positive, arrays of different lengths, and NaN.
     """
-    load, response = _pair("load", load, "response", response)
+    load, response = _check_pair("load", load, "response", response)
     if (load <= 0).any():
         raise ValueError("load must be positive, in newtons.")
     levels, which, count = np.unique(load, return_inverse=True, return_counts=True)
@@ -88,7 +88,7 @@ def point_localisation(place: ArrayLike, found: ArrayLike) -> Localisation:
     off = np.linalg.norm(found - place, axis=1)
     there = np.isfinite(off)
     if not there.any():
-        raise ValueError("found: nothing was found of any touch.")
+        raise ValueError("found: every row is NaN; no touch was found.")
     off = off[there]
     return Localisation(float(off.mean()), float(off.std()), float(off.max()), float(1 - there.mean()))
 
@@ -106,7 +106,7 @@ def least_detected(amount: ArrayLike, detected: ArrayLike) -> float:
     detected = np.asarray(detected)
     if detected.dtype.kind != "b":
         raise ValueError(f"detected must be true or false for each trial; it is {detected.dtype}.")
-    amount, detected = _pair("amount", amount, "detected", detected.astype(float))
+    amount, detected = _check_pair("amount", amount, "detected", detected.astype(float))
     levels, which, count = np.unique(amount, return_inverse=True, return_counts=True)
     share = isotonic_regression(np.bincount(which, detected) / count, weights=count).x
     above = int(np.argmax(share >= 0.5))
@@ -123,7 +123,7 @@ def contact_area(area: ArrayLike, found: ArrayLike) -> ContactArea:
 
     Raises `ValueError` for arrays of different lengths, NaN, and true areas that are all the same.
     """
-    area, found = _pair("area", area, "found", found)
+    area, found = _check_pair("area", area, "found", found)
     if len(area) < 2 or (area == area[0]).all():
         raise ValueError("area: give two different areas, or more.")
     gain, least = np.polyfit(area, found, 1)
@@ -139,25 +139,31 @@ def response_times(seconds: ArrayLike, response: ArrayLike) -> tuple[float, floa
     10 %, and infinite if the recording ends before. Raises `ValueError` for arrays of different lengths, times that do
     not increase, NaN, and a response that is nowhere positive.
     """
-    seconds, response = _pair("seconds", seconds, "response", response)
+    seconds, response = _check_pair("seconds", seconds, "response", response)
     if (np.diff(seconds) <= 0).any():
-        raise ValueError("seconds must rise.")
+        raise ValueError("seconds must increase from frame to frame.")
     size = float(response.max())
     if size <= 0:
-        raise ValueError("response is nowhere positive; give one in which touches are.")
-    begun, done = (int(np.argmax(response >= share * size)) for share in (_BEGUN, _DONE))
-    last = len(response) - 1 - int(np.argmax(response[::-1] >= _DONE * size))
-    after = response[last:] < _BEGUN * size
+        raise ValueError(
+            "response is nowhere positive; give the response to a touch, with the sign that makes it positive."
+        )
+    begun, done = (int(np.argmax(response >= share * size)) for share in (_RISE_START, _RISE_END))
+    last = len(response) - 1 - int(np.argmax(response[::-1] >= _RISE_END * size))
+    after = response[last:] < _RISE_START * size
     gone = float(seconds[last + int(np.argmax(after))] - seconds[last]) if after.any() else float("inf")
     return float(seconds[done] - seconds[begun]), gone
 
 
-def _pair(first: str, one: ArrayLike, second: str, other: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def _check_pair(
+    first_name: str, first: ArrayLike, second_name: str, second: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
     """Convert two arrays to numbers, and check that both are (n,) and finite."""
-    left, right = real_array(first, one, "numbers (n,)"), real_array(second, other, "numbers (n,)")
+    left, right = real_array(first_name, first, "numbers (n,)"), real_array(second_name, second, "numbers (n,)")
     if left.ndim != 1 or left.shape != right.shape or not left.size:
-        raise ValueError(f"{first} and {second} must be (n,), as many; they have shapes {left.shape}, {right.shape}.")
-    for name, values in ((first, left), (second, right)):
+        raise ValueError(
+            f"{first_name} and {second_name} must be (n,), as many; they have shapes {left.shape}, {right.shape}."
+        )
+    for name, values in ((first_name, left), (second_name, right)):
         if not np.isfinite(values).all():
             raise ValueError(f"{name} has NaN or infinite values.")
     return left, right
@@ -240,62 +246,64 @@ def touch_attributes(
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     report = progress or (lambda said: None)
     report("untouched frames")
-    untouched = _frames(press([[] for _ in range(_UNTOUCHED)]), _UNTOUCHED, linear)
+    untouched = _check_frames(press([[] for _ in range(_UNTOUCHED)]), _UNTOUCHED, linear)
     reference, noise = untouched.mean(axis=0), ImageNoise.of_frames(linear, untouched)
 
-    def contacts_in(frames: np.ndarray) -> list[list[Contact]]:
+    def find_in_frames(frames: np.ndarray) -> list[list[Contact]]:
         return [find_contacts(finder, image, noise) for image in np.asarray(linear.image(frames - reference))]
 
-    def contacts(touches: Sequence[Sequence[DiscTouch]]) -> list[list[Contact]]:
-        return contacts_in(_frames(press(touches), len(touches), linear))
+    def press_and_find(touches: Sequence[Sequence[DiscTouch]]) -> list[list[Contact]]:
+        return find_in_frames(_check_frames(press(touches), len(touches), linear))
 
     report("Weber ratio")
     loads = np.repeat(load * _LOADS, _PRESSED_TIMES)
     levels, weber = weber_ratio(
-        loads, [_peak(one) for one in contacts([[DiscTouch(centre, n, diameter)] for n in loads])]
+        loads, [_strongest_peak(one) for one in press_and_find([[DiscTouch(centre, n, diameter)] for n in loads])]
     )
     report("localisation")
-    places = centre + (within * np.sqrt(random.uniform(size=_PLACES)))[:, None] * _directions(random, _PLACES)
-    found = contacts([[DiscTouch(place, load, diameter)] for place in places])
-    localisation = point_localisation(places, np.array([_centroid(one) for one in found]))
+    places = centre + (within * np.sqrt(random.uniform(size=_PLACES)))[:, None] * _random_directions(random, _PLACES)
+    found = press_and_find([[DiscTouch(place, load, diameter)] for place in places])
+    localisation = point_localisation(places, np.array([_strongest_centroid(one) for one in found]))
     report("two points")
     apart = np.repeat(_SEPARATIONS * diameter, _TRIALS)
-    half = apart[:, None] / 2 * _directions(random, len(apart))
-    found = contacts([[DiscTouch(centre + way * one, load, diameter) for way in (-1, 1)] for one in half])
+    half = apart[:, None] / 2 * _random_directions(random, len(apart))
+    found = press_and_find([[DiscTouch(centre + way * one, load, diameter) for way in (-1, 1)] for one in half])
     two_points = least_detected(apart, np.array([len(one) > 1 for one in found]))
     report("contact area")
     wide = np.repeat(_DIAMETERS, _PRESSED_TIMES)
-    found = contacts([[DiscTouch(centre, load * one**2, one * diameter)] for one in wide])
+    found = press_and_find([[DiscTouch(centre, load * one**2, one * diameter)] for one in wide])
     area = contact_area(np.pi / 4 * (wide * diameter) ** 2, [one[0].area if one else 0.0 for one in found])
     rise = fall = None
     if recording is not None:
         report("times")
         seconds = real_array("recording", recording[0], "seconds (T,), and frames (T, M)")
-        frames = _frames(recording[1], len(np.atleast_1d(seconds)), linear)
-        rise, fall = response_times(seconds, [_peak(one) for one in contacts_in(frames)])
+        frames = _check_frames(recording[1], len(np.atleast_1d(seconds)), linear)
+        rise, fall = response_times(seconds, [_strongest_peak(one) for one in find_in_frames(frames)])
     return TouchAttributes(levels, weber, localisation, two_points, area, rise, fall)
 
 
-def _frames(given, number: int, linear: LinearReconstruction) -> Float[np.ndarray, "n M"]:
-    frames, wanted = real_array("frames", given, "volts (n, M)"), (number, linear.num_measurements)
+def _check_frames(frames_given, num_touches: int, linear: LinearReconstruction) -> Float[np.ndarray, "n M"]:
+    """Convert frames to an array. Raises `ValueError` unless there is one for each touch, finite, with M channels."""
+    frames, wanted = real_array("frames", frames_given, "volts (n, M)"), (num_touches, linear.num_measurements)
     if frames.shape != wanted or not np.isfinite(frames).all():
         raise ValueError(f"frames must be finite volts {wanted}, one for each touch; they have shape {frames.shape}.")
     return frames
 
 
-def _directions(random: np.random.Generator, number: int) -> Float[np.ndarray, "n 2"]:
-    angle = random.uniform(0, 2 * np.pi, number)
+def _random_directions(random: np.random.Generator, count: int) -> Float[np.ndarray, "n 2"]:
+    """Draw `count` random unit vectors."""
+    angle = random.uniform(0, 2 * np.pi, count)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _peak(found: list[Contact]) -> float:
-    """Peak of the strongest contact; 0 if there is none."""
-    return abs(found[0].peak) if found else 0.0
+def _strongest_peak(contacts: list[Contact]) -> float:
+    """Magnitude of the peak of the strongest contact; 0 without a contact."""
+    return abs(contacts[0].peak) if contacts else 0.0
 
 
-def _centroid(found: list[Contact]) -> np.ndarray:
-    """Centroid of the strongest contact; NaN if there is none."""
-    return found[0].centroid if found else np.full(2, np.nan)
+def _strongest_centroid(contacts: list[Contact]) -> np.ndarray:
+    """Centroid (2,) of the strongest contact, metres; NaN without a contact."""
+    return contacts[0].centroid if contacts else np.full(2, np.nan)
 
 
 __getattr__ = _with_moved_names(__name__)

@@ -89,7 +89,7 @@ def test_freedom_is_the_trace(high, length):
     """(tr A)² / tr A², with A from the responses to unit samples: xᵀAx for e_i + e_j and e_i - e_j gives A_ij."""
     rate, hop = 8000.0, 16
     settings = IntensitySettings(low=260.0, high=high, window=length / rate, hop=hop / rate)
-    grid = intensity.make_grid(settings, rate, None, "")
+    grid = intensity.window_grid(settings, rate, None, "")
 
     one, other = np.eye(length)[:, None], np.eye(length)
     plus = intensity.band_power((one + other).reshape(-1, length), grid)
@@ -100,7 +100,7 @@ def test_freedom_is_the_trace(high, length):
     moved = np.zeros((2, length + hop, length + hop))
     moved[0, :length, :length] = moved[1, hop:, hop:] = form
     correlation = (moved[0] * moved[1]).sum() / (form**2).sum()
-    shared = intensity.shared_noise(grid, 5)
+    shared = intensity.noise_correlation(grid, 5)
     assert shared[0, 1] == shared[3, 2] == pytest.approx(correlation, rel=1e-9)
     assert 0.2 < correlation < 0.9
     assert shared[0, 4] == shared[4, 0] == 0

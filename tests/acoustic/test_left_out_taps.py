@@ -8,8 +8,8 @@ import pytest
 from microphone_arrays import MICROPHONES, OUTLINE, listen, models
 
 from jeit.acoustic import Calibration, Intensities, Taps, calibrate_microphones, locate
-from jeit.acoustic.calibration.calibrate import calibrate_each, choose
-from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, _deal
+from jeit.acoustic.calibration.calibrate import fit_each_decay, select_fit
+from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, _assign_folds
 from jeit.acoustic.decay import DECAYS
 from jeit.layout import grid
 
@@ -31,7 +31,7 @@ def taps(power, error=0.05, seed=0):
 @functools.cache
 def fitted(law):
     """Fits of every law to taps that one was made by; what cannot be fitted."""
-    return calibrate_each(taps(LAWS[law]))
+    return fit_each_decay(taps(LAWS[law]))
 
 
 # A steep array is said to be attenuated in `test_untuned_arrays`.
@@ -39,14 +39,14 @@ def fitted(law):
     "law", [pytest.param(one, marks=pytest.mark.slow if one == "attenuated" else []) for one in LAWS]
 )
 def test_auto_takes_the_law_that_taps_were_made_by(law):
-    fit = choose(*fitted(law))
+    fit = select_fit(*fitted(law))
     assert fit.calibration.microphone_array.decay.name == law
     assert fit.left_out[0][1] < 2.1e-3
     assert {name for name, _ in fit.left_out} == set(DECAYS)
 
 
 def test_what_auto_takes_is_what_that_law_alone_gives():
-    auto = choose(*fitted("exponential"))
+    auto = select_fit(*fitted("exponential"))
     alone = calibrate_microphones(taps(LAWS["exponential"]), decay="exponential")
     assert eqx.tree_equal(auto.calibration, alone.calibration)
     assert alone.left_out == auto.left_out[:1]
@@ -54,7 +54,7 @@ def test_what_auto_takes_is_what_that_law_alone_gives():
 
 @pytest.mark.slow
 def test_auto_fits_every_law_and_chooses():
-    auto, expected = calibrate_microphones(taps(LAWS["exponential"])), choose(*fitted("exponential"))
+    auto, expected = calibrate_microphones(taps(LAWS["exponential"])), select_fit(*fitted("exponential"))
     assert eqx.tree_equal(auto.calibration, expected.calibration)
     assert auto.left_out == expected.left_out
 
@@ -63,9 +63,9 @@ def test_the_simpler_of_two_that_do_as_well():
     fits, _ = fitted("inverse-square")
     off = {"inverse-square": 1.04e-3, "exponential": 5e-3, "attenuated": 1e-3}
     told = {name: eqx.tree_at(lambda f: f.left_out, fit, ((name, off[name]),)) for name, fit in fits.items()}
-    assert choose(told, {}).calibration.microphone_array.decay.name == "inverse-square"
+    assert select_fit(told, {}).calibration.microphone_array.decay.name == "inverse-square"
     told["inverse-square"] = eqx.tree_at(lambda f: f.left_out, fits["inverse-square"], (("inverse-square", 1.06e-3),))
-    assert choose(told, {}).calibration.microphone_array.decay.name == "attenuated"
+    assert select_fit(told, {}).calibration.microphone_array.decay.name == "attenuated"
 
 
 def test_taps_in_another_order_are_refused():
@@ -74,21 +74,21 @@ def test_taps_in_another_order_are_refused():
     with pytest.raises(ValueError, match="in the order of the taps"):
         calibrate_microphones(taps(power, 0.2), decay="inverse-square")
     with pytest.raises(ValueError, match="in the order of the taps"):
-        choose({}, {"inverse-square": "are positions in the order of the taps?", "exponential": "other"})
+        select_fit({}, {"inverse-square": "are positions in the order of the taps?", "exponential": "other"})
 
 
 @pytest.mark.slow
 def test_taps_in_another_order_are_refused_by_every_law():
     power = np.random.default_rng(1).permutation(LAWS["inverse-square"])
-    fits, refused = calibrate_each(taps(power, 0.2))
+    fits, refused = fit_each_decay(taps(power, 0.2))
     assert fits == {}
     assert set(refused) == set(DECAYS)
     with pytest.raises(ValueError, match="in the order of the taps"):
-        choose(fits, refused)
+        select_fit(fits, refused)
 
 
 def test_taps_at_one_place_are_left_out_together():
-    part = _deal(PLACES.repeat(3, axis=0)).reshape(-1, 3)
+    part = _assign_folds(PLACES.repeat(3, axis=0)).reshape(-1, 3)
     assert (part == part[:, :1]).all()
     assert np.bincount(part[:, 0]).tolist() == [13, 12, 12, 12]
 

@@ -75,7 +75,7 @@ def test_touches(known, touches):
     # One in ten thousand is called a misfit, and places near the rim may look outside.
     assert np.mean(found.status == "touch") > 0.95
     assert found.counts()["touch"] == (found.status == "touch").sum()
-    assert found.located.all()
+    assert found.has_position.all()
     # 64 draws: 0.95 within 0.08 or so, and at the rim a little less.
     assert coverage(found, places) > 0.85
     assert np.median(np.linalg.norm(found.position - places, axis=1)) < 0.003
@@ -103,7 +103,7 @@ def test_silence_is_no_touch(known):
     """A thousand windows of it, and between touches."""
     found = locate(heard(silence(1000)), known)
     assert found.counts() == {"no touch": 1000}
-    assert not found.located.any()
+    assert not found.has_position.any()
     for values in (found.position, found.covariance, found.strength, found.misfit):
         assert np.isnan(values).all()
     assert found.notes == ()
@@ -116,7 +116,7 @@ def test_silence_between_touches(known, touches):
     found = locate(heard(power), known)
     assert (found.status[quiet] == "no touch").all()
     assert (found.status[~quiet] != "no touch").all()
-    np.testing.assert_array_equal(found.located, ~quiet)
+    np.testing.assert_array_equal(found.has_position, ~quiet)
 
 
 def test_frames_of_zeros_are_no_touch(known, touches):
@@ -126,7 +126,7 @@ def test_frames_of_zeros_are_no_touch(known, touches):
     power[20:25] *= 1e-9
     found = locate(heard(power, floor=0), calibration(array(9, relative=0.05)))
     assert (found.status[10:25] == "no touch").all()
-    assert found.located.sum() == FRAMES - 15
+    assert found.has_position.sum() == FRAMES - 15
 
 
 def test_nothing_but_zeros(known):
@@ -230,8 +230,8 @@ def test_unusable_frames(known, touches):
     found = locate(heard(power), known, gain_drift=0)
     assert (found.status[[5, 6]] == "unusable").all()
     assert found.status[7] != "unusable"
-    assert not found.located[[5, 6]].any()
-    assert found.located.sum() == FRAMES - 2
+    assert not found.has_position[[5, 6]].any()
+    assert found.has_position.sum() == FRAMES - 2
     np.testing.assert_array_equal(found.used[5], np.arange(9) < 2)
     others = np.setdiff1d(np.arange(FRAMES), [5, 6, 7])
     whole = locate(heard(touches[1]), known, gain_drift=0)
@@ -348,7 +348,7 @@ def test_noise_that_only_negative_intensities_betray():
     power = np.concatenate([hear(microphone_array, places), np.zeros((32, 9))]) + 0.01 * rng.normal(size=(64, 9))
     found = locate(heard(power, floor=0), calibration(microphone_array))
     assert (found.status[32:] == "no touch").all()
-    assert found.located[:32].all()
+    assert found.has_position[:32].all()
     assert np.median(np.linalg.norm(found.position[:32] - places, axis=1)) < 0.004
     assert coverage(found, np.concatenate([places, places]), slice(0, 32)) > 0.8
 
@@ -377,12 +377,12 @@ def test_bad_options(options, message, known, touches):
 
 def test_a_place_known_to_nothing_is_ambiguous():
     """Covariances wider than the skin, or none at all, are bounded, and such places are not called touches."""
-    from jeit.acoustic.localisation.locate import _bound
+    from jeit.acoustic.localisation.locate import _limit_uncertainty
 
     status = np.array(["touch", "touch", "touch", "outside"], object)
     covariance = np.stack([1e-6 * np.eye(2), np.full((2, 2), np.nan), 4e10 * np.ones((2, 2)), np.full((2, 2), np.nan)])
     result = {"position": np.zeros((4, 2)), "covariance": covariance}
-    _bound(status, result, 0.2)
+    _limit_uncertainty(status, result, 0.2)
     assert list(status) == ["touch", "ambiguous", "ambiguous", "outside"]
     np.testing.assert_allclose(result["covariance"][1:], np.broadcast_to(0.01 * np.eye(2), (3, 2, 2)))
     np.testing.assert_allclose(result["covariance"][0], 1e-6 * np.eye(2))

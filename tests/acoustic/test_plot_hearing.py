@@ -216,7 +216,7 @@ def test_the_papers_loss_is_in_decibels(ax):
         ("microphones has shape", {"microphones": np.ones((9, 3))}),
         ("truth has shape", {"marks": Marks(truth=[0.0, 0.0, 0.0])}),
         ("estimate has shape", {"marks": Marks(estimate=0.0)}),
-        ("covariance needs an estimate", {"marks": Marks(covariance=np.eye(2))}),
+        ("give estimate too", {"marks": Marks(covariance=np.eye(2))}),
         ("covariance has shape", {"marks": Marks(estimate=[0.0, 0.0], covariance=np.eye(3))}),
     ],
 )

@@ -77,7 +77,7 @@ def test_a_touch_without_pauses(vibration, silent, heard_before):
     assert "silence=" in note
     found = locate(vibration, heard_before, silence=silent)
     assert found.notes == ()
-    assert found.located.all()
+    assert found.has_position.all()
     assert np.isin(found.status, ["touch", "ambiguous"]).all()
     # Nine microphones 7 cm apart, and a model that knows nothing of echoes.
     assert np.median(np.linalg.norm(found.position - PLACE, axis=1)) < 0.012
@@ -102,7 +102,7 @@ def test_a_microphone_that_has_no_silence_is_not_used(skin, vibration, silent, h
     assert found.faults[4] == "in the silence: dead: every sample is 0"
     assert not found.used[:, 4].any()
     assert found.used[:, :4].all()
-    assert found.located.all()
+    assert found.has_position.all()
 
 
 def test_silence_that_makes_no_sense(skin, vibration, silent, heard_before):
@@ -111,5 +111,5 @@ def test_silence_that_makes_no_sense(skin, vibration, silent, heard_before):
     with pytest.raises(ValueError, match="'hush' has 8 microphones"):
         locate(vibration, heard_before, silence=recorded(skin, silent.samples[:8], "hush"))
     for pair in ((intensities(vibration), silent), (vibration, intensities(silent))):
-        with pytest.raises(ValueError, match="silence is for a recording of samples"):
+        with pytest.raises(ValueError, match="silence applies to a recording of samples"):
             locate(pair[0], heard_before, silence=pair[1])

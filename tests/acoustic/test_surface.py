@@ -11,9 +11,9 @@ from jeit.acoustic.surface import (
     Plane,
     bounding_box,
     chart_grid,
-    in_space,
     longer_side,
     outline_sides,
+    to_space,
 )
 from jeit.mesh import Disk, Polygon, Rectangle
 from jeit_solvers.engines import on_device, on_host
@@ -175,10 +175,10 @@ def test_slopes_of_a_curved_surface(skin):
     @jax.jit
     def compiled(at):
         made = on_device(skin)
-        return jax.jvp(made.place, (at,), (direction,)), in_space(made, at, covariance)
+        return jax.jvp(made.place, (at,), (direction,)), to_space(made, at, covariance)
 
     (place, slope), spread = compiled(at)
-    for mine, theirs in zip((place, *spread), (skin.place(at), *in_space(skin, at, covariance)), strict=True):
+    for mine, theirs in zip((place, *spread), (skin.place(at), *to_space(skin, at, covariance)), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-9, atol=1e-15)
     rest = [np.abs(skin.place(at + h * direction) - place - h * slope).max() for h in (1e-3, 1e-4)]
     assert np.log10(float(rest[0] / rest[1])) > 1.8
@@ -190,7 +190,7 @@ def test_covariance_in_space(skin):
     chart = middle(4)
     root = np.random.default_rng(2).normal(size=(4, 2, 2)) * 1e-3
     covariance = root @ root.transpose(0, 2, 1)
-    place, found = in_space(skin, chart, np.asarray(covariance.transpose(1, 2, 0)))
+    place, found = to_space(skin, chart, np.asarray(covariance.transpose(1, 2, 0)))
     # In another order of sums.
     np.testing.assert_allclose(place, skin.place(chart).T, atol=1e-15)
     step = 1e-6

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.problems.heard_arrays import DEVELOPMENT, REPORTED, draw_array, steep_array
 from benchmarks.problems.located_arrays import located, located_by_each, plainly_located, taps_of
-from jeit.acoustic.calibration.calibrate import calibrate_each, choose
+from jeit.acoustic.calibration.calibrate import fit_each_decay, select_fit
 from jeit.acoustic.decay import DECAYS
 
 FEW = {"microphones": (9, 12), "tap_side": (7, 7), "repeats": (1, 1)}
@@ -17,9 +17,9 @@ FEW = {"microphones": (9, 12), "tap_side": (7, 7), "repeats": (1, 1)}
 def steep():
     """Intensity falls by e in 45 mm, beside its spreading; a clean array with edges that reflect."""
     array = steep_array(0.045, microphones=(16, 16), tap_side=(7, 7), repeats=(1, 1))
-    fits, refused = calibrate_each(taps_of(array))
+    fits, refused = fit_each_decay(taps_of(array))
     assert refused == {}
-    taken = choose(fits, refused)
+    taken = select_fit(fits, refused)
     judged = {name: located(array, fits[name]) for name in ("inverse-square", taken.left_out[0][0])}
     return taken, judged, plainly_located(array)
 

@@ -106,7 +106,7 @@ def test_a_large_error_of_the_models_is_noted(folder, off, tmp_path, capsys):
     )
     assert "the models miss the recorded levels by" in told["off"]
     assert "in another way here than in any decay model." in told["off"]
-    exact, miss = (float(re.search(r"located to ± ([\d.]+) mm", one)[1]) for one in told.values())
+    exact, miss = (float(re.search(r"error of location ± ([\d.]+) mm", one)[1]) for one in told.values())
     assert exact < 0.2
     assert miss > 2
 
@@ -121,7 +121,7 @@ def test_another_decay_model_is_advised_where_one_was_asked_for(folder, off, tmp
     assert "try another --decay, or auto." in spoilt
     assert "the models miss" not in exact
     assert re.search(r"decay model inverse-square: locates taps left out of the fit to 0\.0 mm, median \(", exact)
-    small, large = (float(re.search(r"located to ± ([\d.]+) mm", one)[1]) for one in (exact, spoilt))
+    small, large = (float(re.search(r"error of location ± ([\d.]+) mm", one)[1]) for one in (exact, spoilt))
     assert small < 0.2
     assert large > 2
 
@@ -326,8 +326,8 @@ def instead(command, **changes):
         ([*LOCATE, "--method", "magic"], "likelihood, consistency"),
         ([*LOCATE, "--gap", "0"], "--gap"),
         ([*LOCATE, "--low", "100"], "for samples"),
-        ([*LOCATE, "--silence", "touch.npz"], "--silence is for samples"),
-        (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--silence", "recording.npz"], "must hold samples"),
+        ([*LOCATE, "--silence", "touch.npz"], "--silence applies to recordings of samples"),
+        (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--silence", "recording.npz"], "must contain"),
         (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--silence", "none.npz"], "none.npz"),
         (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--high", "5000"], "2000"),
         (["locate", "touch.npz", "-c", "sound.json", "-o", "out", "--window", "-1"], "window"),

@@ -10,8 +10,8 @@ from small_networks import SKIN
 
 from jeit.design import read_described_skin
 from jeit.touch.networks import PRESETS, read_network
-from jeit.touch.networks.learn import Examples, Runs, shuffled, stand, train_unrolled
-from jeit.touch.networks.sensed import Sensed
+from jeit.touch.networks.learn import TouchExamples, TrainingRuns, evaluate_network, shuffle_pairs, train_unrolled
+from jeit.touch.networks.linear_channels import LinearChannels
 from jeit.touch.networks.three_stages import ThreeStages
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.simulate.contact.indent_sets import image_places
@@ -82,16 +82,16 @@ def test_the_quick_preset(run, tmp_path):
     assert (model / "learning.png").stat().st_size > 10_000
     skin, network = read_described_skin(tmp_path / "skin.toml"), read_network(model)
     opened = [xarray.open_zarr(model / "work" / f"{name}.zarr") for name in ("learnt", "held-out", "standing")]
-    learnt, held, judged = (Examples(one["change"].to_numpy(), one["depth"].to_numpy()) for one in opened)
+    learnt, held, judged = (TouchExamples(one["change"].to_numpy(), one["depth"].to_numpy()) for one in opened)
 
     def explained(other):
-        return stand(dataclasses.replace(network, network=other), skin, judged).explained
+        return evaluate_network(dataclasses.replace(network, network=other), skin, judged).explained
 
-    channels, sensed = learnt.change.shape[1], Sensed.of(skin)
+    channels, sensed = learnt.change.shape[1], LinearChannels.from_skin(skin)
     fresh = Unrolled(channels, (48, 48), key=jax.random.key(3))
-    fresh = fresh.of_skin(sensed, image_places(skin, 48, 48), skin.layout.centres, network.noise)
-    runs = Runs(PRESETS["quick"].plan, jax.random.key(0))
-    lost = train_unrolled(fresh, sensed, shuffled(learnt), held, network.noise, runs)
+    fresh = fresh.adapted_to_skin(sensed, image_places(skin, 48, 48), skin.layout.centres, network.noise)
+    runs = TrainingRuns(PRESETS["quick"].plan, jax.random.key(0))
+    lost = train_unrolled(fresh, sensed, shuffle_pairs(learnt), held, network.noise, runs)
     other = ThreeStages(channels, (48, 48), key=jax.random.key(3))
     assert explained(fresh) < 0.55
     assert explained(other) < 0.1

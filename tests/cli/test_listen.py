@@ -74,7 +74,7 @@ def test_nothing_is_surer_than_clips_can_show(folder):
     ("options", "said"),
     [
         (("--output", "CLIPS/model"), "lies in the folder of clips"),
-        (("--output", "model", "--method", "linear", "--batches", "10"), "--batches is for networks"),
+        (("--output", "model", "--method", "linear", "--batches", "10"), "--batches applies to networks"),
     ],
 )
 def test_what_is_not_begun(folder, tmp_path, capsys, options, said):

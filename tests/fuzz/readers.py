@@ -47,7 +47,7 @@ from jeit.touch.kohonen import Schedule, read_map, write_map
 from jeit.touch.learnt.presses import read_frames
 from jeit.touch.listening import LabelledClips, Listener
 from jeit.touch.networks import ImageNetwork, read_network, write_network
-from jeit.touch.networks.image_network import described
+from jeit.touch.networks.image_network import describe_skin
 from jeit.touch.networks.unrolled import Unrolled
 
 
@@ -430,7 +430,7 @@ def _gesture_model(folder):
 def _listener(folder):
     random = np.random.default_rng(0)
     labels = [name for name in MATERIALS for _ in range(5)]
-    clips = LabelledClips.of([struck(random, name) for name in labels], labels)
+    clips = LabelledClips.from_recordings([struck(random, name) for name in labels], labels)
     Listener.fit(clips, method="linear").write(folder / "a.jeit")
 
 
@@ -439,7 +439,7 @@ def _network(folder):
     layout = named_layout("grid-4x4", Rectangle(0.1, 0.1))
     skin = Skin.create(layout, num_layers=0, cell_size=9e-3)
     extent = tuple(map(float, skin.outline.extent))
-    made_for = described(skin.model.protocol, layout.centres, extent)
+    made_for = describe_skin(skin.model.protocol, layout.centres, extent)
     network = Unrolled(made_for["channels"], (12, 12), 2, key=jax.random.key(0))
     write_network(ImageNetwork(network, "unrolled", 5e-3, (12, 12), extent, 1e-4, made_for), folder / "a.jeit")
 

@@ -20,7 +20,7 @@ from jeit.live.views.learnt import DepthView, LearntSkinView
 from jeit.mesh import Rectangle
 from jeit.touch import LearntSkin, Presses, TouchImages, TouchWatch, learn_gestures
 from jeit.touch.networks import ImageNetwork, stream_depths
-from jeit.touch.networks.sensed import Sensed, centroids_of
+from jeit.touch.networks.linear_channels import LinearChannels, depth_centroids
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.simulate.contact.indent_sets import image_places, pixel_places
 
@@ -131,7 +131,7 @@ def network():
     """A network that is not trained, whose maps are linear images; and frames of its skin."""
     skin = Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=8e-3)
     plain = Unrolled(skin.model.protocol.num_measurements, SHAPE, key=jax.random.key(0))
-    places, sensed = image_places(skin, SHAPE[1], SHAPE[0]), Sensed.of(skin, SHAPE)
+    places, sensed = image_places(skin, SHAPE[1], SHAPE[0]), LinearChannels.from_skin(skin, SHAPE)
     linear = plain.of_skin(sensed, places, skin.layout.centres, 1.5e-3)
     near = np.linalg.norm(places - [0.02, 0.03], axis=-1).ravel() < 0.012
     change = np.stack([share * sensed.operator @ near for share in (0.0, 0.3, 0.6)])
@@ -152,7 +152,7 @@ def test_depths_are_those_of_the_stream(network):
         deep = one.depth.max() > imaging.floor
         assert len(picture.markers) == deep
         if deep:
-            middle = centroids_of(one.depth[None], pixel_places(imaging.extent, imaging.shape))[0]
+            middle = depth_centroids(one.depth[None], pixel_places(imaging.extent, imaging.shape))[0]
             np.testing.assert_allclose((picture.markers[0].x, picture.markers[0].y), middle)
     assert [one.status for one in made] == ["unchanged", "imaged", "imaged", "refused", "imaged", "refused"]
     assert np.linalg.norm(np.array((made[2].markers[0].x, made[2].markers[0].y)) - [0.02, 0.03]) < 0.01

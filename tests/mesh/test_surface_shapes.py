@@ -135,7 +135,7 @@ def test_a_bent_sheet_without_cuts_is_the_sheet():
 
 
 def test_a_closed_sleeve_is_another_body():
-    """Joined along its edge, a sheet conducts the other way round, too."""
+    """JoinedIndenters along its edge, a sheet conducts the other way round, too."""
     closed = tube(0.2 / (2 * np.pi), 0.1, num_around=40)
     angles = 2 * np.pi * np.arange(8) / 8
     radius = 0.2 / (2 * np.pi)

@@ -18,7 +18,7 @@ from jeit.acoustic.calibration.robust_least_squares import TapFit, fit_taps, sta
 from jeit.acoustic.calibration.usable_microphones import LeftOutTaps, check_received, leave_out, locate_left_out
 from jeit.acoustic.decay import DECAYS, AbstractDecay, find_decay
 from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.noise import IntensityNoise, below_nothing
+from jeit.acoustic.noise import IntensityNoise, noise_from_negative_powers
 from jeit.acoustic.signal.faults import describe_faults, intensity_faults
 from jeit.acoustic.signal.intensity import IntensitySettings, check_settings, tap_intensities
 from jeit.acoustic.signal.recording import Taps
@@ -33,7 +33,7 @@ AUTO = "auto"
 _LEAST_IMPROVEMENT = 0.05
 # Relative error of the intensities above which a note is given. On simulated skins with uneven coupling and exact
 # positions, the relative error is 18 to 21 %.
-_MUCH = 0.23
+_LARGE_ERROR = 0.23
 # Minimum fraction of the microphones with enough taps that must agree with the model, unless left-out taps are located
 # well. Otherwise the given positions are rejected.
 _LEAST_SHARE = 0.5
@@ -82,7 +82,7 @@ class CalibrationFit(eqx.Module):
         """Text that compares the localisation errors of the decay models for left-out taps; empty if unknown."""
         if not self.left_out:
             return ""
-        mine, *others = (_millimetres(off) for _, off in self.left_out)
+        mine, *others = (_distance_text(off) for _, off in self.left_out)
         names = [name for name, _ in self.left_out[1:]]
         beside = ", ".join(f"{name} {off}" for name, off in zip(names, others, strict=True))
         return f"locates taps left out of the fit to {mine}, median" + (f" ({beside})" if beside else "")
@@ -90,7 +90,7 @@ class CalibrationFit(eqx.Module):
     @property
     def note(self) -> str:
         """Text that suggests reasons for a large `error`; empty if the error is not large."""
-        if self.error <= _MUCH:
+        if self.error <= _LARGE_ERROR:
             return ""
         return (
             f"the models miss the recorded levels by {100 * self.error:.0f} %, and places are less certain. "
@@ -100,8 +100,8 @@ class CalibrationFit(eqx.Module):
         )
 
 
-def _millimetres(off: float) -> str:
-    return f"{1e3 * off:.1f} mm" if np.isfinite(off) else "refused"
+def _distance_text(distance: float) -> str:
+    return f"{1e3 * distance:.1f} mm" if np.isfinite(distance) else "refused"
 
 
 def calibrate_microphones(
@@ -128,11 +128,11 @@ def calibrate_microphones(
     """
     every = isinstance(decay, str) and decay == AUTO
     kinds = () if every else (find_decay(decay),)
-    fits, refused = calibrate_each(taps, kinds, place_error=place_error, intensity=intensity, progress=progress)
-    return choose(fits, refused)
+    fits, refused = fit_each_decay(taps, kinds, place_error=place_error, intensity=intensity, progress=progress)
+    return select_fit(fits, refused)
 
 
-def choose(fits: dict[str, CalibrationFit], refused: dict[str, str]) -> CalibrationFit:
+def select_fit(fits: dict[str, CalibrationFit], refused: dict[str, str]) -> CalibrationFit:
     """Select the fit that locates left-out taps best. Among fits with nearly equal errors, the one with the fewest
     parameters is selected. Raises `ValueError` if `fits` is empty; its message is the first reason in `refused`."""
     if not fits:
@@ -143,7 +143,7 @@ def choose(fits: dict[str, CalibrationFit], refused: dict[str, str]) -> Calibrat
 
 
 @np.errstate(all="ignore")  # models that do not fit are reported with a reason
-def calibrate_each(
+def fit_each_decay(
     taps: Taps,
     decays: Sequence[type[AbstractDecay]] = (),
     *,
@@ -166,12 +166,12 @@ def calibrate_each(
     report = progress or (lambda step: None)
     if taps.samples is not None:
         report("measure intensities")
-    readings = _read(taps, intensity, place_error)
+    readings = _read_taps(taps, intensity, place_error)
     found, refused = {}, {}
     for kind in decays or DECAYS.values():
         report(f"fit {kind.name}")
         try:
-            found[kind.name] = _fit(kind, readings)
+            found[kind.name] = _fit_decay_model(kind, readings)
         except _NoFitError as error:
             refused[kind.name] = str(error)
     left_out = {name: fitted.left.median for name, fitted in found.items()} | dict.fromkeys(refused, np.inf)
@@ -182,7 +182,7 @@ def calibrate_each(
     return fits, refused
 
 
-class _Readings(NamedTuple):
+class _FitInput(NamedTuple):
     """Input of a fit: positions and intensities of the taps, and the noise of the microphones.
 
     **Fields**: `microphones`, `places`: positions of microphones and taps in metres; `surface`: the surface;
@@ -202,7 +202,7 @@ class _Readings(NamedTuple):
     settings: IntensitySettings | None
 
 
-class _Fitted(NamedTuple):
+class _FittedModel(NamedTuple):
     """Result of the fit of one decay model.
 
     **Fields**: `fit`: the fit; `tried`: mask of the readings used in the first fit, of all microphones; `good`: mask of
@@ -222,23 +222,23 @@ class _NoFitError(Exception):
     """Raised if a decay model cannot be fitted to the taps. The message gives the reason."""
 
 
-def _read(taps: Taps, intensity: IntensitySettings | None, place_error: float) -> _Readings:
+def _read_taps(taps: Taps, intensity: IntensitySettings | None, place_error: float) -> _FitInput:
     surface = make_surface(taps.outline, taps.positions)
     settings = None
     if taps.samples is None:
         assert taps.power is not None
         power, (usable, faults) = taps.power, intensity_faults(taps.power)
-        noise = IntensityNoise.create(power.shape[1], deviation=below_nothing(power, usable))
+        noise = IntensityNoise.create(power.shape[1], deviation=noise_from_negative_powers(power, usable))
     else:
         settings = intensity if intensity is not None else IntensitySettings()
         power, floor, freedom, usable, faults = tap_intensities(taps, settings)
         noise = IntensityNoise.create(power.shape[1], floor=floor, freedom=np.median(freedom))
     known = np.where(usable, power, np.nan).T
     noisy = noise, settings is not None, tuple(faults), settings
-    return _Readings(taps.microphones, surface, taps.positions, float(place_error), known, *noisy)
+    return _FitInput(taps.microphones, surface, taps.positions, float(place_error), known, *noisy)
 
 
-def _fit(kind: type[AbstractDecay], readings: _Readings) -> _Fitted:
+def _fit_decay_model(kind: type[AbstractDecay], readings: _FitInput) -> _FittedModel:
     """Fit one decay model to all microphones. Raises `_NoFitError` if too few microphones received the taps or agree
     with the model."""
     distance = np.linalg.norm(readings.microphones[:, None] - readings.places, axis=-1)
@@ -250,16 +250,16 @@ def _fit(kind: type[AbstractDecay], readings: _Readings) -> _Fitted:
     tried = fit.use.T
     fit, good, reasons, explained = leave_out(fit, readings.faults)
     left = locate_left_out(fit, readings.microphones, readings.surface, readings.places)
-    if good.sum() < 3 or (good.sum() < _LEAST_SHARE * enough.sum() and not left.located):
+    if good.sum() < 3 or (good.sum() < _LEAST_SHARE * enough.sum() and not left.is_better_than_mean):
         raise _NoFitError(
             f"only {good.sum()} of the {enough.sum()} microphones that received the taps follow a decay model, and "
             "three are needed, or half: are the rows of positions in the order of the taps, those of microphones in "
             f"the order of the channels? {describe_faults(reasons)}."
         )
-    return _Fitted(fit, tried, good, reasons, explained, left)
+    return _FittedModel(fit, tried, good, reasons, explained, left)
 
 
-def _calibration_fit(taps: Taps, readings: _Readings, fitted: _Fitted, notes) -> CalibrationFit:
+def _calibration_fit(taps: Taps, readings: _FitInput, fitted: _FittedModel, notes) -> CalibrationFit:
     fit, good = fitted.fit, fitted.good
     # Logarithm of the common factor of gains and strengths, according to the convention of `Calibration`.
     gain = np.log(np.asarray(fit.kind.from_logarithms(host.asarray(fit.logarithms)).gain))[good].mean()
@@ -276,7 +276,7 @@ def _calibration_fit(taps: Taps, readings: _Readings, fitted: _Fitted, notes) ->
         errors,
         readings.settings,
         taps.name,
-        _range(strength[loud]),
+        _strength_range(strength[loud]),
         fitted.left.widening,
     )
     rest = strength, fit.outlier, fitted.explained, shared, fit.displacement, notes
@@ -284,7 +284,7 @@ def _calibration_fit(taps: Taps, readings: _Readings, fitted: _Fitted, notes) ->
     return CalibrationFit(calibration, distance, readings.power.T, fitted.tried, *rest)
 
 
-def _range(strength: np.ndarray) -> tuple[float, float] | None:
+def _strength_range(strength: np.ndarray) -> tuple[float, float] | None:
     """Strengths of the weakest and the strongest tap; None if no strength is known."""
     known = strength[strength > 0]
     return (float(known.min()), float(known.max())) if known.size else None

@@ -69,7 +69,7 @@ class Calibration(eqx.Module):
 
     def save(self, path: str | Path) -> None:
         """Write the calibration to a JSON file, which includes the format version and the units."""
-        text = json.dumps(self._content(), indent=1, ensure_ascii=False, allow_nan=False)
+        text = json.dumps(self._to_json(), indent=1, ensure_ascii=False, allow_nan=False)
         with written_whole(path) as file:
             file.write(f"{text}\n".encode())
 
@@ -102,14 +102,14 @@ class Calibration(eqx.Module):
         except ValueError as error:
             raise ValueError(faults_message(name, [str(error)])) from None
 
-    def _content(self) -> dict[str, Any]:
+    def _to_json(self) -> dict[str, Any]:
         microphone_array = on_host(self.microphone_array)
         surface: dict[str, Any] = {
-            "outline": _list(microphone_array.surface.outline.vertices),
-            "holes": [_list(hole) for hole in microphone_array.surface.outline.holes],
+            "outline": _array_to_lists(microphone_array.surface.outline.vertices),
+            "holes": [_array_to_lists(hole) for hole in microphone_array.surface.outline.holes],
         }
         if isinstance(microphone_array.surface, CurvedSurface):
-            surface["curve"] = {key: _list(getattr(microphone_array.surface, key)) for key in _CURVE}
+            surface["curve"] = {key: _array_to_lists(getattr(microphone_array.surface, key)) for key in _CURVE}
         kind = type(microphone_array.decay)
         microphones = []
         for number in range(self.num_microphones):
@@ -117,9 +117,9 @@ class Calibration(eqx.Module):
             errors = dict(zip(kind.parameters, self.standard_errors[:, number], strict=True))
             microphones.append(
                 {
-                    "position": _list(microphone_array.microphones[number]),
+                    "position": _array_to_lists(microphone_array.microphones[number]),
                     **parameters,
-                    "relative_standard_error": {key: _number(error) for key, error in errors.items()},
+                    "relative_standard_error": {key: _number_or_none(error) for key, error in errors.items()},
                     "relative_noise": float(microphone_array.noise.relative[number]),
                     "noise_floor": float(microphone_array.noise.floor[number]),
                     "noise_deviation": float(microphone_array.noise.deviation[number]),
@@ -147,7 +147,7 @@ class Calibration(eqx.Module):
 
     @classmethod
     def _from_table(cls, table: CalibrationTable) -> Calibration:
-        each, kind, surface = table.microphones, DECAYS[table.decay], _surface(table.surface)
+        each, kind, surface = table.microphones, DECAYS[table.decay], _surface_from_table(table.surface)
         for number, one in enumerate(each):
             if len(one.position) != surface.dimension:
                 raise ValueError(
@@ -186,12 +186,12 @@ class Calibration(eqx.Module):
             np.array([[math.nan if value is None else value for value in row] for row in errors]),
             None if settings is None else IntensitySettings(**settings.model_dump()),
             table.name,
-            None if table.strengths is None else _strengths(table.strengths),
+            None if table.strengths is None else _check_strengths(table.strengths),
             table.widening,
         )
 
 
-def _surface(table: SurfaceTable) -> AbstractSurface:
+def _surface_from_table(table: SurfaceTable) -> AbstractSurface:
     check_extent(table.outline, "surface.outline")
     outline, curve = Polygon(table.outline, table.holes), table.curve
     if curve is None:
@@ -203,16 +203,16 @@ def _surface(table: SurfaceTable) -> AbstractSurface:
     return CurvedSurface(outline, *(as_array(getattr(curve, key)) for key in _CURVE))
 
 
-def _strengths(given: np.ndarray) -> tuple[float, float]:
-    low, high = map(float, given)
+def _check_strengths(strengths: np.ndarray) -> tuple[float, float]:
+    low, high = map(float, strengths)
     if low > high:
         raise ValueError(f"strengths are {low:g} and {high:g}; give the weaker first.")
     return low, high
 
 
-def _list(array) -> list:
+def _array_to_lists(array) -> list:
     return np.asarray(array).tolist()
 
 
-def _number(value) -> float | None:
+def _number_or_none(value) -> float | None:
     return float(value) if np.isfinite(value) else None

@@ -25,7 +25,7 @@ _MOST_STEPS = 100
 # Maximum change of the logarithm of a strength in a step.
 _LONGEST_STEP = 3.0
 # Maximum number of iterations in which parameters are fixed at their bounds or released.
-_MOST_HELD = 6
+_MOST_ACTIVE_SET_STEPS = 6
 # The tolerance `atol`, in the unit of the cost, ends the fit once the data are fitted to rounding error.
 _SOLVER = Descent(rtol=1e-10, atol=1e-20, damping=1e-2, history=1)
 
@@ -131,11 +131,11 @@ def fit_together(
     def expand(unknowns, _):
         cost, system = _normal_equations(problem, *unpack(unknowns), free)
 
-        def step(damping):
-            change, shift = _step(system, damping)
+        def solve_step(damping):
+            change, shift = _solve_step(system, damping)
             slope = np.sum(system.gradient * change) + system.tap_gradient @ shift
             inner = np.einsum("km,lm,mkl->", change, change, system.matrix)
-            inner += np.einsum("km,kmn,kn->", change, system.ties, change)
+            inner += np.einsum("km,kmn,kn->", change, system.penalty, change)
             across = 2 * np.einsum("km,kmt,t->", change, system.coupling, shift, optimize=True)
             return (
                 np.concatenate([change.ravel(), shift]),
@@ -143,7 +143,7 @@ def fit_together(
                 inner + across + np.sum(system.tap_matrix * shift**2),
             )
 
-        return cost, step
+        return cost, solve_step
 
     return unpack(_SOLVER.at_once(expand, np.concatenate([start.ravel(), strength]), None, _MOST_STEPS)[0])
 
@@ -163,7 +163,7 @@ def fit_within(
     lower, upper = (bound[:, None] for bound in bounds)
     held = ((start <= lower) | (start >= upper)) & received
     values = start
-    for _ in range(_MOST_HELD):
+    for _ in range(_MOST_ACTIVE_SET_STEPS):
         slope = _normal_equations(problem, values, strength, received & np.ones_like(held))[1].gradient
         inwards = np.where(values <= lower, slope < 0, slope > 0)
         held &= ~inwards
@@ -185,7 +185,7 @@ def log_covariance(
     by the condition `scale` · values = constant, with `scale` (P M,). Entries of values that are not `free` (P, M) are
     NaN.
     """
-    schur = _schur(_normal_equations(problem, values, strength, free)[1], 0.0)
+    schur = _schur_complement(_normal_equations(problem, values, strength, free)[1], 0.0)
     number, count = values.shape
     kept = np.asarray(free).ravel()
     shift = np.concatenate([np.ones(count), np.zeros((number - 1) * count)])[kept]
@@ -199,17 +199,17 @@ def log_covariance(
     return result
 
 
-class _System(NamedTuple):
+class _NormalEquations(NamedTuple):
     """Normal equations of the least-squares problem.
 
-    **Fields**: `matrix`: block (M, P, P) of each microphone; `ties`: matrices (P, M, M) of the penalty, which couple
+    **Fields**: `matrix`: block (M, P, P) of each microphone; `penalty`: matrices (P, M, M) of the penalty, which couple
     the microphones; `coupling`: block (P, M, T) between values and strengths; `tap_matrix`: diagonal (T,) of the
     strengths; `gradient`, `tap_gradient`: gradients with respect to values (P, M) and strengths (T,); `free`: mask
     (P, M) of the fitted values.
     """
 
     matrix: np.ndarray
-    ties: np.ndarray
+    penalty: np.ndarray
     coupling: np.ndarray
     tap_matrix: np.ndarray
     gradient: np.ndarray
@@ -217,16 +217,16 @@ class _System(NamedTuple):
     free: np.ndarray
 
 
-def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[np.ndarray, _System]:
+def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[np.ndarray, _NormalEquations]:
     off, share, jacobian = problem.expand(values, strengths)
     weight = problem.weight
-    ties = _ties(problem)
+    ties = _penalty_matrices(problem)
     pulled = np.einsum("kmn,kn->km", ties, values)
     jacobian = np.where(free[:, :, None], jacobian, 0.0)
     weighted = weight * jacobian
-    system = _System(
+    system = _NormalEquations(
         matrix=np.einsum("kmt,lmt->mkl", weighted, jacobian),
-        ties=ties * (free[:, :, None] & free[:, None]),
+        penalty=ties * (free[:, :, None] & free[:, None]),
         coupling=weighted * share,
         tap_matrix=np.sum(weight * share**2, axis=0),
         gradient=np.where(free, pulled, 0.0) - np.sum(weighted * off, axis=-1),
@@ -236,7 +236,7 @@ def _normal_equations(problem: DecayProblem, values, strengths, free) -> tuple[n
     return 0.5 * np.sum(weight * off**2) + 0.5 * np.sum(values * pulled), system
 
 
-def _ties(problem: DecayProblem) -> Float[np.ndarray, "P M M"]:
+def _penalty_matrices(problem: DecayProblem) -> Float[np.ndarray, "P M M"]:
     """Matrices (P, M, M) of the penalties Σ_m (v_m − v̄)² / spread², where v̄ is the mean over the microphones with at
     least one reading of nonzero weight, or 0 for displacements."""
     received = (problem.weight > 0).any(axis=1).astype(float)
@@ -245,10 +245,10 @@ def _ties(problem: DecayProblem) -> Float[np.ndarray, "P M M"]:
     return (np.diag(received) - tied[:, None, None] * mean) / problem.spread[:, None, None] ** 2
 
 
-def _step(system: _System, damping):
+def _solve_step(system: _NormalEquations, damping):
     number, count = system.gradient.shape
     diagonal = _tap_diagonal(system, damping)
-    schur = _schur(system, damping)
+    schur = _schur_complement(system, damping)
     # Two things are held fixed: the undetermined direction, in which all gains increase and all strengths decrease; and
     # parameters that are not free.
     shift = np.concatenate([np.where(system.free[0], 1.0, 0.0), np.zeros((number - 1) * count)])
@@ -261,17 +261,17 @@ def _step(system: _System, damping):
     return change, shifts
 
 
-def _tap_diagonal(system: _System, damping):
+def _tap_diagonal(system: _NormalEquations, damping):
     return np.where(system.tap_matrix > 0, system.tap_matrix * (1 + damping), 1.0)
 
 
-def _schur(system: _System, damping):
+def _schur_complement(system: _NormalEquations, damping):
     number, count = system.gradient.shape
     size = number * count
     blocks = system.matrix * (1 + damping * np.eye(number))
     index, full = np.arange(count), np.zeros((number, count, number, count))
     full[:, index, :, index] = blocks
     parameter = np.arange(number)
-    full[parameter, :, parameter] += system.ties
+    full[parameter, :, parameter] += system.penalty
     coupling = system.coupling.reshape(size, -1)
     return full.reshape(size, size) - (coupling / _tap_diagonal(system, damping)) @ coupling.T

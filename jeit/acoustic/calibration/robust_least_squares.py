@@ -22,15 +22,15 @@ from scipy.spatial import KDTree
 
 from jeit.acoustic.calibration.decay_fit import DecayProblem, fit_strengths, fit_within, log_covariance
 from jeit.acoustic.decay import AbstractDecay
-from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, below_nothing
+from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, noise_from_negative_powers
 from jeit_solvers.engines import host, on_host, slopes
 
 # Residuals larger than this number of standard deviations are excluded from the noise estimate.
-_BEYOND = 4.0
+_OUTLIER_DEVIATIONS = 4.0
 # Weight of the median over all microphones in the noise estimate of one microphone, as a number of taps.
-_DRAWN = 20.0
+_MEDIAN_WEIGHT = 20.0
 # Minimum number of taps for an estimate of the additive noise.
-_FEW = 8
+_FEWEST_TAPS = 8
 
 
 def relative_errors(
@@ -56,15 +56,15 @@ def relative_errors(
         signal, off = received[k, used], residual[k, used]
         share = (signal / (signal + floor[k])) ** 2
         other = (cross[k] * signal + rest[k] ** 2) / (signal + floor[k]) ** 2
-        near = np.abs(off) <= _BEYOND * max(1.4826 * np.median(np.abs(off)), 1e-15)
+        near = np.abs(off) <= _OUTLIER_DEVIATIONS * max(1.4826 * np.median(np.abs(off)), 1e-15)
         for _ in range(3):
-            near = np.abs(off) <= _BEYOND * np.sqrt(np.mean(off[near] ** 2))
+            near = np.abs(off) <= _OUTLIER_DEVIATIONS * np.sqrt(np.mean(off[near] ** 2))
         seen[k] = near.sum()
         excess[k] = (inflation * np.mean(off[near] ** 2) - np.mean(other[near])) / np.mean(share[near])
     if not seen.any():
         return np.full(len(received), 0.5)
     typical = max(float(np.median(excess[seen > 0])), 0.0)
-    drawn = (seen * np.minimum(excess, 1.0) + _DRAWN * typical) / (seen + _DRAWN)
+    drawn = (seen * np.minimum(excess, 1.0) + _MEDIAN_WEIGHT * typical) / (seen + _MEDIAN_WEIGHT)
     return np.sqrt(np.maximum(drawn, LEAST_RELATIVE**2))
 
 
@@ -83,24 +83,24 @@ def additive_deviations(
     coarse = np.concatenate([[0.0], np.geomspace(1e-6, 0.5, 18)])
     scatter = np.geomspace(LEAST_RELATIVE, 1.0, 30)
     for k in range(len(received)):
-        if use[k].sum() < _FEW:
+        if use[k].sum() < _FEWEST_TAPS:
             continue
         read, signal = power[k, use[k]], received[k, use[k]]
         top = np.abs(read).max()
         if top == 0:
             continue
 
-        def score(shares, read=read, signal=signal, top=top):
+        def log_likelihood(shares, read=read, signal=signal, top=top):
             trial = (scatter[:, None, None] * signal) ** 2 + (top * shares[:, None]) ** 2 + 1e-30 * top**2
-            ratio = np.minimum(inflation * (read - signal) ** 2 / trial, _BEYOND**2)
+            ratio = np.minimum(inflation * (read - signal) ** 2 / trial, _OUTLIER_DEVIATIONS**2)
             return np.sum(ratio + np.log(trial), axis=-1).min(axis=0)
 
-        scores = score(coarse)
+        scores = log_likelihood(coarse)
         best = int(scores.argmin())
         if scores[best] < scores[0] - 6:
             near = coarse[best] * np.geomspace(0.5, 2.0, 9)
-            deviation[k] = top * near[score(near).argmin()]
-    judged = use.sum(axis=1) >= _FEW
+            deviation[k] = top * near[log_likelihood(near).argmin()]
+    judged = use.sum(axis=1) >= _FEWEST_TAPS
     typical = float(np.median(deviation[judged])) if judged.any() else 0.0
     return np.where(judged, np.maximum(deviation, 0.5 * typical), deviation)
 
@@ -108,16 +108,16 @@ def additive_deviations(
 # Maximum number of iterations of the fit with a shared shape, and of the fit with individual shapes.
 _ALTERNATIONS, _REWEIGHTINGS = 6, 12
 # Degrees of freedom of Student's t distribution, from which the weights of the residuals are derived.
-_TAIL = 5.0
+_T_FREEDOM = 5.0
 # Ratio of the mean square residual of a tap to the median over all taps above which the tap is excluded.
-_OUTLIER = 12.0
+_OUTLIER_RATIO = 12.0
 # Standard deviation of the logarithms of the shape parameters over the array: in the fit with a shared shape; initially
 # in the fit with individual shapes; its minimum; its maximum.
 _ALIKE, _FIRST, _LEAST, _MOST = 0.03, 0.5, 0.1, 1.0
 # Maximum displacement of a microphone along each coordinate, in units of `place_error`.
-_FARTHEST = 4.0
+_MOST_DISPLACEMENT = 4.0
 # Relative standard error of the shape at or above which a microphone's own taps are considered not to determine it.
-_LOOSE = 0.5
+_UNDETERMINED_ERROR = 0.5
 
 
 class TapFit(eqx.Module):
@@ -195,7 +195,7 @@ class TapFit(eqx.Module):
         """
         alone = np.where(np.arange(len(self.spread)) == 1, np.inf, self.spread)
         own = standard_errors(replace(self, spread=alone))[1]
-        return self.usable.any(axis=1) & ~self.held[1] & ~(own < _LOOSE)
+        return self.usable.any(axis=1) & ~self.held[1] & ~(own < _UNDETERMINED_ERROR)
 
     @property
     def level(self) -> Float[np.ndarray, "M T"]:
@@ -229,7 +229,7 @@ def fit_taps(
     spacing = float(np.median(KDTree(microphones).query(microphones, k=2)[0][:, 1])) if len(microphones) > 1 else 0.0
     moves = offset.shape[2] if place_error > 0 else 0
     low, high = kind.bounds(extent)
-    lower, upper = np.array([*low, *[-_FARTHEST] * moves]), np.array([*high, *[_FARTHEST] * moves])
+    lower, upper = np.array([*low, *[-_MOST_DISPLACEMENT] * moves]), np.array([*high, *[_MOST_DISPLACEMENT] * moves])
     start = np.asarray(kind.start(spacing if spacing > 0 else extent / 4, len(microphones)).logarithms())
     start = np.concatenate([start, np.zeros((moves, len(microphones)))])
     shapes, taps = len(kind.parameters) - 1, len(places)
@@ -242,7 +242,7 @@ def fit_taps(
         known_noise,
         values=np.clip(start, lower[:, None], upper[:, None]),
         held=np.zeros(start.shape, bool),
-        spread=_spread(np.full(shapes, _ALIKE), np.full(moves, _ALIKE)),
+        spread=_prior_spread(np.full(shapes, _ALIKE), np.full(moves, _ALIKE)),
         strength=np.zeros(taps),
         weight=np.zeros(power.shape),
         outlier=np.zeros(taps, bool),
@@ -260,13 +260,15 @@ def fit_taps(
         # The relative error of the initial model is assumed to be at least 20 %.
         weight=1 / np.maximum(_level_variance(fit, np.nan_to_num(np.maximum(power, 0.0))), 0.04),
     )
-    fit = _refine(fit, _ALTERNATIONS)
-    return _refine(replace(fit, spread=_spread(np.full(shapes, _FIRST), np.ones(moves))), _REWEIGHTINGS, scattered=True)
+    fit = _alternate(fit, _ALTERNATIONS)
+    return _alternate(
+        replace(fit, spread=_prior_spread(np.full(shapes, _FIRST), np.ones(moves))), _REWEIGHTINGS, update_spread=True
+    )
 
 
-def refit_without(fit: TapFit, bad: Bool[np.ndarray, " M"]) -> TapFit:
-    """Repeat the fit without the microphones in the mask `bad`."""
-    return _refine(replace(fit, dropped=fit.dropped | bad), _REWEIGHTINGS, scattered=True)
+def refit_without(fit: TapFit, excluded: Bool[np.ndarray, " M"]) -> TapFit:
+    """Repeat the fit without the microphones in the mask `excluded`."""
+    return _alternate(replace(fit, dropped=fit.dropped | excluded), _REWEIGHTINGS, update_spread=True)
 
 
 def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
@@ -285,29 +287,29 @@ def standard_errors(fit: TapFit) -> Float[np.ndarray, "P M"]:
     return np.sqrt(np.maximum(np.diag(covariance), 0)).reshape(free.shape)
 
 
-def _refine(fit: TapFit, rounds: int, *, scattered: bool = False) -> TapFit:
+def _alternate(fit: TapFit, iterations: int, *, update_spread: bool = False) -> TapFit:
     """Alternate between the fit of all microphones and the re-estimation of noise and weights, until convergence or for
-    `rounds` iterations. If `scattered`, the `spread` of the parameters is also re-estimated."""
-    for _ in range(rounds):
+    `iterations` iterations. If `update_spread`, the `spread` of the parameters is also re-estimated."""
+    for _ in range(iterations):
         before, received = fit.values, np.asarray(fit.usable.any(axis=1))
         values, strength, held = fit_within(fit.problem(), before, fit.strength, received, fit.bounds)
         fit = replace(fit, values=values, strength=strength, held=held)
         strength = fit_strengths(fit.problem(with_outliers=True), fit.values, fit.strength)
         fit = _reweight(replace(fit, strength=strength))
-        if scattered:
-            fit = replace(fit, spread=_scatter(fit))
+        if update_spread:
+            fit = replace(fit, spread=_update_spread(fit))
         if np.abs(fit.values - before)[fit.free].max(initial=0.0) < 1e-9:
             break
     return fit
 
 
-def _spread(shapes, moves) -> Float[np.ndarray, " P"]:
-    """Spread (P,) of all values from that of the `shapes` and of the displacements (`moves`); infinite for the gain,
-    which has no prior."""
-    return np.concatenate([[np.inf], shapes, moves])
+def _prior_spread(shapes, displacements) -> Float[np.ndarray, " P"]:
+    """Spread (P,) of all values from that of the `shapes` and of the displacements (`displacements`); infinite for the
+    gain, which has no prior."""
+    return np.concatenate([[np.inf], shapes, displacements])
 
 
-def _scatter(fit: TapFit) -> Float[np.ndarray, " P"]:
+def _update_spread(fit: TapFit) -> Float[np.ndarray, " P"]:
     """Update the spread of the shape parameters over the array, and that of the displacements, by one step of
     expectation maximisation, from the estimates and their standard errors."""
     known = fit.usable.any(axis=1)
@@ -321,7 +323,7 @@ def _scatter(fit: TapFit) -> Float[np.ndarray, " P"]:
     square = (near**2 + errors[1:count] ** 2).sum(axis=1) / (known.sum() - 1)
     # The displacements have one spread, which is at most `place_error`.
     moved = np.full(len(moves), (moves**2 + errors[count:] ** 2).mean() if moves.size else 0.0)
-    return _spread(*(np.clip(np.sqrt(one), _LEAST, _MOST) for one in (square, moved)))
+    return _prior_spread(*(np.clip(np.sqrt(one), _LEAST, _MOST) for one in (square, moved)))
 
 
 def _reweight(fit: TapFit) -> TapFit:
@@ -335,20 +337,20 @@ def _reweight(fit: TapFit) -> TapFit:
     if not fit.known_noise:
         use = np.isfinite(fit.power) & ~fit.outlier
         deviation = additive_deviations(fit.power, received, use, inflation)
-        betrayed = below_nothing(fit.power.T, np.isfinite(fit.power.T))
+        betrayed = noise_from_negative_powers(fit.power.T, np.isfinite(fit.power.T))
         fit = replace(
             fit, noise=on_host(IntensityNoise.create(len(received), deviation=np.maximum(deviation, betrayed)))
         )
     relative = relative_errors(fit.noise, received, _residual_of_equals(fit, received), fit.use, inflation)
     fit = replace(fit, noise=replace(fit.noise, relative=relative))
     residual = np.where(fit.usable, fit.level - expected, 0.0)
-    square = residual**2 / np.maximum(_variance(fit, np.maximum(received, 1e-150)), LEAST_RELATIVE**2)
+    square = residual**2 / np.maximum(_power_variance(fit, np.maximum(received, 1e-150)), LEAST_RELATIVE**2)
     usable = fit.usable
     level = np.minimum(square, 100.0).sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
     typical = max(float(np.median(level[usable.any(axis=0)])), 1e-6)
-    fit = replace(fit, outlier=level > _OUTLIER * max(typical, 0.2))
+    fit = replace(fit, outlier=level > _OUTLIER_RATIO * max(typical, 0.2))
     variance = _level_variance(fit, received)
-    return replace(fit, weight=(_TAIL + 1) / (_TAIL + residual**2 / variance) / variance)
+    return replace(fit, weight=(_T_FREEDOM + 1) / (_T_FREEDOM + residual**2 / variance) / variance)
 
 
 def _residual_of_equals(fit: TapFit, received: np.ndarray) -> Float[np.ndarray, "M T"]:
@@ -368,8 +370,8 @@ def _level_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
     """Variance (M, T) of the levels for the expected power `received`, which is bounded from below so that all weights
     are finite."""
     floor = 1e-6 * np.nanmax(np.where(fit.use, fit.power, np.nan), axis=1, initial=1e-300)[:, None]
-    return _variance(fit, np.maximum(received, floor))
+    return _power_variance(fit, np.maximum(received, floor))
 
 
-def _variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
+def _power_variance(fit: TapFit, received: np.ndarray) -> np.ndarray:
     return np.asarray(fit.noise.level_variance(host.asarray(received)))

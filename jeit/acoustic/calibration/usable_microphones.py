@@ -25,16 +25,16 @@ from jeit.acoustic.localisation.localiser import Localiser
 from jeit.acoustic.localisation.pixels import Pixels, valleys
 from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.signal.faults import describe_faults
-from jeit.acoustic.surface import AbstractSurface, bounding_box, in_space, longer_side
+from jeit.acoustic.surface import AbstractSurface, bounding_box, longer_side, to_space
 from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import as_array, at_once, host, namespace, on_device
 
 # Minimum fraction of the variance of a microphone's levels that its model must explain.
 _LEAST_EXPLAINED = 0.3
 # Maximum ratio of a microphone's relative error to the median over all microphones, and lower bound of that median.
-_UNLIKE, _WELL = 2.5, 0.1
+_MOST_ERROR_RATIO, _LEAST_MEDIAN_ERROR = 2.5, 0.1
 # Minimum decrease of the logarithm of a response from the nearest to the farthest tap.
-_FLAT = 0.1
+_LEAST_DECREASE = 0.1
 
 
 def check_received(
@@ -62,22 +62,22 @@ def leave_out(fit: TapFit, faults) -> tuple[TapFit, Bool[np.ndarray, " M"], tupl
     Returns the new fit, the mask of the usable microphones, the reasons why microphones are unusable ("" for usable
     ones), and the fraction of variance that each model explains.
     """
-    reasons, explained = _judge(fit, faults)
+    reasons, explained = _reasons_and_explained(fit, faults)
     bad = np.array([bool(reason) for reason in reasons])
     # The disagreement of some microphones may become apparent only after others are excluded.
     while bad.any() and (~fit.dropped & ~bad).sum() >= 3:
         fit = refit_without(fit, bad)
-        again, explained = _judge(fit, ("",) * len(bad), explained)
+        again, explained = _reasons_and_explained(fit, ("",) * len(bad), explained)
         bad = np.array([bool(reason) for reason in again]) & ~fit.dropped
         reasons = tuple(new if worse else old for new, old, worse in zip(again, reasons, bad, strict=True))
     return fit, ~fit.dropped & ~bad, reasons, explained
 
 
-def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
+def _reasons_and_explained(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[np.ndarray, " M"]]:
     """Return the reason why each microphone is unusable ("" if usable), and the fraction of the variance of its levels
     that its model explains. For excluded microphones this fraction is taken from `explained`."""
     expected, level, use = fit.expected(), fit.level, fit.use
-    falls = _falls(fit)
+    falls = _response_decrease(fit)
     needed = len(fit.kind.parameters) + 2
     deviation, relative = fit.noise.deviation, fit.noise.relative
     typical = float(np.median(relative[use.any(axis=1)])) if use.any() else 0.0
@@ -91,13 +91,13 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
             continue
         spread = np.var(level[k, used])
         share[k] = 1 - np.mean((level - expected)[k, used] ** 2) / spread if spread > 0 else 0.0
-        if falls[k] < _FLAT:
+        if falls[k] < _LEAST_DECREASE:
             reasons.append("what it hears does not fall with distance")
         elif used.sum() >= needed and not share[k] >= _LEAST_EXPLAINED:
             reasons.append(f"its model explains {100 * max(share[k], 0):.0f} % of what it received")
         elif received < needed:
             reasons.append(f"it received {received} of the taps only, and {needed} are needed")
-        elif relative[k] > _UNLIKE * max(typical, _WELL):
+        elif relative[k] > _MOST_ERROR_RATIO * max(typical, _LEAST_MEDIAN_ERROR):
             reasons.append(
                 f"its model is off by {100 * relative[k]:.0f} %, and those of others by {100 * typical:.0f} %: is it "
                 "where it is said to be, and was its gain the same throughout?"
@@ -107,7 +107,7 @@ def _judge(fit: TapFit, faults, explained=None) -> tuple[tuple[str, ...], Float[
     return tuple(reasons), share
 
 
-def _falls(fit: TapFit) -> Float[np.ndarray, " M"]:
+def _response_decrease(fit: TapFit) -> Float[np.ndarray, " M"]:
     """Decrease of the logarithm of each microphone's response from the nearest tap to the farthest."""
     response, use = fit.problem().log_response(fit.values), fit.use
     most, least = (
@@ -117,13 +117,13 @@ def _falls(fit: TapFit) -> Float[np.ndarray, " M"]:
 
 
 # Number of folds in the cross-validation.
-_PARTS = 4
+_NUM_FOLDS = 4
 # Minimum relative error assumed when a raster is screened; maximum number of steps of a minimisation.
 _SCREENED_AT, _MOST_STEPS = 0.2, 30
 # Minimum number of located taps for an estimate of `widening`; fraction of the taps that the error ellipses must
 # contain; quantile of χ² with two degrees of freedom for that fraction.
-_FEWEST, _MOST_OF_THEM = 10, 0.9
-_CHI_SQUARE = -2 * math.log(1 - _MOST_OF_THEM)
+_FEWEST, _CONTAINED_SHARE = 10, 0.9
+_CHI_SQUARE = -2 * math.log(1 - _CONTAINED_SHARE)
 
 
 class LeftOutTaps(NamedTuple):
@@ -151,10 +151,10 @@ class LeftOutTaps(NamedTuple):
         known = self.square[np.isfinite(self.square)]
         if known.size < _FEWEST:
             return 1.0
-        return max(float(np.quantile(known, _MOST_OF_THEM)) / _CHI_SQUARE, 1.0)
+        return max(float(np.quantile(known, _CONTAINED_SHARE)) / _CHI_SQUARE, 1.0)
 
     @property
-    def located(self) -> bool:
+    def is_better_than_mean(self) -> bool:
         """Whether the median error is less than half of `guess`, the error of always guessing the mean position."""
         return self.median < 0.5 * self.guess
 
@@ -164,9 +164,9 @@ def locate_left_out(
 ) -> LeftOutTaps:
     """Locate each tap with decay models and displacements fitted to taps in other folds, and with the noise of the fit
     to all taps. `microphones`: given positions."""
-    part = _deal(places)
+    part = _assign_folds(places)
     off, square = np.full((2, len(places)), np.nan)
-    coarse = Localiser.create(_array(fit, fit.values, microphones, surface)).coarse
+    coarse = Localiser.create(_microphone_array(fit, fit.values, microphones, surface)).coarse
     for k in range(int(part.max()) + 1):
         out = (part == k) & ~fit.outlier
         kept = replace(fit, outlier=fit.outlier | (part == k))
@@ -175,8 +175,8 @@ def locate_left_out(
         if not out.any() or not (use.sum(axis=0) >= 3).any():
             continue
         values, _, _ = fit_within(kept.problem(), fit.values, fit.strength, received, fit.bounds)
-        array = _array(fit, values, microphones, surface)
-        found, covariance = at_once(_most_likely, array, coarse, np.nan_to_num(fit.power[:, out]), use)
+        array = _microphone_array(fit, values, microphones, surface)
+        found, covariance = at_once(_locate_most_likely, array, coarse, np.nan_to_num(fit.power[:, out]), use)
         offset = found - places[out]
         # The pseudoinverse is used, since the covariance on a curved surface is singular.
         known = np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(offset).all(axis=1) & (use.sum(axis=0) >= 3)
@@ -187,13 +187,13 @@ def locate_left_out(
     return LeftOutTaps(off, square, guess)
 
 
-def _array(fit: TapFit, values, microphones, surface: AbstractSurface) -> MicrophoneArray:
+def _microphone_array(fit: TapFit, values, microphones, surface: AbstractSurface) -> MicrophoneArray:
     decay = on_device(fit.kind.from_logarithms(host.asarray(values[: len(fit.kind.parameters)])))
     displaced = microphones + fit.problem().displacement(values)
     return MicrophoneArray(as_array(displaced), surface, decay, on_device(fit.noise))
 
 
-def _most_likely(array: MicrophoneArray, coarse: Pixels, power, use):
+def _locate_most_likely(array: MicrophoneArray, coarse: Pixels, power, use):
     """Positions (F, d) and covariances (F, d, d) by Fisher scoring from the best two valleys of a raster, within the
     bounding box of the outline. For a rectangular outline, the result is that of a `Localiser` up to rounding."""
     xp = namespace(array, power)
@@ -217,12 +217,12 @@ def _most_likely(array: MicrophoneArray, coarse: Pixels, power, use):
     best = value.argmin(axis=0) * power.shape[1] + xp.arange(power.shape[1])
     x = found.x[:, best]
     spread = inverse_small(Likelihood.create(power, use, array).expand(x)[2])[:2, :2]
-    return in_space(array.surface, x[:2], spread)
+    return to_space(array.surface, x[:2], spread)
 
 
-def _deal(places: Float[np.ndarray, "T d"]) -> Int[np.ndarray, " T"]:
+def _assign_folds(places: Float[np.ndarray, "T d"]) -> Int[np.ndarray, " T"]:
     """Index of the fold of each tap. Distinct positions are assigned to the folds in turn, in a fixed random order."""
     step = 1e-4 * max(float(np.ptp(places, axis=0).max()), 1e-300)
     _, which = np.unique(np.round(places / step), axis=0, return_inverse=True)
     order = np.random.default_rng(0).permutation(which.max() + 1)
-    return (order % _PARTS)[which.ravel()]
+    return (order % _NUM_FOLDS)[which.ravel()]

@@ -23,12 +23,15 @@ BandHigh = Annotated[
 ]
 Window = Annotated[float | None, typer.Option(help="Length of a window, seconds (default 0.05, or the calibration's).")]
 Hop = Annotated[
-    float | None, typer.Option(help="From one window to the next, seconds (default 0.0125, or the calibration's).")
+    float | None,
+    typer.Option(
+        help="Time from the start of a window to the start of the next, seconds (default 0.0125, or the calibration's)."
+    ),
 ]
 
 
 def intensity_settings(low: float | None, high: float | None, window: float | None, hop: float | None):
-    """`IntensitySettings` with what was given, None if nothing was."""
+    """Create `IntensitySettings` from the options that were given; None if all of them are None."""
     given = {"low": low, "high": high, "window": window, "hop": hop}
     given = {name: value for name, value in given.items() if value is not None}
     if not given:
@@ -50,14 +53,17 @@ def calibrate_microphones(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", help="Calibration file to write (JSON); a picture goes beside it.", show_default=False
+            "--output",
+            "-o",
+            help="Calibration file to write (JSON); a picture is written to the same folder.",
+            show_default=False,
         ),
     ],
     decay: Annotated[
         str,
         typer.Option(
-            help="inverse-square, a/(r²+b); exponential; attenuated, the product of both; or auto, that of them which "
-            "best locates taps left out of the fit."
+            help="inverse-square, a/(r²+b); exponential; attenuated, the product of both; or auto, the model that best "
+            "locates taps left out of the fit."
         ),
     ] = "auto",
     place_error: Annotated[
@@ -96,11 +102,11 @@ def calibrate_microphones(
             step("write")
             write_calibration(fit, output)
     if not quiet:
-        _show(console, fit, touched)
+        _print_summary(console, fit, touched)
         say_written(console, output, files[1].name)
 
 
-def _show(console, fit: "CalibrationFit", taps: "Taps") -> None:
+def _print_summary(console, fit: "CalibrationFit", taps: "Taps") -> None:
     import numpy as np
 
     from jeit.cli.console import pairs
@@ -112,17 +118,22 @@ def _show(console, fit: "CalibrationFit", taps: "Taps") -> None:
         ("taps", f"{len(fit.outlier)}, {int(fit.outlier.sum())} left out as outliers"),
         ("decay model", f"{calibration.microphone_array.decay.name}: {fit.evidence}"),
         ("error of the model", f"{100 * fit.error:.1f} % of an intensity, median"),
-        ("so a touch is located", f"to ± {1e3 * _location_error(fit, taps):.1f} mm by one window, median, at best"),
+        (
+            "error of location",
+            f"± {1e3 * _location_error(fit, taps):.1f} mm from one window, median (Cramér-Rao bound)",
+        ),
         *([("note", in_options(fit.note, {"decay": "--decay"}))] if fit.note else []),
-        ("scale", "strength 1 reads 1 at a typical microphone right under the source"),
+        ("scale", "a source of strength 1 has intensity 1 at a typical microphone directly below it"),
     ]
     if fit.shared.any():
         which = ", ".join(str(k) for k in np.flatnonzero(fit.shared))
-        rows.append(("tap nearer to", f"{which}: no tap says how their response falls off; it is that of the others"))
+        rows.append(
+            ("tap nearer to", f"{which}: no tap determines the decay of their response; that of the others is used")
+        )
     console.print()
     console.print(pairs(calibration.name, rows))
     console.print()
-    console.print(_parameters(fit))
+    console.print(_parameter_table(fit))
     refused = [(f"microphone {k}", f"not usable: {why}") for k, why in enumerate(calibration.reasons) if why]
     if refused:
         console.print()
@@ -130,7 +141,8 @@ def _show(console, fit: "CalibrationFit", taps: "Taps") -> None:
 
 
 def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
-    """The Cramér-Rao bound where it was tapped, as loudly: standard deviation along its worst direction, metres."""
+    """Cramér-Rao bound for sources with the positions and strengths of the taps: median over the taps of the standard
+    deviation along the major axis of the error ellipse, metres."""
     import numpy as np
 
     from jeit.acoustic import cramer_rao
@@ -140,8 +152,8 @@ def _location_error(fit: "CalibrationFit", taps: "Taps") -> float:
     return float(np.median(np.sqrt(np.linalg.eigvalsh(bound)[:, -1])))
 
 
-def _parameters(fit: "CalibrationFit"):
-    """A table of the decay models and displacements of all usable microphones."""
+def _parameter_table(fit: "CalibrationFit"):
+    """Create a table of the decay models and displacements of all usable microphones."""
     import numpy as np
     from rich.table import Table
 

@@ -29,19 +29,24 @@ def locate(
         ),
     ],
     calibration: Annotated[
-        Path, typer.Option("--calibration", "-c", help="File of jeit calibrate-microphones.", show_default=False)
+        Path,
+        typer.Option("--calibration", "-c", help="File that 'jeit calibrate-microphones' wrote.", show_default=False),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for track.csv, report.json, track.png.", show_default=False)
     ],
     method: Annotated[
-        str, typer.Option(help="likelihood, or consistency for the loss of Park 2022 on a 200 × 200 map, refined.")
+        str,
+        typer.Option(
+            help="likelihood: maximum likelihood; consistency: the loss of Park 2022 on a 200 × 200 map, refined."
+        ),
     ] = "likelihood",
-    gap: Annotated[float, typer.Option(help="Seconds of silence that end a touch.")] = 0.15,
+    gap: Annotated[float, typer.Option(help="Time without a position after which a touch has ended, seconds.")] = 0.15,
     silence: Annotated[
         Path | None,
         typer.Option(
-            help="Recording of the untouched array, samples or WAV, for the noise floor: where touches never pause.",
+            help="Recording of the untouched array, samples or WAV, from which the noise floor is estimated; needed if "
+            "touches never pause.",
             show_default=False,
         ),
     ] = None,
@@ -77,58 +82,61 @@ def locate(
         step("read")
         known = Calibration.load(calibration)
         sound = read_recording(recording)
-        hush = None if silence is None else _silence(silence, sound)
+        hush = None if silence is None else _read_silence(silence, sound)
         options = {"method": method, "gap": gap, "intensity": settings, "silence": hush, "gain_drift": gain_drift}
         found = locate_touches(sound, known, **options, progress=step)
         step("write")
         write_track(found, output)
     if not quiet:
-        _show(console, found)
+        _print_summary(console, found)
         say_written(console, output / "track.csv", "report.json", "track.png")
 
 
-def _silence(path: Path, sound) -> "Recording":
+def _read_silence(path: Path, sound) -> "Recording":
     from jeit.acoustic import Recording, read_recording
 
     hush = read_recording(path)
     if not (isinstance(sound, Recording) and isinstance(hush, Recording)):
-        raise ValueError("--silence is for samples, and must hold samples: intensities have their floor.")
+        raise ValueError(
+            "--silence applies to recordings of samples, and must contain samples; recordings of intensities "
+            "have their floor."
+        )
     return hush
 
 
-def _show(console, found: "LocatedTouches") -> None:
+def _print_summary(console, located: "LocatedTouches") -> None:
     from rich.table import Table
 
     from jeit.acoustic.signal.faults import describe_faults
     from jeit.cli.console import pairs
 
-    locations = found.locations
+    locations = located.locations
     counts = ", ".join(f"{number} {status}" for status, number in locations.counts().items())
-    rows = [("frames", f"{len(locations.times)}: {counts}"), ("touches", str(len(found.track.touches)))]
+    rows = [("frames", f"{len(locations.times)}: {counts}"), ("touches", str(len(located.track.touches)))]
     rows += [("faults", describe_faults(locations.faults))] * any(locations.faults)
     rows += [("note", in_options(note, {"silence": "--silence"})) for note in locations.notes]
     console.print()
     console.print(pairs(locations.name, rows))
-    if found.track.touches:
+    if located.track.touches:
         console.print()
         names = ("touch", "from / s", "to / s", "x / mm", "y / mm", "± / mm", "path / mm")
         table = Table(*names, box=None, padding=(0, 1, 0, 0))
         for column in table.columns:
             column.justify, column.no_wrap = "right", True
         table.add_column("frames", justify="right")
-        for row in _rows(found):
+        for row in _table_rows(located):
             table.add_row(*row)
         console.print(table)
     console.print()
 
 
-def _rows(found: "LocatedTouches") -> Iterator[tuple[str, ...]]:
-    """Of every touch, and of the one beside it where there are two at once."""
+def _table_rows(located: "LocatedTouches") -> Iterator[tuple[str, ...]]:
+    """Yield a row of the printed table for each touch, and for the second of two simultaneous touches."""
     import numpy as np
 
     from jeit.acoustic.localisation.locations import LocationStatus
 
-    locations, track = found.locations, found.track
+    locations, track = located.locations, located.track
     for number, touch in enumerate(track.touches, 1):
         frames = slice(touch.first, touch.last + 1)
         place = 1e3 * track.position[frames, :2]

@@ -43,13 +43,16 @@ def calibrated_intensities(
                 f"{calibration.num_microphones}; give the calibration of this array."
             )
     if silence is not None and not (isinstance(recording, Recording) and isinstance(silence, Recording)):
-        raise ValueError("silence is for a recording of samples, and must be one itself; intensities have their floor.")
+        raise ValueError(
+            "silence applies to a recording of samples, and must be one itself; recordings of intensities have "
+            "their floor."
+        )
     if isinstance(recording, Intensities):
         return recording
     settings = intensity or calibration.intensity or IntensitySettings()
     recorded = intensities(recording, settings)
     if silence is not None:
-        return _above_silence(recorded, intensities(silence, settings))
+        return _with_floor_of_silence(recorded, intensities(silence, settings))
     # Noise floors can be compared only if band and windows are those of the calibration.
     if settings != calibration.intensity:
         if calibration.intensity is None:
@@ -67,7 +70,7 @@ def calibrated_intensities(
     return dataclasses.replace(recorded, notes=(note,)) if text else recorded
 
 
-def _above_silence(recorded: Intensities, quiet: Intensities) -> Intensities:
+def _with_floor_of_silence(recorded: Intensities, quiet: Intensities) -> Intensities:
     """Replace the noise floor of a recording by that of `quiet`, a recording of silence. Microphones that are unusable
     in the silence become unusable."""
     known = np.asarray(quiet.usable.any(axis=0))

@@ -155,20 +155,20 @@ class Consistency(eqx.Module):
 
 
 # Number of candidate positions along the outline.
-_EDGE = 240
+_OUTLINE_CANDIDATES = 240
 # Distance, as a fraction of the skin's size, below which two minima are considered the same.
 _SAME_VALLEY = 0.05
 # Number of steps in the second valley before its cost is compared with that of the first; maximum difference of cost
 # for which the minimisation continues; maximum number of steps of a minimisation.
-_TRIAL_STEPS, _PROMISING, _MOST_STEPS = 8, 8.0, 30
+_TRIAL_STEPS, _MOST_EXCESS, _MOST_STEPS = 8, 8.0, 30
 # Tolerance of the minimisation: predicted decrease of the cost in the next step, relative to 1 + |cost|.
 _TOLERANCE = 1e-12
 
 
-def find_minima(objective, first, second, worth):
+def find_minima(objective, first, second, try_second):
     """Minimise the objective from the starting positions `first` and `second` (2, F).
 
-    `worth`: mask of the frames for which the second start is tried, or None for none; it is given up if it is not
+    `try_second`: mask of the frames for which the second start is tried, or None for none; it is given up if it is not
     promising. Returns the unknowns (n, F) at the minimum; the cost on the outline minus the cost of the minimum beyond
     it; the difference of cost between the two minima; whether the minimisation converged; and the start and end (2, 2,
     F) of the side of the outline to which the position was moved, NaN for positions inside.
@@ -180,15 +180,15 @@ def find_minima(objective, first, second, worth):
     value = xp.where(xp.isfinite(found.value), found.value, xp.inf)
     within = surface.outline.contains(unknowns[:2].T)
     rival, least = xp.full(value.shape, xp.inf), value
-    if worth is not None:
+    if try_second is not None:
         # After a few steps, the minimisation continues only in promising second valleys.
-        tried = _minimise(objective, objective.start(second), ~worth, max_steps=_TRIAL_STEPS)
-        worth = worth & (tried.value < value + _PROMISING)
-        other = _minimise(objective, tried.x, ~worth)
-        other_value = xp.where(worth & xp.isfinite(other.value), other.value, xp.inf)
+        tried = _minimise(objective, objective.start(second), ~try_second, max_steps=_TRIAL_STEPS)
+        try_second = try_second & (tried.value < value + _MOST_EXCESS)
+        other = _minimise(objective, tried.x, ~try_second)
+        other_value = xp.where(try_second & xp.isfinite(other.value), other.value, xp.inf)
         other_within = surface.outline.contains(other.x[:2].T)
         apart = xp.linalg.norm(other.x[:2] - unknowns[:2], axis=0) > _SAME_VALLEY * longer_side(surface)
-        rival = xp.where(apart & worth & within & other_within, xp.abs(other_value - value), xp.inf)
+        rival = xp.where(apart & try_second & within & other_within, xp.abs(other_value - value), xp.inf)
         least = xp.minimum(value, other_value)
         # If one of the two minima is outside the outline, the other is selected. A position on the outline may still be
         # better.
@@ -201,8 +201,8 @@ def find_minima(objective, first, second, worth):
     beyond = xp.isfinite(value) & (~within | (least < value))
     nowhere = xp.full((2, 2, value.size), xp.nan)
 
-    def hold(_):
-        held, side = _on_edge(objective, ~beyond)
+    def move_to_outline(_):
+        held, side = _minimise_on_outline(objective, ~beyond)
         moved = beyond & (~within | (held.value < value))
         return (
             xp.where(moved, held.x, unknowns),
@@ -211,11 +211,15 @@ def find_minima(objective, first, second, worth):
             xp.where(moved, side, nowhere),
         )
 
-    def leave(_):
+    def keep_inside(_):
         return unknowns, xp.zeros_like(value), converged, nowhere
 
     some = xp.any(beyond)
-    held = (hold(None) if some else leave(None)) if xp is np else jax.lax.cond(some, hold, leave, None)
+    held = (
+        (move_to_outline(None) if some else keep_inside(None))
+        if xp is np
+        else jax.lax.cond(some, move_to_outline, keep_inside, None)
+    )
     unknowns, excess, converged, side = held
     return unknowns, excess, rival, converged, side
 
@@ -233,14 +237,14 @@ def _minimise(objective, start, skip, *, max_steps: int | None = None) -> Minimu
     rest = xp.full(start.shape[0] - 2, xp.inf)
     reach = longer_side(surface)
 
-    def of(frames):
+    def expand_frames(frames):
         return type(objective)(*frames, objective.microphone_array)
 
     return minimise_small(
-        lambda x, frames: of(frames).expand(x),
+        lambda x, frames: expand_frames(frames).expand(x),
         start,
         objective.frames,
-        finish=None if max_steps is not None else lambda x, frames: _expand_exactly(of(frames), x),
+        finish=None if max_steps is not None else lambda x, frames: _expand_exactly(expand_frames(frames), x),
         max_steps=max_steps or _MOST_STEPS,
         lower=xp.concatenate([low - reach, -rest])[:, None],
         upper=xp.concatenate([high + reach, rest])[:, None],
@@ -258,7 +262,7 @@ def _expand_exactly(objective, x) -> tuple[Array, Array, Array]:
     return value, gradient, namespace(hessian).where(definite_small(hessian), hessian, model)
 
 
-def _on_edge(objective, skip) -> tuple[Minimum, Array]:
+def _minimise_on_outline(objective, skip) -> tuple[Minimum, Array]:
     """Find the best position on the outline: the best of many candidates, refined along its side. Frames in the mask
     `skip` (F,) are left out. Also returns the start and end of the side (2, 2, F).
     """
@@ -267,7 +271,7 @@ def _on_edge(objective, skip) -> tuple[Minimum, Array]:
     length = xp.linalg.norm(end - start, axis=0)
     # Candidate positions are equally spaced along the outline, and given by a side and a fraction of its length.
     stops = xp.concatenate([xp.zeros(1), xp.cumsum(length)])
-    walked = stops[-1] * (xp.arange(_EDGE) + 0.5) / _EDGE
+    walked = stops[-1] * (xp.arange(_OUTLINE_CANDIDATES) + 0.5) / _OUTLINE_CANDIDATES
     which = xp.clip(xp.searchsorted(stops, walked, side="right") - 1, 0, length.size - 1)
     share = (walked - stops[which]) / length[which]
     chart = start[:, which] + share * (end - start)[:, which]

@@ -26,7 +26,7 @@ from scipy.special import chdtrc
 from jeit.acoustic.localisation.likelihood import Likelihood
 from jeit.acoustic.localisation.localiser import SourceEstimate
 from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.surface import in_space, longer_side
+from jeit.acoustic.surface import longer_side, to_space
 from jeit_solvers import inverse_small
 from jeit_solvers.engines import as_array, host, on_device, on_host, slopes
 
@@ -112,9 +112,9 @@ def _estimate(microphone_array: MicrophoneArray, power, use, scale, locate_frame
         if not touch.any():
             break
         array = _with_known_gains(microphone_array, changes)
-        matrix, right = _normal_equations(array, power[touch], use[touch], _unknowns(array, found, touch))
+        matrix, right = _normal_equations(array, power[touch], use[touch], _unknowns_of_sources(array, found, touch))
         right = right + matrix @ changes.logarithm
-        significant = _significant(matrix, right)
+        significant = _are_significant(matrix, right)
         covariance = np.linalg.inv(matrix + np.eye(len(scale)) / deviation**2)
         before = changes.logarithm
         changes = GainChanges(centred @ covariance @ right, centred @ covariance @ centred)
@@ -127,11 +127,11 @@ def _estimate(microphone_array: MicrophoneArray, power, use, scale, locate_frame
     return changes, explained
 
 
-def _significant(matrix: np.ndarray, right: np.ndarray) -> bool:
+def _are_significant(matrix: np.ndarray, right_hand_side: np.ndarray) -> bool:
     """Whether the changes are larger than is due to the noise and the errors of the decay models."""
     values, vectors = np.linalg.eigh(matrix)
     kept = values > _RANK * values[-1]
-    square = (vectors[:, kept].T @ right) ** 2 / values[kept]
+    square = (vectors[:, kept].T @ right_hand_side) ** 2 / values[kept]
     return bool(chdtrc(kept.sum(), square.sum()) < _FALSE_CHANGE)
 
 
@@ -149,14 +149,17 @@ def covariance_with_gains(
     derivative of its unknowns with respect to the changes is B = F⁻¹ Jᵀ W S, and their covariance in the joint estimate
     is F⁻¹ + B C Bᵀ for the covariance C of the changes.
     """
-    array, unknowns = _with_known_gains(microphone_array, changes), _unknowns(microphone_array, found, slice(None))
+    array, unknowns = (
+        _with_known_gains(microphone_array, changes),
+        _unknowns_of_sources(microphone_array, found, slice(None)),
+    )
     known = np.isfinite(unknowns).all(axis=0)
     unknowns = host.where(known, unknowns, 0.0)
     likelihood, jacobian, share, weight = _linearise(array, power, use, unknowns)
-    inverse = _inverse(likelihood.expand(unknowns)[2])
+    inverse = _inverse_fisher(likelihood.expand(unknowns)[2])
     slope = np.einsum("klf,lmf->kmf", inverse[:2], weight * share * jacobian)
     total = inverse[:2, :2] + host.einsum("kmf,mn,lnf->klf", slope, changes.covariance, slope, optimize=True)
-    return np.where(known[:, None, None], in_space(array.surface, unknowns[:2], total)[1], np.nan)
+    return np.where(known[:, None, None], to_space(array.surface, unknowns[:2], total)[1], np.nan)
 
 
 def _with_known_gains(microphone_array: MicrophoneArray, changes: GainChanges) -> MicrophoneArray:
@@ -164,10 +167,12 @@ def _with_known_gains(microphone_array: MicrophoneArray, changes: GainChanges) -
     return on_host(changes._replace(covariance=np.zeros_like(changes.covariance)).apply(microphone_array))
 
 
-def _unknowns(microphone_array: MicrophoneArray, found: SourceEstimate, which) -> Float[np.ndarray, "3 F"]:
-    """Chart coordinates and logarithm of the strength of the sources `found` in the frames `which`."""
-    chart = on_host(microphone_array.surface).project(np.asarray(found.position)[which].T)
-    return np.concatenate([chart, np.log(np.asarray(found.strength))[None, which]])
+def _unknowns_of_sources(
+    microphone_array: MicrophoneArray, sources: SourceEstimate, frames
+) -> Float[np.ndarray, "3 F"]:
+    """Chart coordinates and logarithm of the strength of the sources `sources` in the frames `frames`."""
+    chart = on_host(microphone_array.surface).project(np.asarray(sources.position)[frames].T)
+    return np.concatenate([chart, np.log(np.asarray(sources.strength))[None, frames]])
 
 
 def _linearise(array: MicrophoneArray, power, use, unknowns) -> tuple[Likelihood, np.ndarray, np.ndarray, np.ndarray]:
@@ -188,14 +193,14 @@ def _normal_equations(array: MicrophoneArray, power, use, unknowns) -> tuple[np.
     off = likelihood.level - array.expected(unknowns)[0]
     weighted = weight * share
     coupling = weighted * jacobian
-    inverse = _inverse(np.einsum("kmf,lmf->klf", weight * jacobian, jacobian))
+    inverse = _inverse_fisher(np.einsum("kmf,lmf->klf", weight * jacobian, jacobian))
     eliminated = np.einsum("klf,lmf->kmf", inverse, coupling)
     matrix = np.diag((weighted * share).sum(axis=1)) - np.einsum("kmf,knf->mn", coupling, eliminated)
     right = (weighted * off).sum(axis=1) - np.einsum("kmf,kf->m", eliminated, (weight * jacobian * off).sum(axis=1))
     return matrix, right
 
 
-def _inverse(fisher) -> np.ndarray:
+def _inverse_fisher(fisher) -> np.ndarray:
     """Inverses of Fisher matrices (3, 3, F), also of singular ones: their ridge makes them definite."""
     definite = fisher + _RIDGE * np.maximum(np.trace(fisher), 1.0) * np.eye(len(fisher))[:, :, None]
     return np.asarray(inverse_small(definite))

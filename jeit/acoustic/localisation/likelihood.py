@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.microphones import MicrophoneArray, check_array
-from jeit.acoustic.surface import in_space
+from jeit.acoustic.surface import to_space
 from jeit_solvers import inverse_small, symmetric_small
 from jeit_solvers.engines import either_engine, kept, namespace, slopes
 
@@ -98,7 +98,7 @@ class Likelihood(eqx.Module):
     def strength(self, response: Float[Array, "M F"]) -> Float[Array, " F"]:
         """Strength of sources with given responses f, by least squares with weights from the observed power. The result
         is positive."""
-        weight, xp = self._weight(), namespace(self, response)
+        weight, xp = self._power_weights(), namespace(self, response)
         fitted = xp.sum(weight * self.power * response, axis=0) / xp.sum(weight * response**2, axis=0)
         loudest = xp.max(xp.where(self.use, self.power / response, 0.0), axis=0)
         return xp.maximum(fitted, 1e-6 * loudest)
@@ -112,12 +112,12 @@ class Likelihood(eqx.Module):
         """Half the weighted residual sum of squares (F, P) at candidate positions with responses f and the best-fitting
         strength: ½ (Σ w p² − (Σ w p f)² / Σ w f²), with observed powers p and weights w derived from them. It
         approximates the cost, and takes two matrix products for all frames and positions."""
-        weight, xp = self._weight(), namespace(self, response)
+        weight, xp = self._power_weights(), namespace(self, response)
         seen = weight * self.power
         fitted = xp.maximum(seen.T @ response, 0.0) ** 2 / (weight.T @ response**2)
         return 0.5 * (xp.sum(self.power * seen, axis=0)[:, None] - fitted)
 
-    def _weight(self) -> Float[Array, "M F"]:
+    def _power_weights(self) -> Float[Array, "M F"]:
         xp = namespace(self)
         return xp.where(self.use, 1 / self.microphone_array.noise.variance(xp.maximum(self.power, 0.0)), 0.0)
 
@@ -138,11 +138,11 @@ def cramer_rao(
     """
     check_array(microphone_array)
     present = np.ones(len(microphone_array.microphones), bool) if use is None else use
-    return _least_covariance(microphone_array, position, strength, present)
+    return _bound_covariance(microphone_array, position, strength, present)
 
 
 @either_engine
-def _least_covariance(microphone_array: MicrophoneArray, position, strength, present) -> Float[Array, "N d d"]:
+def _bound_covariance(microphone_array: MicrophoneArray, position, strength, present) -> Float[Array, "N d d"]:
     xp = namespace(microphone_array, position, strength, present)
     position = xp.asarray(position, float)
     chart = microphone_array.surface.project(position.T)
@@ -151,4 +151,4 @@ def _least_covariance(microphone_array: MicrophoneArray, position, strength, pre
     there = xp.broadcast_to(xp.asarray(present, bool)[:, None], (len(present), number))
     # The Fisher matrix does not depend on the measured values.
     _, _, matrix = Likelihood.create(xp.ones(there.shape), there, microphone_array).expand(unknowns)
-    return in_space(microphone_array.surface, chart, inverse_small(matrix)[:2, :2])[1]
+    return to_space(microphone_array.surface, chart, inverse_small(matrix)[:2, :2])[1]

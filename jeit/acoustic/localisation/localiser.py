@@ -19,7 +19,7 @@ from jeit.acoustic.localisation.consistency import Consistency, differentiable_m
 from jeit.acoustic.localisation.likelihood import Likelihood
 from jeit.acoustic.localisation.pixels import Pixels, valleys
 from jeit.acoustic.microphones import MicrophoneArray, check_array
-from jeit.acoustic.surface import bounding_box, in_space, longer_side
+from jeit.acoustic.surface import bounding_box, longer_side, to_space
 from jeit.arguments import check_name
 from jeit_solvers import inverse_small
 from jeit_solvers.engines import (
@@ -116,7 +116,7 @@ class Localiser(eqx.Module):
     def __call__(self, power: ArrayLike, use: ArrayLike | None = None) -> SourceEstimate:
         """Locate the source of each frame. `power` (F, M): intensities minus the floor. `use` (F, M): mask of the
         intensities to use; by default all finite ones. Frames with fewer than three usable microphones give NaN."""
-        return self._run(_locate, power, use)
+        return self._call_validated(_locate, power, use)
 
     def maps(self, power: ArrayLike, use: ArrayLike | None = None) -> Float[Array, "F rows columns"]:
         """Compute the map of each frame: the negative log-likelihood with the best strength at each pixel, up to a
@@ -126,8 +126,8 @@ class Localiser(eqx.Module):
         if the localiser was created without `map_shape`.
         """
         if self.pixels is None:
-            raise ValueError("maps were not asked for: make the Localiser with map_shape=(rows, columns).")
-        return self._run(_maps, power, use)
+            raise ValueError("this Localiser has no maps; create it with map_shape=(rows, columns).")
+        return self._call_validated(_maps, power, use)
 
     def with_maps(
         self, power: ArrayLike, use: ArrayLike | None = None
@@ -135,7 +135,7 @@ class Localiser(eqx.Module):
         """Compute both the estimate and the map of each frame. Raises `ValueError` as `maps` does."""
         return self(power, use), self.maps(power, use)
 
-    def _run(self, function, power, use):
+    def _call_validated(self, function, power, use):
         """Validate the intensities and the mask, and call `function` with the localiser and both arrays."""
         at_hand = not self.compiled and has_values(self, power, use)
         xp = np if at_hand else jnp
@@ -148,30 +148,30 @@ class Localiser(eqx.Module):
                 f"{len(self.microphone_array.microphones)} microphones."
             )
         if not len(power):  # without frames, the result of an unusable frame gives the structure of the output
-            found = self._run(function, np.full((1, power.shape[1]), np.nan), None)
+            found = self._call_validated(function, np.full((1, power.shape[1]), np.nan), None)
             return jax.tree.map(lambda array: array[:0], found)
-        return on_device(at_once(function, self, power, use)) if at_hand else _compiled(function, self, power, use)
+        return on_device(at_once(function, self, power, use)) if at_hand else _call_compiled(function, self, power, use)
 
 
 @eqx.filter_jit
-def _compiled(function, localiser: Localiser, power, use):
+def _call_compiled(function, localiser: Localiser, power, use):
     return function(localiser, power, use)
 
 
-def _in_chunks(function, most: int, *arrays):
-    """Call `function` for at most `most` frames at a time. The `arrays` (F, M) are split into chunks, padded, and
+def _in_chunks(function, max_frames: int, *arrays):
+    """Call `function` for at most `max_frames` frames at a time. The `arrays` (F, M) are split into chunks, padded, and
     transposed to (M, F). In the results, frames are the leading axis."""
     number = arrays[0].shape[0]
-    size_of_chunk = min(most, max(number, 1))
+    size_of_chunk = min(max_frames, max(number, 1))
     chunks = -(-number // size_of_chunk)
     pad = ((0, chunks * size_of_chunk - number), (0, 0))
 
     xp = namespace(arrays)
 
-    def cut(array):
+    def split(array):
         return xp.pad(array, pad).reshape(chunks, size_of_chunk, -1).transpose(0, 2, 1)
 
-    _, found = scan(lambda _, chunk: (None, function(*chunk)), None, tuple(cut(array) for array in arrays))
+    _, found = scan(lambda _, chunk: (None, function(*chunk)), None, tuple(split(array) for array in arrays))
     return jax.tree.map(lambda array: array.reshape(-1, *array.shape[2:])[:number], found)
 
 
@@ -190,12 +190,12 @@ def _raster(localiser: Localiser, microphone_array: MicrophoneArray) -> tuple[Pi
 def _maps(localiser: Localiser, power, use) -> Array:
     """Compute the maps of all frames (F, rows, columns) at once by matrix products."""
     pixels, features = _raster(localiser, localiser.microphone_array)
-    use = _usable(localiser, power, use)
+    use = _usable_readings(localiser, power, use)
     maps = METHODS[localiser.method].create(power.T, use.T, localiser.microphone_array).screen(features)
     return (maps if pixels.full else namespace(maps).where(pixels.inside, maps, np.nan)).reshape(-1, *pixels.shape)
 
 
-def _starts(localiser: Localiser, power, use):
+def _starting_positions(localiser: Localiser, power, use):
     """Starting positions of the minimisation: those of the first valley (F, 2) and the second valley (F, 2), and the
     mask (F,) of the frames whose second valley is worth a minimisation."""
     still = undifferentiated(localiser.microphone_array)
@@ -214,14 +214,14 @@ def _starts(localiser: Localiser, power, use):
     return _in_chunks(screen, most, undifferentiated(power), use)
 
 
-def _usable(localiser: Localiser, power, use):
+def _usable_readings(localiser: Localiser, power, use):
     """Mask of the usable readings: those in `use` with a positive sum of power and floor, whose logarithm exists."""
     return use & (power + localiser.microphone_array.noise.floor > 0)
 
 
 def _locate(localiser: Localiser, power, use) -> SourceEstimate:
-    use = _usable(localiser, power, use)
-    first, second, worth = _starts(localiser, power, use)
+    use = _usable_readings(localiser, power, use)
+    first, second, worth = _starting_positions(localiser, power, use)
 
     def refine(power, use, first, second, worth):
         return _refine(localiser, power, use, first, second, worth[0])
@@ -242,10 +242,10 @@ def _refine(localiser: Localiser, power, use, first, second, worth) -> SourceEst
     likelihood = Likelihood.create(power, use, microphone_array)
     objective = likelihood if localiser.method == "likelihood" else Consistency.create(power, use, microphone_array)
     unknowns = differentiable_minima(objective, unknowns, side, longer_side(fixed.surface))
-    return _describe(objective, likelihood, unknowns, excess, rival, converged)
+    return _source_estimate(objective, likelihood, unknowns, excess, rival, converged)
 
 
-def _describe(objective, likelihood: Likelihood, unknowns, excess, rival, converged) -> SourceEstimate:
+def _source_estimate(objective, likelihood: Likelihood, unknowns, excess, rival, converged) -> SourceEstimate:
     xp = namespace(likelihood, unknowns)
     surface, chart = likelihood.microphone_array.surface, unknowns[:2]
     if isinstance(objective, Likelihood):
@@ -255,7 +255,7 @@ def _describe(objective, likelihood: Likelihood, unknowns, excess, rival, conver
         strength = likelihood.strength(likelihood.microphone_array.response(chart))
         spread = objective.covariance(chart, strength)
     misfit = likelihood.misfit(xp.concatenate([chart, xp.log(strength)[None]]))
-    place, covariance = in_space(surface, chart, spread)
+    place, covariance = to_space(surface, chart, spread)
     number = xp.sum(likelihood.use, axis=0)
     known = (number >= 3) & xp.all(xp.isfinite(unknowns), axis=0)
     return SourceEstimate(

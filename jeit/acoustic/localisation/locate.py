@@ -17,7 +17,7 @@ from jeit.acoustic.localisation.locations import FEW_FRAMES, Locations, Location
 from jeit.acoustic.localisation.setup_changes import find_setup_changes
 from jeit.acoustic.localisation.two_sources import locate_two
 from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.noise import IntensityNoise, below_nothing
+from jeit.acoustic.noise import IntensityNoise, noise_from_negative_powers
 from jeit.acoustic.signal.faults import describe_faults
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
@@ -39,16 +39,16 @@ _OUTSIDE, _RIVAL = 9.0, 4.0
 # Thresholds for accepting two sources whose misfit is statistically significant: maximum ratio of their misfit to that
 # of one source, and maximum misfit per degree of freedom. Minimum ratio of the strengths of two sources, since errors
 # of the model look like a weak second source.
-_BOTH, _STILL_FAIR, _WEAKEST = 0.2, 10.0, 0.05
+_MOST_MISFIT_RATIO, _MOST_MISFIT, _WEAKEST = 0.2, 10.0, 0.05
 # Fraction of the touches that are not explained by one source on the skin, above which changes of the setup are
 # searched for.
-_ODD = 0.25
+_MOST_UNEXPLAINED = 0.25
 # Minimum fraction of the frames that one or two sources must explain if the gains have not changed.
 _EXPLAINED = 0.9
 # Minimum ratio of the intensity of a touch to the highest intensity of the recording, if no floor is known (−60 dB).
 _DYNAMIC_RANGE = 1e-6
 # Maximum plausible ratio of the strength of touches to that of the calibration taps, or its inverse (40 dB).
-_SAME_UNIT = 1e4
+_MOST_STRENGTH_RATIO = 1e4
 
 
 def locate(
@@ -79,7 +79,7 @@ def locate(
         raise ValueError(f"gain_drift must be zero or positive, as a fraction; it is {describe(gain_drift)}.")
     intensities = calibrated_intensities(recording, calibration, intensity, silence=silence)
     microphone_array, use, faults = microphones_in_use(intensities, calibration)
-    touched = use.any(axis=1) & _above_floor(intensities, microphone_array.noise, use)
+    touched = use.any(axis=1) & _detected_frames(intensities, microphone_array.noise, use)
     enough = use.sum(axis=1) >= 3
     solve = touched & enough
     compiled = int(solve.sum()) > FEW_FRAMES if compiled is None else compiled
@@ -103,8 +103,8 @@ def locate(
         for key, values in found.items():
             result[key][solve] = values
         result["covariance"] *= calibration.widening
-        _bound(status, result, float(longer_side(on_host(microphone_array.surface))))
-        notes += [*_gain_note(changes), *_notes(status, intensities, use, microphone_array)]
+        _limit_uncertainty(status, result, float(longer_side(on_host(microphone_array.surface))))
+        notes += [*_gain_note(changes), *_setup_notes(status, intensities, use, microphone_array)]
     return Locations(
         np.asarray(intensities.times),
         **result,
@@ -112,7 +112,7 @@ def locate(
         used=use,
         overlap=intensities.overlap,
         faults=faults,
-        notes=(*notes, *_unit(result["strength"], intensities, use, calibration)),
+        notes=(*notes, *_unit_note(result["strength"], intensities, use, calibration)),
         name=intensities.name,
     )
 
@@ -140,7 +140,7 @@ def _locate_frames(
 
     def most_likely(array: MicrophoneArray) -> tuple[SourceEstimate, np.ndarray]:
         found = estimate(array, "likelihood", None)
-        return found, _judge(found, found) == LocationStatus.TOUCH
+        return found, _initial_status(found, found) == LocationStatus.TOUCH
 
     *others, last = estimate_gain_changes(microphone_array, power, use, settings.gain_drift, most_likely)
 
@@ -155,7 +155,7 @@ def _locate_frames(
         result |= {"second": np.full_like(result["position"], np.nan), "second_strength": np.full(number, np.nan)}
         if settings.method == "likelihood":
             result["covariance"] = covariance_with_gains(microphone_array, power, use, found, changes)
-        status = _judge(judge, found)
+        status = _initial_status(judge, found)
         _fit_two_sources(status, result, power, use, array, compiled)
         excess = np.asarray(judge.excess)
         status[(status == LocationStatus.MISFIT) & (excess > _OUTSIDE)] = LocationStatus.OUTSIDE
@@ -168,22 +168,22 @@ def _locate_frames(
     return *locate_with(last), last
 
 
-def _judge(judge: SourceEstimate, found: SourceEstimate) -> np.ndarray:
-    """Status of the frames with a touch, before a fit of two sources is tried. `judge`: maximum-likelihood estimates,
-    from which the status follows; `found`: estimates of the selected method."""
-    misfit, freedom = np.asarray(judge.misfit), np.asarray(judge.freedom)
-    excess = np.asarray(judge.excess)
-    rivalled = np.asarray(judge.rival) < _RIVAL
+def _initial_status(most_likely: SourceEstimate, estimate: SourceEstimate) -> np.ndarray:
+    """Status of the frames with a touch, before a fit of two sources is tried. `most_likely`: maximum-likelihood
+    estimates, from which the status follows; `estimate`: estimates of the selected method."""
+    misfit, freedom = np.asarray(most_likely.misfit), np.asarray(most_likely.freedom)
+    excess = np.asarray(most_likely.excess)
+    rivalled = np.asarray(most_likely.rival) < _RIVAL
     status = np.where(rivalled, LocationStatus.AMBIGUOUS, LocationStatus.TOUCH).astype(object)
-    status[_unexplained(misfit, freedom)] = LocationStatus.MISFIT
+    status[_exceeds_noise(misfit, freedom)] = LocationStatus.MISFIT
     # A frame is "outside" if a source beyond the outline explains it, and is clearly better than any source inside. Two
     # sources are not explained by one source beyond the outline.
-    status[(excess > _OUTSIDE) & ~_unexplained(misfit - excess, freedom)] = LocationStatus.OUTSIDE
-    status[~np.isfinite(np.asarray(found.position)).all(axis=1)] = LocationStatus.UNUSABLE
+    status[(excess > _OUTSIDE) & ~_exceeds_noise(misfit - excess, freedom)] = LocationStatus.OUTSIDE
+    status[~np.isfinite(np.asarray(estimate.position)).all(axis=1)] = LocationStatus.UNUSABLE
     return status
 
 
-def _unexplained(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+def _exceeds_noise(misfit: np.ndarray, freedom: np.ndarray) -> np.ndarray:
     """Mask of the frames whose misfit is too large to be due to noise."""
     return (freedom > 0) & (chdtrc(np.maximum(freedom, 1), misfit) < _FALSE_MISFIT)
 
@@ -203,8 +203,8 @@ def _fit_two_sources(
         two = locate_two(microphone_array, *_pad_frames(power[tried], use[tried], compiled), compiled=compiled)
         misfit, freedom = np.asarray(two.misfit)[: tried.size], np.asarray(two.freedom)[: tried.size]
         stronger, weaker = np.asarray(two.strength)[: tried.size].T
-        much_better = (misfit < _BOTH * result["misfit"][tried]) & (misfit < _STILL_FAIR * freedom)
-        both = (~_unexplained(misfit, freedom) | much_better) & (weaker > _WEAKEST * stronger)
+        much_better = (misfit < _MOST_MISFIT_RATIO * result["misfit"][tried]) & (misfit < _MOST_MISFIT * freedom)
+        both = (~_exceeds_noise(misfit, freedom) | much_better) & (weaker > _WEAKEST * stronger)
         chosen, index = tried[both], np.flatnonzero(both)
         status[chosen] = LocationStatus.TWO_TOUCHES
         result["misfit"][chosen], result["freedom"][chosen] = misfit[both], freedom[both]
@@ -217,7 +217,7 @@ def _fit_two_sources(
     result["covariance"][left] *= np.maximum(wide, 1.0)[:, None, None]
 
 
-def _bound(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> None:
+def _limit_uncertainty(status: np.ndarray, result: dict[str, np.ndarray], reach: float) -> None:
     """Mark touches as ambiguous if their standard deviation exceeds a fourth of the skin's size, and replace
     covariances that extend beyond the skin. Modifies `status` and `result` in place."""
     located = np.isfinite(result["position"]).all(axis=1)
@@ -242,7 +242,7 @@ def _gain_note(changes: GainChanges) -> list[str]:
     ]
 
 
-def _notes(
+def _setup_notes(
     status: np.ndarray, intensities: Intensities, use: np.ndarray, microphone_array: MicrophoneArray
 ) -> list[str]:
     """Notes on changes of the setup since the calibration, which are searched for if one source does not explain many
@@ -250,7 +250,7 @@ def _notes(
     notes = []
     placed = ~np.isin(status, [LocationStatus.NO_TOUCH, LocationStatus.UNUSABLE])
     odd = np.isin(status, [LocationStatus.MISFIT, LocationStatus.OUTSIDE, LocationStatus.TWO_TOUCHES])
-    if odd.sum() > _ODD * placed.sum():
+    if odd.sum() > _MOST_UNEXPLAINED * placed.sum():
         exchanged, altered = find_setup_changes(microphone_array, intensities.power[placed], use[placed])
         notes += [
             f"microphones {one} and {other} look exchanged since the calibration: exchanged back, their intensities "
@@ -262,19 +262,23 @@ def _notes(
             "The places are not corrected: make its channel NaN and locate again, or calibrate anew."
             for one in altered
         ]
-        if not exchanged and not altered and (status == LocationStatus.MISFIT).sum() > 2 * _ODD * placed.sum():
+        if (
+            not exchanged
+            and not altered
+            and (status == LocationStatus.MISFIT).sum() > 2 * _MOST_UNEXPLAINED * placed.sum()
+        ):
             notes.append("most touches fit no single source: is this the calibration of this array?")
     return notes
 
 
-def _unit(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
+def _unit_note(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calibration: Calibration) -> list[str]:
     """Return a note if the intensities differ by orders of magnitude from those of the calibration, which suggests
     another gain or unit."""
     asked = "do the recording and the taps have the same gain and unit?"
     if np.isfinite(strength).any():
         typical = float(np.nanmedian(strength))
         ratio = typical / np.clip(typical, *(calibration.strengths or (typical, typical)))
-        if max(ratio, 1 / ratio) > _SAME_UNIT:
+        if max(ratio, 1 / ratio) > _MOST_STRENGTH_RATIO:
             return [f"touches are {ratio:.3g} times as strong as the calibration's taps: {asked}"]
         return []
     # Without a touch and without a known floor, the intensities are compared with the noise of the calibration.
@@ -283,7 +287,7 @@ def _unit(strength: np.ndarray, intensities: Intensities, use: np.ndarray, calib
     if intensities.floor.any() or not known.any():
         return []
     ratio = float(np.median(np.where(use, np.abs(intensities.power), 0.0).max(axis=0)[known] / deviation[known]))
-    low = ratio < 1 / _SAME_UNIT
+    low = ratio < 1 / _MOST_STRENGTH_RATIO
     return [f"the sound is {ratio:.3g} times as loud as the calibration's noise: {asked}"] if low else []
 
 
@@ -312,7 +316,7 @@ def microphones_in_use(
         )
     else:
         # Negative intensities are due to noise, which may be larger than in the calibration.
-        wider = np.maximum(below_nothing(intensities.power, use), np.asarray(known.deviation))
+        wider = np.maximum(noise_from_negative_powers(intensities.power, use), np.asarray(known.deviation))
         noise = eqx.tree_at(
             lambda n: (n.deviation, n.floor),
             known,
@@ -328,7 +332,7 @@ def microphones_in_use(
     )
 
 
-def _above_floor(intensities: Intensities, noise: IntensityNoise, use: np.ndarray) -> np.ndarray:
+def _detected_frames(intensities: Intensities, noise: IntensityNoise, use: np.ndarray) -> np.ndarray:
     """Mask of the frames in which the intensity of at least one microphone exceeds the detection threshold."""
     power = np.where(use, intensities.power, -np.inf)
     if np.any(intensities.floor > 0) and np.isfinite(intensities.freedom):

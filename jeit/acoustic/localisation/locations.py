@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from enum import StrEnum
 
 import equinox as eqx
@@ -68,9 +69,16 @@ class Locations(eqx.Module):
     name: str = eqx.field(static=True)
 
     @property
-    def located(self) -> Bool[np.ndarray, " F"]:
+    def has_position(self) -> Bool[np.ndarray, " F"]:
         """Mask (F,) of the frames that have a position."""
         return np.asarray(np.isfinite(self.position).all(axis=1))
+
+    @property
+    def located(self) -> Bool[np.ndarray, " F"]:
+        """Former name of `has_position`, which goes with the next version."""
+        text = "Locations.located is now Locations.has_position; the old name goes with the next version."
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        return self.has_position
 
     def counts(self) -> dict[str, int]:
         """Number of frames with each status that occurs."""

@@ -12,7 +12,7 @@ from jeit_solvers.engines import as_array, namespace, set_at
 
 # Condition for a minimisation from the second valley: its value is less than this factor times the value of the best
 # valley, plus this offset. On rasters with more than this number of pixels, only the best valley is used.
-_WORTH, _WORTH_MORE, _FINE = 1.5, 8.0, 2000
+_WORTH_FACTOR, _WORTH_OFFSET, _MOST_PIXELS = 1.5, 8.0, 2000
 
 
 class Pixels(eqx.Module):
@@ -46,19 +46,19 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
     rows, columns = pixels.shape
     inside, xp = pixels.inside.reshape(rows, columns), namespace(maps, pixels)
 
-    def known(values, inside):
-        fair = ~xp.isnan(values) if pixels.full else inside & ~xp.isnan(values)
-        return xp.where(fair, values, xp.inf)
+    def fill_outside(values, inside):
+        known = ~xp.isnan(values) if pixels.full else inside & ~xp.isnan(values)
+        return xp.where(known, values, xp.inf)
 
     # The row of the minimum is found first, and then the pixel in the row, which is faster than a single search.
     square = maps.reshape(-1, rows, columns)
-    row = xp.argmin(xp.min(known(square, inside), axis=2), axis=1)
-    in_row = known(xp.take_along_axis(square, row[:, None, None], axis=1)[:, 0], inside[row])
+    row = xp.argmin(xp.min(fill_outside(square, inside), axis=2), axis=1)
+    in_row = fill_outside(xp.take_along_axis(square, row[:, None, None], axis=1)[:, 0], inside[row])
     best = row * columns + xp.argmin(in_row, axis=1)
     first = pixels.chart[:, best]
-    if rows * columns > _FINE:  # fine rasters have spurious local minima
+    if rows * columns > _MOST_PIXELS:  # fine rasters have spurious local minima
         return first, first, xp.zeros(best.shape, bool)
-    square = known(square, inside)
+    square = fill_outside(square, inside)
     values = square.reshape(len(best), -1)
     wide = xp.pad(square, ((0, 0), (1, 1), (1, 1)), constant_values=xp.inf)
     around = [wide[:, i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
@@ -69,7 +69,7 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
     rivals = xp.where(lowest, values, xp.inf)
     other = xp.argmin(rivals, axis=1)
     least, second = xp.min(values, axis=1), xp.min(rivals, axis=1)
-    return first, pixels.chart[:, other], second < _WORTH * least + _WORTH_MORE
+    return first, pixels.chart[:, other], second < _WORTH_FACTOR * least + _WORTH_OFFSET
 
 
 def brightness(

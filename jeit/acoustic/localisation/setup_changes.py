@@ -84,11 +84,11 @@ def find_setup_changes(
     return changes if now <= _WRONG else SetupChanges([], [])
 
 
-def _apply_change(state: tuple[np.ndarray, np.ndarray], which: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _apply_change(state: tuple[np.ndarray, np.ndarray], channels: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the order and the mask of the channels after exchanging two channels, or leaving out one."""
     order, kept = (part.copy() for part in state)
-    if len(which) == 2:
-        order[list(which)] = order[list(which[::-1])]
+    if len(channels) == 2:
+        order[list(channels)] = order[list(channels[::-1])]
     else:
-        kept[which[0]] = False
+        kept[channels[0]] = False
     return order, kept

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jeit.acoustic.localisation.likelihood import Likelihood
 from jeit.acoustic.localisation.pixels import Pixels
 from jeit.acoustic.microphones import MicrophoneArray
-from jeit.acoustic.surface import bounding_box, in_space, longer_side
+from jeit.acoustic.surface import bounding_box, longer_side, to_space
 from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import at_once, has_values, namespace, on_device, on_host, scan
 
@@ -93,16 +93,16 @@ def _locate_two(microphone_array: MicrophoneArray, pixels: Pixels, power, use) -
     spread = inverse_small(matrix)
     number = xp.sum(use, axis=0)
     known = (number >= 6) & xp.isfinite(xp.min(value, axis=0))
-    each = [in_space(microphone_array.surface, x[k : k + 2], spread[k : k + 2, k : k + 2]) for k in (0, 3)]
+    each = [to_space(microphone_array.surface, x[k : k + 2], spread[k : k + 2, k : k + 2]) for k in (0, 3)]
 
-    def shown(array):
+    def frames_first(array):
         return xp.where(known.reshape(-1, *(1,) * (array.ndim - 1)), array, xp.nan)
 
     return TwoSources(
-        position=shown(xp.stack([place for place, _ in each], axis=1)),
-        covariance=shown(xp.stack([covariance for _, covariance in each], axis=1)),
-        strength=shown(xp.exp(x[2::3]).T),
-        misfit=shown(likelihood.misfit(x)),
+        position=frames_first(xp.stack([place for place, _ in each], axis=1)),
+        covariance=frames_first(xp.stack([covariance for _, covariance in each], axis=1)),
+        strength=frames_first(xp.exp(x[2::3]).T),
+        misfit=frames_first(likelihood.misfit(x)),
         freedom=xp.maximum(number - 6, 0),
         converged=converged & known,
     )

@@ -88,8 +88,8 @@ def plot_error_curve(
     if not 1 <= len(errors) <= len(SERIES_COLOURS):
         raise ValueError(f"errors has {len(errors)} methods; give 1 to {len(SERIES_COLOURS)}, {{name: errors}}.")
     check_name("statistic", statistic, _STATISTICS)
-    each = {name: _rows(array, f"errors['{name}']", x.size) for name, array in errors.items()}
-    least = None if bound is None else _STATISTICS[statistic](_rows(bound, "bound", x.size))
+    each = {name: _errors_in_millimetres(array, f"errors['{name}']", x.size) for name, array in errors.items()}
+    least = None if bound is None else _STATISTICS[statistic](_errors_in_millimetres(bound, "bound", x.size))
     order = np.argsort(x)
     ax = axes_or_new(ax, (5.8, 4.2))
     ax.set_yscale("log")
@@ -126,12 +126,12 @@ def _mark_axes(ax: Axes, x: np.ndarray, logarithmic: bool) -> None:
     draw_horizontal_grid(ax)
 
 
-def _rows(errors: ArrayLike, name: str, number: int) -> np.ndarray:
+def _errors_in_millimetres(errors: ArrayLike, name: str, num_values: int) -> np.ndarray:
     """Convert errors in metres, (K,) or (K, N), to an array (K, N) in millimetres, and check its shape and values."""
     array = np.asarray(errors, float)
     rows = array[:, None] if array.ndim == 1 else array
-    if rows.ndim != 2 or len(rows) != number or not rows.shape[1]:
-        raise ValueError(f"{name} has shape {array.shape}; give ({number},) or ({number}, places), in metres.")
+    if rows.ndim != 2 or len(rows) != num_values or not rows.shape[1]:
+        raise ValueError(f"{name} has shape {array.shape}; give ({num_values},) or ({num_values}, places), in metres.")
     if (rows < 0).any() or not np.isfinite(rows).any(axis=1).all():
         raise ValueError(f"{name}: errors are distances, not negative, and every row needs one that is finite.")
     return 1e3 * rows

@@ -88,7 +88,7 @@ def plot_loss_map(
     if level is not None and level.shape != (number,):
         raise ValueError(f"received has shape {level.shape}; give one for each of the {number} microphones.")
     ax = axes_or_new(ax)
-    shown = _above_least(pixels, method)
+    shown = _above_minimum(pixels, method)
     most = min(float(np.nanmax(shown)), _MOST[method]) or 1.0
     colours = colormaps[SEQUENTIAL + "_r"].copy()
     colours.colorbar_extend = "max" if np.nanmax(shown) > most else "neither"  # pyright: ignore[reportAttributeAccessIssue]
@@ -110,7 +110,7 @@ def _draw_marks(ax: Axes, view: View, marks: Marks) -> list[Line2D]:
     """Draw the marked positions and return their legend entries. Raises `ValueError` for shapes that do not match the
     surface, and for a covariance without an estimate."""
     if marks.covariance is not None and marks.estimate is None:
-        raise ValueError("covariance needs an estimate: the place that it is the covariance of.")
+        raise ValueError("covariance: give estimate too, the position whose covariance it is.")
     handles = []
     style: dict[str, Any] = {"linestyle": "none", "zorder": 5, "path_effects": HALO}
     if marks.truth is not None:
@@ -125,7 +125,7 @@ def _draw_marks(ax: Axes, view: View, marks: Marks) -> list[Line2D]:
     return handles
 
 
-def _above_least(pixels: np.ndarray, method: str) -> np.ndarray:
+def _above_minimum(pixels: np.ndarray, method: str) -> np.ndarray:
     least = np.nanmin(pixels)
     if method == "likelihood":
         return np.sqrt(2 * (pixels - least))
@@ -134,14 +134,14 @@ def _above_least(pixels: np.ndarray, method: str) -> np.ndarray:
     return 10 * np.log10(np.maximum(pixels, bottom) / bottom)
 
 
-def _draw_levels(ax: Axes, place: np.ndarray, received: np.ndarray) -> Line2D:
+def _draw_levels(ax: Axes, microphones: np.ndarray, received: np.ndarray) -> Line2D:
     """Draw the microphones as circles whose area grows linearly with the received level in decibels; return the legend
     entry."""
     positive = np.isfinite(received) & (received > 0)
     loudest = received[positive].max(initial=1e-300)
     level = 10 * np.log10(np.where(positive, received, 1e-300) / loudest)
     area = 8 + 150 * np.clip(1 + level / _RANGE, 0, 1)
-    ax.scatter(*place.T, s=area, facecolor="white", edgecolor=MICROPHONE, linewidth=1.2, alpha=0.9, zorder=3)
+    ax.scatter(*microphones.T, s=area, facecolor="white", edgecolor=MICROPHONE, linewidth=1.2, alpha=0.9, zorder=3)
     return Line2D(
         [],
         [],
@@ -201,11 +201,11 @@ def plot_receptive_fields(
         panel.set_xlim(0, 1e3 * distance[-1])
         panel.set_ylim(low, high)
         panel.tick_params(labelleft=column == 0, labelbottom=place + columns >= chosen.size)
-    _label(ax, fit, noise_shown=bool(noise[chosen].max() > low))
+    _label_panels(ax, fit, noise_shown=bool(noise[chosen].max() > low))
     return ax
 
 
-def _label(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
+def _label_panels(ax: Axes, fit: CalibrationFit, *, noise_shown: bool) -> None:
     """Draw the axis labels shared by all panels, and the legend above the panels."""
     label: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "color": INK}
     label["annotation_clip"] = False

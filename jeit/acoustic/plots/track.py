@@ -30,7 +30,7 @@ _STATUS_MARKERS = {
 }
 # Thresholds of motion below which a touch is drawn as a single position: the distance of its path from the mean of the
 # path, in standard deviations; and the diameter of the path, as a fraction of the size of the surface.
-_MOVED, _LEAST = 4.0, 0.05
+_MOVED_DEVIATIONS, _LEAST = 4.0, 0.05
 
 
 def plot_track(
@@ -80,7 +80,7 @@ def plot_track(
     if known is not None:
         handles += ax.plot(*known.T, color=INK, linewidth=0.9, linestyle=(0, (4, 3)), zorder=3.6, label="truth")
     if not track.touches:
-        _write_no_touch(ax, view, locations)
+        _label_no_touch(ax, view, locations)
         draw_legend(ax, handles)
         return ax
     first, last = track.touches[0].onset, track.touches[-1].offset
@@ -94,7 +94,7 @@ def plot_track(
     return ax
 
 
-def _write_no_touch(ax: Axes, view: View, locations: Locations) -> None:
+def _label_no_touch(ax: Axes, view: View, locations: Locations) -> None:
     left, right, bottom, top = view.extent
     words = "no touch" if (locations.status != LocationStatus.UNUSABLE).any() else "no usable frame"
     box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85}
@@ -110,7 +110,9 @@ def _draw_touch(ax: Axes, view: View, track: Track, touch: Touch, path, times: S
     spread = view.chart_covariance(track.covariance[surest], track.position[surest])
     left, right, bottom, top = view.extent
     moved = np.linalg.norm(places - places.mean(axis=0), axis=1).max()
-    still = max(_MOVED * np.sqrt(np.linalg.eigvalsh(spread)[-1]), 0.5 * _LEAST * max(right - left, top - bottom))
+    still = max(
+        _MOVED_DEVIATIONS * np.sqrt(np.linalg.eigvalsh(spread)[-1]), 0.5 * _LEAST * max(right - left, top - bottom)
+    )
     mark: dict[str, Any] = {"linestyle": "none", "markeredgecolor": INK, "markeredgewidth": 1.2, "zorder": 5}
     if moved < still:
         colour = times.to_rgba(track.times[surest])
@@ -133,8 +135,8 @@ def _draw_frames(ax: Axes, view: View, track: Track, locations: Locations, times
     """Draw the position of each frame: a dot; a ring if the track rejects the position; a marker for each status other
     than "touch". Return the legend entries."""
     places = view.chart(locations.position, "locations")
-    plain = locations.located & ~np.isin(locations.status, list(_STATUS_MARKERS))
-    believed, doubted = plain & ~track.rejected, locations.located & track.rejected
+    plain = locations.has_position & ~np.isin(locations.status, list(_STATUS_MARKERS))
+    believed, doubted = plain & ~track.rejected, locations.has_position & track.rejected
     handles = []
     dots = {"s": 7, "linewidths": 0, "alpha": 0.6, "zorder": 3.7}
     ax.scatter(*places[believed].T, color=times.to_rgba(track.times[believed]), **dots)
@@ -154,7 +156,7 @@ def _draw_other_frames(ax: Axes, view: View, locations: Locations, places: np.nd
     handles = []
     second = view.chart(locations.second, "locations.second")
     for status, marker in _STATUS_MARKERS.items():
-        which = (locations.status == status) & locations.located
+        which = (locations.status == status) & locations.has_position
         if not which.any():
             continue
         style = {"marker": marker, "s": 22, "linewidths": 0.8, "edgecolors": INK, "zorder": 4.5}

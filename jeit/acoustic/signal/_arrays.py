@@ -18,7 +18,7 @@ _BESIDE, _SAME = 0.05, 1e-6  # of the length; m
 _FARTHEST = 1e9
 
 
-def either(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
+def choose_array(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
     """Return which of the arrays named `first` and `second` the file contains. Raises `ValueError` if it contains both
     or neither."""
     if first in arrays and second in arrays:
@@ -29,12 +29,12 @@ def either(arrays: dict[str, np.ndarray], first: str, second: str) -> str:
     return first if first in arrays else second
 
 
-def short(values: np.ndarray) -> str:
+def short_text(values: np.ndarray) -> str:
     """Text of an array for a message: its values if it has at most four, otherwise its shape."""
     return f"of shape {values.shape}" if values.size > 4 else str(values.tolist())
 
 
-def real(value, label: str, axes: str) -> np.ndarray:
+def real_array_of(value, label: str, axes: str) -> np.ndarray:
     """Convert `value` to a real array with as many axes as `axes` names, separated by commas.
 
     float32 is kept; other types become float64. Raises `ValueError` for values that are not real, another number of
@@ -53,7 +53,7 @@ def real(value, label: str, axes: str) -> np.ndarray:
     return array if array.dtype == np.float32 else array.astype(float, copy=False)
 
 
-def number(value, label: str) -> float:
+def real_number(value, label: str) -> float:
     """Convert a number, or an array with one element, to a float. Raises `ValueError` for anything else."""
     array = np.asarray(value)
     if array.dtype.kind not in "fiu" or array.size != 1:
@@ -64,7 +64,7 @@ def number(value, label: str) -> float:
 def sampling_rate(value) -> float:
     """Return the sampling rate in Hz as a float. Raises `ValueError` if it is not a finite number, or too low to record
     touches."""
-    rate = number(value, "rate")
+    rate = real_number(value, "rate")
     if not np.isfinite(rate) or rate < LOWEST_RATE:
         raise ValueError(
             f"rate is {rate:g}; give the samples a second of each microphone in Hz (40000, not 40 kHz or 25 µs): "
@@ -76,16 +76,16 @@ def sampling_rate(value) -> float:
 def check_full_scale(value) -> float | None:
     """Return the largest possible magnitude of a sample as a float; None if unknown. Raises `ValueError` for values
     that are not positive and finite."""
-    full_scale = None if value is None else number(value, "full_scale")
+    full_scale = None if value is None else real_number(value, "full_scale")
     if full_scale is not None and not 0 < full_scale < np.inf:
         raise ValueError(f"full_scale must be the largest sample possible, positive and finite; it is {full_scale:g}.")
     return full_scale
 
 
-def coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
+def check_coordinates(value, label: str, dimension: tuple[int, ...]) -> np.ndarray:
     """Return points as an array (n, d) in metres, with `dimension` = (d,) and d = 2 or 3. Raises `ValueError` for other
     shapes, and for coordinates that are not finite."""
-    points = real(value, label, "points, 2 or 3").astype(float)
+    points = real_array_of(value, label, "points, 2 or 3").astype(float)
     if points.shape[1] not in (2, 3) or points.shape[1:] != dimension:
         raise ValueError(
             f"{label} has shape {points.shape}; give one row of 2 or 3 coordinates each, as many for microphones, "

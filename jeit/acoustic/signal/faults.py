@@ -49,10 +49,10 @@ def sample_faults(
     lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
     if lowest == highest:
         return kind, f"dead: every {'' if whole else 'finite '}sample is {lowest:g}"
-    stuck = _stuck(samples, rate, float(highest - lowest))
+    stuck = _stuck_samples(samples, rate, float(highest - lowest))
     # A channel that stays at one end of its range is stuck, not clipping.
     live = samples if stuck is None else np.where(stuck, np.nan, samples)
-    clipping = _clipping(live, full_scale)
+    clipping = _clipped_samples(live, full_scale)
     if clipping is not None:
         kind[clipping] = CLIPPING
     if stuck is not None:
@@ -82,7 +82,7 @@ def window_faults(
         hit = total[..., start + length] > total[..., start]
         if hit.any():
             usable &= ~hit
-            reasons.append(f"{word} in {_share(hit)} windows")
+            reasons.append(f"{word} in {_format_share(hit)} windows")
     return usable, "; ".join(reasons)
 
 
@@ -98,7 +98,7 @@ def intensity_faults(power: Float[np.ndarray, "F M"]) -> tuple[Bool[np.ndarray, 
         elif none:
             reasons.append("dead: every intensity is NaN or infinite")
         else:
-            reasons.append("" if channel.all() else f"NaN or infinite in {_share(~channel)} windows")
+            reasons.append("" if channel.all() else f"NaN or infinite in {_format_share(~channel)} windows")
     return finite & ~dead, tuple(reasons)
 
 
@@ -121,23 +121,23 @@ def _ranges(numbers: np.ndarray) -> str:
     return ", ".join(f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts)
 
 
-def _share(hit: np.ndarray) -> str:
+def _format_share(hit: np.ndarray) -> str:
     return f"all {hit.size}" if hit.all() else f"{int(hit.sum())} of {hit.size}"
 
 
-def _runs(flags: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
+def _true_runs(flags: Bool[np.ndarray, " S"]) -> Shaped[np.ndarray, "2 R"]:
     """Start and end indices of the runs of True; the end is exclusive."""
     change = np.flatnonzero(np.diff(flags, prepend=False, append=False))
     return np.stack([change[::2], change[1::2]])
 
 
-def _step(samples: np.ndarray) -> float:
+def _converter_step(samples: np.ndarray) -> float:
     """Step of the analogue-to-digital converter: the smallest nonzero difference between successive samples."""
     change = np.abs(np.diff(samples))
     return float(np.fmin.reduce(np.where(change > 0, change, np.inf)))
 
 
-def _stuck(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, " S"] | None:
+def _stuck_samples(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, " S"] | None:
     """Mask of the samples in long constant stretches, unless the signal also comes to rest elsewhere; None if no sample
     is stuck. `extent`: range of the samples."""
     stretch = max(_STUCK_SAMPLES, round(_STUCK_TIME * rate))
@@ -149,7 +149,7 @@ def _stuck(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, 
     if not (span == 0).any():
         return None
     # Each flag stands for a pair of equal neighbours, so a run of n flags is a stretch of n + 1 samples.
-    start, stop = _runs(samples[1:] == samples[:-1])
+    start, stop = _true_runs(samples[1:] == samples[:-1])
     long = stop - start + 1 >= stretch
     if not long.any():
         return None
@@ -159,11 +159,11 @@ def _stuck(samples: np.ndarray, rate: float, extent: float) -> Bool[np.ndarray, 
     # Silence can be constant too: with a coarse converter, or in a simulation without noise. The sound then fades into
     # silence, so that some other blocks are almost constant. In a stuck channel with noise no other block is.
     live = ~stuck[: blocks.size].reshape(blocks.shape).any(axis=1) & np.isfinite(span)
-    rest = max(_REST_STEPS * _step(samples), _REST_RANGE * extent)
+    rest = max(_REST_STEPS * _converter_step(samples), _REST_RANGE * extent)
     return None if live.any() and span[live].min() <= rest else stuck
 
 
-def _clipping(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray, " S"] | None:
+def _clipped_samples(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray, " S"] | None:
     """Mask of the samples at an end of the channel's range, if its peaks are cut off there; None if they are not."""
     lowest, highest = np.fmin.reduce(samples), np.fmax.reduce(samples)
     found = None
@@ -177,37 +177,39 @@ def _clipping(samples: np.ndarray, full_scale: float | None) -> Bool[np.ndarray,
         if np.count_nonzero(fall <= max(heights)) < _FLAT:
             continue
         if not hold:
-            step, hold = _step(samples), _hold(samples)
+            step, hold = _converter_step(samples), _samples_per_value(samples)
         for height in heights:
             near = fall <= height + step
-            if _flat(fall, near, height + 2 * step, hold):
+            if _has_clipped_peak(fall, near, height + 2 * step, hold):
                 found = near if found is None else found | near
     return found
 
 
-def _flat(fall: np.ndarray, near: Bool[np.ndarray, " S"], height: float, hold: float) -> bool:
+def _has_clipped_peak(
+    distance_below_top: np.ndarray, near: Bool[np.ndarray, " S"], height: float, samples_per_value: float
+) -> bool:
     """Whether any run of samples `near` the top is a clipped peak.
 
-    `fall` (S,): distance of each sample below the top. `hold`: number of samples per converted value. An unclipped peak
-    is nearly a parabola: if n successive converted values stay within `height` of the top, then k values later it has
-    fallen by at most `height` · ((n - 1 + 2k) / (n - 1))². A clipped peak falls by much more, about the height that was
-    cut off. Slow or loud peaks are thus accepted, however many samples they have near the top, and so is a single value
-    that the converter holds for several samples.
+    `distance_below_top` (S,): distance of each sample below the top. `samples_per_value`: number of samples per
+    converted value. An unclipped peak is nearly a parabola: if n successive converted values stay within `height` of
+    the top, then k values later it has fallen by at most `height` · ((n - 1 + 2k) / (n - 1))². A clipped peak falls by
+    much more, about the height that was cut off. Slow or loud peaks are thus accepted, however many samples they have
+    near the top, and so is a single value that the converter holds for several samples.
     """
-    start, stop = _runs(near)
-    conversions = (stop - start) / hold
+    start, stop = _true_runs(near)
+    conversions = (stop - start) / samples_per_value
     for which in np.flatnonzero(conversions >= _FLAT):
         number, first, last = conversions[which], start[which], stop[which]
         beyond = max(1, int(number) // 2)
-        reach = int(beyond * hold)
-        sides = (fall[max(0, first - reach) : first], fall[last : last + reach])
+        reach = int(beyond * samples_per_value)
+        sides = (distance_below_top[max(0, first - reach) : first], distance_below_top[last : last + reach])
         least = min(np.fmax.reduce(side) if side.size else np.inf for side in sides)
         if least > _SHARP * height * ((number - 1 + 2 * beyond) / (number - 1)) ** 2:
             return True
     return False
 
 
-def _hold(samples: np.ndarray) -> float:
+def _samples_per_value(samples: np.ndarray) -> float:
     """Number of samples for which the converter holds each value, estimated as the 5 % quantile of the lengths of
     constant runs."""
     lengths = np.diff(np.flatnonzero(samples[1:] != samples[:-1]))

@@ -35,7 +35,7 @@ _FEWEST_BINS = 4.0
 _CHUNK = 2**18
 
 
-class Grid(NamedTuple):
+class WindowGrid(NamedTuple):
     """Windows and band of a recording, in samples and frequency bins.
 
     **Fields**: `length`, `hop`: length of a window and distance between windows, in samples; `taper`: Hann window (N,);
@@ -49,7 +49,7 @@ class Grid(NamedTuple):
     weights: np.ndarray
 
 
-def make_grid(settings, rate: float, samples: int | None, name: str) -> Grid:
+def window_grid(settings, rate: float, samples: int | None, name: str) -> WindowGrid:
     """Convert `IntensitySettings` to windows and bins at the sampling rate `rate` in Hz.
 
     `samples`: number of samples of the recording, if known; `name`: its name in messages. Raises `ValueError` if band,
@@ -80,10 +80,10 @@ def make_grid(settings, rate: float, samples: int | None, name: str) -> Grid:
     weights = np.diff(overlap) * length / rate
     (used,) = np.nonzero(weights)
     weights = weights[used[0] : used[-1] + 1] * 2 / (length * (taper**2).sum())
-    return Grid(length, hop, taper, int(used[0]), weights)
+    return WindowGrid(length, hop, taper, int(used[0]), weights)
 
 
-def band_power(samples: np.ndarray, grid: Grid) -> np.ndarray:
+def band_power(samples: np.ndarray, grid: WindowGrid) -> np.ndarray:
     """Band power (F, M) of samples (M, S) in F windows."""
     finite = np.isfinite(samples)
     if not finite.all():
@@ -109,7 +109,7 @@ def band_power(samples: np.ndarray, grid: Grid) -> np.ndarray:
     return power
 
 
-def _trace(grid: Grid, lag: int) -> float:
+def _overlap_trace(grid: WindowGrid, lag: int) -> float:
     """tr(A_0 A_lag) for two windows `lag` samples apart: half the covariance of their powers for white noise of
     variance 1.
 
@@ -128,24 +128,24 @@ def _trace(grid: Grid, lag: int) -> float:
     return float((squared * correlation).sum())
 
 
-def white_freedom(grid: Grid) -> float:
+def white_freedom(grid: WindowGrid) -> float:
     """Degrees of freedom ν of the power of white noise in one window. The value is exact, except that the subtraction
     of the mean in bins 0 and 1 is neglected."""
     # tr A = Σ w² Σ W, where the weights W include the factor 2 / (N Σ w²).
-    return float(((grid.taper**2).sum() * grid.weights.sum()) ** 2 / _trace(grid, 0))
+    return float(((grid.taper**2).sum() * grid.weights.sum()) ** 2 / _overlap_trace(grid, 0))
 
 
-def shared_noise(grid: Grid, windows: int) -> Float[np.ndarray, "F F"]:
+def noise_correlation(grid: WindowGrid, windows: int) -> Float[np.ndarray, "F F"]:
     """Correlation (F, F) between the powers of white noise in any two of the `windows`, which overlap."""
     overlapping = range(min(windows, -(-grid.length // grid.hop)))
     by_lag = np.zeros(windows)
-    by_lag[: len(overlapping)] = [_trace(grid, j * grid.hop) for j in overlapping]
+    by_lag[: len(overlapping)] = [_overlap_trace(grid, j * grid.hop) for j in overlapping]
     between = np.abs(np.arange(windows)[:, None] - np.arange(windows))
     return by_lag[between] / by_lag[0]
 
 
 # A tap is audible in a window if its loudness there is at least this fraction of its maximum loudness.
-_AUDIBLE = 0.5
+_AUDIBLE_SHARE = 0.5
 
 
 class IntensitySettings(eqx.Module):
@@ -220,7 +220,7 @@ def intensities(
     check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
     check_settings("settings", settings)
     samples, rate = recording.samples, recording.rate
-    grid = make_grid(settings or IntensitySettings(), rate, samples.shape[-1], recording.name)
+    grid = window_grid(settings or IntensitySettings(), rate, samples.shape[-1], recording.name)
     found = [
         window_faults(*sample_faults(channel, rate, recording.full_scale), grid.length, grid.hop) for channel in samples
     ]
@@ -264,7 +264,7 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
         count, microphones = taps.power.shape
         return TapIntensities(taps.power, np.zeros(microphones), np.full(count, np.inf), usable, faults)
     samples, rate = taps.samples, taps.rate
-    grid = make_grid(settings or IntensitySettings(), rate, samples.shape[-1], taps.name)
+    grid = window_grid(settings or IntensitySettings(), rate, samples.shape[-1], taps.name)
     good, faults = [], []
     for m in range(samples.shape[1]):
         # All taps of a microphone are tested together, since range, converter step and silence are properties of the
@@ -282,11 +282,11 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     alive = usable.any(axis=(0, 1))
     least = np.maximum(floor, max(1e-9 * power.max(), np.finfo(float).tiny))
     loudness = np.where(alive, power / least - floor / least, 0).sum(axis=-1)
-    audible = loudness >= _AUDIBLE * loudness.max(axis=1, keepdims=True)
+    audible = loudness >= _AUDIBLE_SHARE * loudness.max(axis=1, keepdims=True)
     # The loudest window is always included, also if no window is above the floor.
     audible |= loudness == loudness.max(axis=1, keepdims=True)
     mean = np.einsum("tf,tfm->tm", audible, power) / audible.sum(axis=1)[:, None]
-    shared = shared_noise(grid, windows)
+    shared = noise_correlation(grid, windows)
     each = np.array([freedom * one.sum() ** 2 / shared[np.ix_(one, one)].sum() for one in audible])
     whole = (usable | ~audible[..., None]).all(axis=1)
     return TapIntensities(mean - floor, floor, each, whole, tuple(faults))
@@ -349,7 +349,7 @@ def noise_floor(
 def degrees_of_freedom(settings: IntensitySettings, rate: float) -> float:
     """Degrees of freedom ν of the power of white noise in one window, sampled at `rate` Hz. The variance of the power
     is 2 mean² / ν."""
-    return white_freedom(make_grid(settings, rate, None, "settings"))
+    return white_freedom(window_grid(settings, rate, None, "settings"))
 
 
 def _check_floor(floor, microphones: int) -> Float[np.ndarray, " M"]:

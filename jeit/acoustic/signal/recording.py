@@ -18,16 +18,16 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jeit.acoustic.signal._arrays import (
+    check_coordinates,
     check_extent,
     check_full_scale,
     check_microphones,
     check_taps,
-    coordinates,
-    either,
-    number,
-    real,
+    choose_array,
+    real_array_of,
+    real_number,
     sampling_rate,
-    short,
+    short_text,
 )
 from jeit.acoustic.signal.faults import intensity_faults
 from jeit.arguments.extras import optional
@@ -37,9 +37,9 @@ from jeit.mesh.topology import check_loop
 # Bytes of memory needed per byte of a file with eight bits per sample.
 _IN_MEMORY = 16
 # First bytes of the formats read by `soundfile`: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
-_OTHERS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
+_SOUNDFILE_STARTS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
 # Bytes that identify formats which `soundfile` does not read: MP4 (from the fifth byte on); WebM, WMA and AMR.
-_MP4, _CLOSED = b"ftyp", (b"\x1aE\xdf\xa3", b"0&\xb2u", b"#!AMR")
+_MP4, _UNREADABLE_STARTS = b"ftyp", (b"\x1aE\xdf\xa3", b"0&\xb2u", b"#!AMR")
 
 
 def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
@@ -55,9 +55,9 @@ def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
         start = file.read(8)
     if start.startswith((b"RIFF", b"RIFX", b"RF64")):
         return _read_wav(path)
-    if start.startswith(_OTHERS) or _is_mp3(start):
-        return _read_other(path)
-    if start[4:] == _MP4 or start.startswith(_CLOSED):
+    if start.startswith(_SOUNDFILE_STARTS) or _is_mp3(start):
+        return _read_with_soundfile(path)
+    if start[4:] == _MP4 or start.startswith(_UNREADABLE_STARTS):
         raise ValueError(
             f"a format that is not read (M4A, MP4, WebM, WMA, AMR); convert it: ffmpeg -i '{path.name}' "
             f"'{path.stem}.wav'."
@@ -82,7 +82,7 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
     if any("prematurely" in str(one.message) for one in said):
         raise ValueError("the WAV file is cut off: it holds fewer samples than its header says. Copy it again.")
     if "Unknown wave file format" in str(problem):  # A-law or ADPCM, for example
-        return _read_other(path)
+        return _read_with_soundfile(path)
     if problem is not None:
         raise ValueError(f"not a readable WAV file, or cut off ({reason(problem)}); write it as plain PCM or float.")
     samples = data.T if data.ndim == 2 else data[None]
@@ -94,7 +94,7 @@ def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
     return samples, rate, _full_scale(samples)
 
 
-def _read_other(path: Path) -> tuple[np.ndarray, float, float | None]:
+def _read_with_soundfile(path: Path) -> tuple[np.ndarray, float, float | None]:
     try:
         soundfile: Any = optional("soundfile", "a format that is not plain WAV", "Or convert it to plain WAV.")
     except ImportError as error:
@@ -117,7 +117,7 @@ def _full_scale(samples: np.ndarray) -> float | None:
 
 
 # Error message for files of an unknown format.
-_OTHERWISE = "neither an NPZ nor a sound file"
+_UNKNOWN_FORMAT = "neither an NPZ nor a sound file"
 
 
 # Maximum magnitude of a sample in any unit; squares of larger samples would overflow in single precision.
@@ -144,7 +144,7 @@ class Recording(eqx.Module):
     ):
         """Raises `ValueError` for samples that are not real, have another shape than (M, S) or look transposed, and for
         an implausible rate."""
-        given = real(samples, "samples", "microphones, samples")
+        given = real_array_of(samples, "samples", "microphones, samples")
         beyond = np.abs(given) > _LOUDEST if given.dtype.kind == "f" else np.zeros(0, bool)
         self.samples = np.where(beyond, np.inf, given) if beyond.any() else given
         count, length = self.samples.shape
@@ -200,23 +200,26 @@ class Intensities(eqx.Module):
         Raises `ValueError` for values that are not real or out of range, for shapes that disagree, and for times that
         do not increase.
         """
-        self.times, self.power = real(times, "times", "windows"), real(power, "intensity", "windows, microphones")
+        self.times, self.power = (
+            real_array_of(times, "times", "windows"),
+            real_array_of(power, "intensity", "windows, microphones"),
+        )
         shape, length = self.power.shape, len(self.times)
         if shape[0] != length:
             hint = " It looks transposed: give (windows, microphones)." if shape[1] == length else ""
             raise ValueError(f"intensity has shape {shape}, but there are {length} times, one a window.{hint}")
         if not np.isfinite(self.times).all() or (np.diff(self.times) <= 0).any():
             raise ValueError("times must be finite and increasing, in seconds: the middle of each window.")
-        self.floor = np.zeros(shape[1]) if floor is None else real(floor, "floor", "microphones")
+        self.floor = np.zeros(shape[1]) if floor is None else real_array_of(floor, "floor", "microphones")
         if self.floor.shape != shape[1:] or not (np.isfinite(self.floor) & (self.floor >= 0)).all():
             raise ValueError(
                 f"floor must be finite and not negative, one for each of the {shape[1]} microphones; it is "
-                f"{short(self.floor)}. Leave it out when it is not known."
+                f"{short_text(self.floor)}. Leave it out when it is not known."
             )
-        self.freedom = number(freedom, "freedom")
+        self.freedom = real_number(freedom, "freedom")
         if not self.freedom > 0:
             raise ValueError(f"freedom must be positive (infinite when unknown); it is {self.freedom}.")
-        self.overlap = number(overlap, "overlap")
+        self.overlap = real_number(overlap, "overlap")
         if not 1 <= self.overlap <= max(length, 1):
             raise ValueError(
                 f"overlap must be at least 1 and no more than the {length} windows: how many of them share a sample "
@@ -272,9 +275,9 @@ class Taps(eqx.Module):
         microphones at the same position, and, on a plane skin, for taps farther outside the outline than 5 % of its
         length.
         """
-        self.outline = coordinates(outline, "outline", np.shape(microphones)[-1:])
-        self.microphones = coordinates(microphones, "microphones", self.outline.shape[1:])
-        self.positions = coordinates(positions, "positions", self.outline.shape[1:])
+        self.outline = check_coordinates(outline, "outline", np.shape(microphones)[-1:])
+        self.microphones = check_coordinates(microphones, "microphones", self.outline.shape[1:])
+        self.positions = check_coordinates(positions, "positions", self.outline.shape[1:])
         if self.outline.shape[1] == 2:
             self.outline = check_loop(self.outline, "outline", clockwise=False)
         elif len(self.outline) < 3:
@@ -293,8 +296,8 @@ class Taps(eqx.Module):
             both = "neither" if power is None else "both"
             raise ValueError(f"taps need either intensity or samples with their rate; {both} were given.")
         expected = (len(self.positions), len(self.microphones))
-        self.power = None if power is None else real(power, "intensity", "taps, microphones")
-        self.samples = None if samples is None else real(samples, "samples", "taps, microphones, samples")
+        self.power = None if power is None else real_array_of(power, "intensity", "taps, microphones")
+        self.samples = None if samples is None else real_array_of(samples, "samples", "taps, microphones, samples")
         label, given = ("intensity", self.power) if self.samples is None else ("samples", self.samples)
         assert given is not None
         if given.shape[:2] != expected:
@@ -327,9 +330,9 @@ def read_recording(path: str | Path) -> Recording | Intensities:
             return Recording(samples, rate, full_scale=full_scale, name=path.stem)
         optional = ("floor", "freedom", "overlap")
         arrays = npz_arrays(
-            path, "samples", "rate", "full_scale", "intensity", "times", *optional, otherwise=_OTHERWISE
+            path, "samples", "rate", "full_scale", "intensity", "times", *optional, otherwise=_UNKNOWN_FORMAT
         )
-        kind = either(arrays, "intensity", "samples")
+        kind = choose_array(arrays, "intensity", "samples")
         if kind == "samples":
             if arrays["samples"].ndim == 3:
                 raise ValueError("samples has three axes, as a file of taps has: read that with read_taps.")
@@ -353,9 +356,9 @@ def read_taps(path: str | Path) -> Taps:
     geometry = ("microphones", "outline", "positions")
     try:
         asked = (*geometry, "intensity", "samples", "rate", "full_scale")
-        arrays = npz_arrays(path, *asked, otherwise=_OTHERWISE)
+        arrays = npz_arrays(path, *asked, otherwise=_UNKNOWN_FORMAT)
         need(arrays, *geometry)
-        kind = either(arrays, "intensity", "samples")
+        kind = choose_array(arrays, "intensity", "samples")
         values = {"power" if kind == "intensity" else "samples": arrays[kind]}
         if kind == "samples":
             need(arrays, "rate")
@@ -369,18 +372,18 @@ def read_taps(path: str | Path) -> Taps:
 def write_recording(path: str | Path, recording: Recording | Intensities) -> None:
     """Write a recording to an NPZ file for `read_recording`. Intensities that are not usable are written as NaN."""
     if isinstance(recording, Recording):
-        _write(path, samples=recording.samples, rate=recording.rate, full_scale=recording.full_scale)
+        _write_npz(path, samples=recording.samples, rate=recording.rate, full_scale=recording.full_scale)
     else:
         known = {key: getattr(recording, key) for key in ("times", "floor", "freedom", "overlap")}
-        _write(path, intensity=np.where(recording.usable, recording.power, np.nan), **known)
+        _write_npz(path, intensity=np.where(recording.usable, recording.power, np.nan), **known)
 
 
 def write_taps(path: str | Path, taps: Taps) -> None:
     """Write taps to an NPZ file for `read_taps`."""
     geometry = {"microphones": taps.microphones, "outline": taps.outline, "positions": taps.positions}
-    _write(path, **geometry, intensity=taps.power, samples=taps.samples, rate=taps.rate, full_scale=taps.full_scale)
+    _write_npz(path, **geometry, intensity=taps.power, samples=taps.samples, rate=taps.rate, full_scale=taps.full_scale)
 
 
-def _write(path: str | Path, **arrays) -> None:
+def _write_npz(path: str | Path, **arrays) -> None:
     with written_whole(path) as file:
         np.savez(file, allow_pickle=False, **{key: value for key, value in arrays.items() if value is not None})

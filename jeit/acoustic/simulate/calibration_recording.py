@@ -21,8 +21,8 @@ from jeit.acoustic.simulate.synthesis import (
     Burst,
     bin_frequencies,
     check_burst,
-    filled_bins,
     noise_spectrum,
+    num_filled_bins,
     sample_times,
     source_spectrum,
     transform_size,
@@ -86,7 +86,7 @@ def calibration_taps(
     for part in np.array_split(np.arange(-(-len(places) // pieces) * pieces), pieces):
         part = np.minimum(part, len(places) - 1)
         samples[part] = _tap_samples(
-            skin, keys[part], places[part], strengths[part], envelope, level, size, filled_bins(skin, size)
+            skin, keys[part], places[part], strengths[part], envelope, level, size, num_filled_bins(skin, size)
         )
         if progress is not None:
             progress(f"{part[-1] + 1} of {len(places)} places")
@@ -99,18 +99,18 @@ def calibration_taps(
 def _tap_samples(skin, keys, places, strengths, envelope, level, size, bins):
     frequencies = bin_frequencies(skin, size, bins)
 
-    def at(item):
+    def samples_at_position(item):
         key, place, loudness = item
         sources, own = jax.random.split(key)
         channels = transfer(skin, frequencies, place)
 
-        def once(key, own, strength):
+        def samples_of_tap(key, own, strength):
             spectrum = strength * source_spectrum(skin, key, envelope, size, bins) * channels
             if level is not None:
                 spectrum += noise_spectrum(skin, own, level, size, bins)
             return jnp.fft.irfft(spectrum, size)[:, : len(envelope)]
 
         repeats = len(loudness)
-        return jax.vmap(once)(jax.random.split(sources, repeats), jax.random.split(own, repeats), loudness)
+        return jax.vmap(samples_of_tap)(jax.random.split(sources, repeats), jax.random.split(own, repeats), loudness)
 
-    return jax.lax.map(at, (keys, places, strengths))
+    return jax.lax.map(samples_at_position, (keys, places, strengths))

@@ -67,7 +67,7 @@ class Readout(eqx.Module):
 
     def __check_init__(self):
         if not self.coupling_db < 0:
-            raise ValueError(f"coupling_db: a neighbour leaks in weakened, below 0 dB; it is {self.coupling_db}.")
+            raise ValueError(f"coupling_db: crosstalk must be below 0 dB; it is {self.coupling_db}.")
         highest = self.rate / 2 / np.sqrt(2)
         if len(self.band) != 2 or not 0 < self.band[0] < self.band[1] < highest:
             raise ValueError(
@@ -96,7 +96,7 @@ def microphone_grid(number: int, *, width: float = 0.2, height: float = 0.2) -> 
     Raises `ValueError` if `number` is less than 1.
     """
     if number < 1:
-        raise ValueError(f"number: give how many points a row has, at least 1; it is {number}.")
+        raise ValueError(f"number: give the number of points in a row, at least 1; it is {number}.")
     along = (np.arange(number) + 0.5) / number - 0.5
     y, x = np.meshgrid(along * height, along * width, indexing="ij")
     return np.stack([x.ravel(), y.ravel()], axis=-1)

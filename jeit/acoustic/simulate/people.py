@@ -101,7 +101,7 @@ class SoundingPerson(eqx.Module):
         """Draw a random person. Traits are log-normal about the medians of the population; `slope` is normal. Raises
         `ValueError` if `key` is not a random key."""
         check_key(key)
-        rng = _generator(key)
+        rng = _numpy_generator(key)
         own = {}
         for name, traits in SOUND_MANNERS.items():
             own[name] = {}
@@ -123,7 +123,7 @@ class SoundingPerson(eqx.Module):
         check_name("modality", modality, MODALITIES)
         check_positive("duration", duration)
         drawn, rest = jax.random.split(key)
-        rng = _generator(drawn)
+        rng = _numpy_generator(drawn)
         if modality == "none":
             return _silence(skin, duration)
         traits = {}
@@ -135,10 +135,12 @@ class SoundingPerson(eqx.Module):
         # The touch is simulated with its own spectral slope in place of the skin's. The microphones' noise depends on
         # the skin's slope and is therefore not added here.
         toned = eqx.tree_at(lambda one: one.spectral_slope, skin, traits.pop("slope"))
-        return _MAKES[modality](rng, toned, rest, traits, duration)
+        return _SIMULATIONS[modality](rng, toned, rest, traits, duration)
 
 
-def _taps(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
+def _simulate_taps(
+    rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
+) -> SimulatedSound:
     """Simulate a pat or tickle: taps of random strength and rhythm at random positions within a small disc."""
     burst = Burst(traits["strength"], max(traits["length"], _SHORTEST))
     interval, radius = traits["interval"], traits.get("radius", _PAT_RADIUS)
@@ -152,20 +154,22 @@ def _taps(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict
     spread = radius * np.sqrt(rng.uniform(size=len(onsets)))
     angle = rng.uniform(0, 2 * np.pi, len(onsets))
     landed = _clip_to_skin(
-        skin, _somewhere(rng, skin) + np.stack([spread * np.cos(angle), spread * np.sin(angle)], axis=-1)
+        skin, _random_position(rng, skin) + np.stack([spread * np.cos(angle), spread * np.sin(angle)], axis=-1)
     )
     blocks = np.maximum(np.searchsorted(onsets, block_times(skin, len(times)) + HOP, side="right") - 1, 0)
     return record(skin, key, landed[blocks], burst.envelope(times, onsets, strengths), False)
 
 
-def _stroke(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
+def _simulate_stroke(
+    rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
+) -> SimulatedSound:
     """Simulate a stroke back and forth along a straight path, slower at the turns."""
     angle, phase = rng.uniform(0, 2 * np.pi, 2)
     half = traits["path"] / 2 * np.array([np.cos(angle), np.sin(angle)])
     room = np.array([skin.layer.width, skin.layer.height]) / 2 - _MARGIN
     half = half * min(1.0, float(np.min(room / np.maximum(np.abs(half), 1e-9))))
     length = 2 * float(np.linalg.norm(half))
-    middle = np.clip(_somewhere(rng, skin), -(room - np.abs(half)), room - np.abs(half))
+    middle = np.clip(_random_position(rng, skin), -(room - np.abs(half)), room - np.abs(half))
     times = sample_times(skin, duration)
     # The mean speed of a sinusoidal motion of amplitude L/2 and angular frequency w is L w / π.
     turning = np.pi * traits["speed"] / length
@@ -175,12 +179,21 @@ def _stroke(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: di
     return record(skin, key, places, traits["strength"] * np.sqrt(speed / NOMINAL_SPEED), False)
 
 
-def _wind(rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float) -> SimulatedSound:
+def _simulate_wind(
+    rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
+) -> SimulatedSound:
     """Simulate an air jet at a random position."""
-    return wind(skin, key, _somewhere(rng, skin), slope=skin.spectral_slope, duration=duration, noise=False, **traits)
+    return wind(
+        skin, key, _random_position(rng, skin), slope=skin.spectral_slope, duration=duration, noise=False, **traits
+    )
 
 
-_MAKES: dict[str, Callable[..., SimulatedSound]] = {"pat": _taps, "tickle": _taps, "stroke": _stroke, "wind": _wind}
+_SIMULATIONS: dict[str, Callable[..., SimulatedSound]] = {
+    "pat": _simulate_taps,
+    "tickle": _simulate_taps,
+    "stroke": _simulate_stroke,
+    "wind": _simulate_wind,
+}
 
 
 def _silence(skin: SoundingSkin, duration: float) -> SimulatedSound:
@@ -191,7 +204,7 @@ def _silence(skin: SoundingSkin, duration: float) -> SimulatedSound:
     )
 
 
-def _somewhere(rng: np.random.Generator, skin: SoundingSkin) -> np.ndarray:
+def _random_position(rng: np.random.Generator, skin: SoundingSkin) -> np.ndarray:
     half = np.array([skin.layer.width, skin.layer.height]) / 2
     return rng.uniform(-1, 1, 2) * np.maximum(half - _MARGIN, half / 2)
 
@@ -201,7 +214,7 @@ def _clip_to_skin(skin: SoundingSkin, places: np.ndarray) -> np.ndarray:
     return np.clip(places, -half, half)
 
 
-def _generator(key: Array) -> np.random.Generator:
+def _numpy_generator(key: Array) -> np.random.Generator:
     return np.random.default_rng(np.asarray(jax.random.bits(key, (4,))).tolist())
 
 

@@ -28,13 +28,13 @@ def source_density(skin: SoundingSkin, frequencies: Float[Array, " F"]) -> Float
 
     lowest, highest = skin.readout.band
 
-    def shape(f):
+    def unnormalised_density(f):
         return band_filter(skin, f) * (jnp.maximum(f, 1e-9) / lowest) ** -skin.spectral_slope
 
     # The integral uses a uniform grid of log-frequency, in which both edges of the filter have the same width:
     # ∫ S df = ∫ S f d(ln f).
     grid = lowest * jnp.exp(jnp.linspace(-0.35, jnp.log(highest / lowest) + 0.35, 2001))
-    return shape(frequencies) / jnp.trapezoid(shape(grid) * grid, jnp.log(grid))
+    return unnormalised_density(frequencies) / jnp.trapezoid(unnormalised_density(grid) * grid, jnp.log(grid))
 
 
 @jax.jit

@@ -19,8 +19,8 @@ from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_ke
 from jeit.acoustic.simulate.synthesis import (
     RINGING,
     bin_frequencies,
-    filled_bins,
     microphone_noise,
+    num_filled_bins,
     sample_times,
     source_spectrum,
     transform_size,
@@ -74,7 +74,7 @@ def superpose(skin: SoundingSkin, key: Array | None, *recordings: SimulatedSound
     if not recordings:
         raise ValueError("recordings: give at least one.")
     if any(recording.noisy for recording in recordings):
-        raise ValueError("recordings: make them with noise=False; noise is added once, here.")
+        raise ValueError("recordings: simulate them with noise=False; `superpose` adds the noise once.")
     shapes = {(recording.samples.shape, recording.rate) for recording in recordings}
     if len(shapes) > 1 or recordings[0].samples.shape[0] != skin.num_microphones or recordings[0].rate != skin.rate:
         raise ValueError(
@@ -93,7 +93,7 @@ def record(skin: SoundingSkin, key: Array, places: np.ndarray, envelope: np.ndar
     whole = transform_size(count, RINGING, skin.rate)
     block = transform_size(2 * round(HOP * skin.rate), skin.layer.longest_delay, skin.rate)
     samples = np.asarray(
-        _moving_source_samples(skin, source, places, envelope, whole, block, filled_bins(skin, block, blur=4 / HOP))
+        _moving_source_samples(skin, source, places, envelope, whole, block, num_filled_bins(skin, block, blur=4 / HOP))
     )
     if noise:
         samples = samples + microphone_noise(skin, own, count)
@@ -107,14 +107,14 @@ def block_times(skin: SoundingSkin, count: int) -> np.ndarray:
 
 
 @partial(jax.jit, static_argnums=(4, 5, 6))
-def _moving_source_samples(skin, key, places, envelope, whole, block, bins):
+def _moving_source_samples(skin, key, places, envelope, num_samples, block, bins):
     count, hop = envelope.shape[0], round(HOP * skin.rate)
-    sound = jnp.fft.irfft(source_spectrum(skin, key, envelope, whole, whole // 2 + 1), whole)[:count]
+    sound = jnp.fft.irfft(source_spectrum(skin, key, envelope, num_samples, num_samples // 2 + 1), num_samples)[:count]
     sound = jnp.pad(sound, (hop, places.shape[0] * hop + hop - count))
     window = jnp.sin(jnp.pi * jnp.arange(2 * hop) / (2 * hop)) ** 2
     frequencies = bin_frequencies(skin, block, bins)
 
-    def step(output, item):
+    def add_block(output, item):
         index, place = item
         piece = jax.lax.dynamic_slice(sound, (index * hop,), (2 * hop,)) * window
         spectrum = jnp.fft.rfft(piece, block)[:bins] * transfer(skin, frequencies, place)
@@ -122,5 +122,5 @@ def _moving_source_samples(skin, key, places, envelope, whole, block, bins):
         return jax.lax.dynamic_update_slice(output, here + jnp.fft.irfft(spectrum, block), (0, index * hop)), None
 
     output = jnp.zeros((skin.num_microphones, places.shape[0] * hop + block))
-    output, _ = jax.lax.scan(step, output, (jnp.arange(places.shape[0]), places))
+    output, _ = jax.lax.scan(add_block, output, (jnp.arange(places.shape[0]), places))
     return output[:, hop : hop + count]

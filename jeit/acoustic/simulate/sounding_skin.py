@@ -93,7 +93,9 @@ class ElastomerLayer(eqx.Module):
         check_metres("thickness", self.thickness, max(self.width, self.height), "the layer is wide")
         check_kind("material", self.material, Elastomer, "an Elastomer, such as Elastomer(shear_modulus=1e5)")
         if not -1 <= self.reflection <= 1:
-            raise ValueError(f"reflection: an edge returns at most what reaches it, -1 to 1; it is {self.reflection}.")
+            raise ValueError(
+                f"reflection: the amplitude reflection coefficient is from -1 to 1; it is {self.reflection}."
+            )
 
     @property
     def longest_delay(self) -> float:

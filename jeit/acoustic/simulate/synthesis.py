@@ -26,15 +26,15 @@ from jeit.arguments.checks import check_positive
 RINGING = 0.05
 
 
-def bin_frequencies(skin: SoundingSkin, size: int, bins: int) -> Array:
-    """Frequencies (bins,) in Hz of the lowest `bins` bins of a transform of `size` samples."""
-    return jnp.arange(bins) * (skin.rate / size)
+def bin_frequencies(skin: SoundingSkin, num_samples: int, bins: int) -> Array:
+    """Frequencies (bins,) in Hz of the lowest `bins` bins of a transform of `num_samples` samples."""
+    return jnp.arange(bins) * (skin.rate / num_samples)
 
 
-def filled_bins(skin: SoundingSkin, size: int, *, blur: float = 0.0) -> int:
-    """Number of bins of a real transform of `size` samples up to half an octave above the band plus `blur` in Hz. The
-    remaining bins are zero."""
-    return min(int((np.sqrt(2) * skin.readout.band[1] + blur) * size / skin.rate) + 1, size // 2)
+def num_filled_bins(skin: SoundingSkin, num_samples: int, *, blur: float = 0.0) -> int:
+    """Number of bins of a real transform of `num_samples` samples up to half an octave above the band plus `blur` in
+    Hz. The remaining bins are zero."""
+    return min(int((np.sqrt(2) * skin.readout.band[1] + blur) * num_samples / skin.rate) + 1, num_samples // 2)
 
 
 def transform_size(count: int, padding: float, rate: float) -> int:
@@ -43,23 +43,23 @@ def transform_size(count: int, padding: float, rate: float) -> int:
     return 2 * int(np.asarray(next_fast_len((needed + 1) // 2)))
 
 
-def source_spectrum(skin: SoundingSkin, key: Array, envelope: Array, size: int, bins: int) -> Array:
+def source_spectrum(skin: SoundingSkin, key: Array, envelope: Array, num_samples: int, bins: int) -> Array:
     """Fourier transform (bins,) of white noise multiplied by `envelope` and filtered to the spectral density of a
     source.
 
     Real white noise of variance 1 has the density 2 / rate at positive frequencies.
     """
-    white = jnp.fft.rfft(jax.random.normal(key, envelope.shape) * envelope, size)[:bins]
-    return white * jnp.sqrt(source_density(skin, bin_frequencies(skin, size, bins)) * skin.rate / 2)
+    white = jnp.fft.rfft(jax.random.normal(key, envelope.shape) * envelope, num_samples)[:bins]
+    return white * jnp.sqrt(source_density(skin, bin_frequencies(skin, num_samples, bins)) * skin.rate / 2)
 
 
-def noise_spectrum(skin: SoundingSkin, key: Array, level: Array, size: int, bins: int) -> Array:
+def noise_spectrum(skin: SoundingSkin, key: Array, level: Array, num_samples: int, bins: int) -> Array:
     """Fourier transform (M, bins) of noise with mean square `level` (M,) and a flat spectrum in the band.
 
-    In a real signal of `size` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square.
+    In a real signal of `num_samples` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square.
     """
-    shape = band_filter(skin, bin_frequencies(skin, size, bins))
-    variance = level[:, None] * shape / jnp.sum(shape) * size**2 / 2
+    shape = band_filter(skin, bin_frequencies(skin, num_samples, bins))
+    variance = level[:, None] * shape / jnp.sum(shape) * num_samples**2 / 2
     draws = jax.random.normal(key, (2, *variance.shape))
     return jnp.sqrt(variance / 2) * (draws[0] + 1j * draws[1])
 
@@ -74,7 +74,7 @@ def microphone_noise(skin: SoundingSkin, key: Array, count: int) -> Float[np.nda
     # Noise synthesised from a spectrum is periodic with period `size`. More samples than needed are generated, so that
     # the last samples are independent of the first.
     size = transform_size(count, RINGING, skin.rate)
-    return np.asarray(_noise_samples(skin, key, noise_power(skin), count, size, filled_bins(skin, size)))
+    return np.asarray(_noise_samples(skin, key, noise_power(skin), count, size, num_filled_bins(skin, size)))
 
 
 def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]:

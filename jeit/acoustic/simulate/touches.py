@@ -48,7 +48,7 @@ def tap(
     onsets = ONSET + np.arange(repeats) / frequency
     times = sample_times(skin, max(duration, onsets[-1] + burst.length + 0.03))
     envelope = burst.envelope(times, onsets, np.full(repeats, burst.strength))
-    return record(skin, key, _place(skin, position), envelope, noise)
+    return record(skin, key, _check_place(skin, position), envelope, noise)
 
 
 def pat(
@@ -87,7 +87,7 @@ def tickle(
     Raises `ValueError` as `tap` does.
     """
     check_skin_and_key(skin, key)
-    middle = _place(skin, position)[0]
+    middle = _check_place(skin, position)[0]
     check_positive("radius", radius)
     check_positive("taps_per_second", taps_per_second)
     check_burst(burst, duration)
@@ -127,13 +127,15 @@ def stroke(
     check_positive("strength", strength)
     check_positive("duration", duration)
     times = sample_times(skin, duration)
-    follow = path if callable(path) else _polyline(skin, path, duration)
+    follow = path if callable(path) else _position_on_polyline(skin, path, duration)
     track = skin.layer.check_inside("path", follow(times))
     if len(track) != len(times):
         raise ValueError(f"path: the function gave {len(track)} positions for {len(times)} times; give one for each.")
     speed = np.linalg.norm(np.gradient(track, times, axis=0), axis=1)
     if not speed.any():
-        raise ValueError("path: the finger stands still, which makes no sound. Give a path with some length, or a tap.")
+        raise ValueError(
+            "path: its length is zero, and a finger at rest makes no sound; give a longer path, or simulate a tap."
+        )
     # The stroke fades in and out over 20 ms.
     ends = np.sin(np.pi / 2 * np.clip(np.minimum(times, duration - times) / 0.02, 0, 1))
     centres = block_times(skin, len(times))
@@ -141,11 +143,11 @@ def stroke(
     return record(skin, key, places, strength * np.sqrt(speed / NOMINAL_SPEED) * ends, noise)
 
 
-def _polyline(skin: SoundingSkin, corners, duration: float) -> Callable[[np.ndarray], np.ndarray]:
+def _position_on_polyline(skin: SoundingSkin, corners, duration: float) -> Callable[[np.ndarray], np.ndarray]:
     place = skin.layer.check_inside("path", corners)
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))])
     return lambda times: np.stack([np.interp(times / duration * along[-1], along, axis) for axis in place.T], axis=-1)
 
 
-def _place(skin: SoundingSkin, position) -> np.ndarray:
+def _check_place(skin: SoundingSkin, position) -> np.ndarray:
     return skin.layer.check_inside("position", [position])

@@ -14,8 +14,8 @@ from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_ke
 from jeit.acoustic.simulate.synthesis import (
     RINGING,
     bin_frequencies,
-    filled_bins,
     microphone_noise,
+    num_filled_bins,
     sample_times,
     transform_size,
 )
@@ -62,7 +62,7 @@ def wind(
     places = np.clip(middle + radius * np.asarray(jax.random.normal(where, (_PLACES, 2))), -half, half)
     times = sample_times(skin, duration)
     loud = np.exp(gusts * _slow_noise(gust, len(times), gust_time * skin.rate) - gusts**2)
-    density = _density(skin, slope, _received_power(skin, jnp.asarray(places), _grid(skin)))
+    density = _density(skin, slope, _received_power(skin, jnp.asarray(places), _frequency_grid(skin)))
     samples = strength * loud * _coloured_noise(skin, own, density, len(times))
     if noise:
         samples = samples + microphone_noise(skin, rest, len(times))
@@ -92,7 +92,7 @@ def room_sound(
     return SimulatedSound(samples, skin.rate, np.zeros((0, 2)), np.zeros(0), np.zeros(len(times)), False)
 
 
-def _grid(skin: SoundingSkin) -> Float[np.ndarray, " G"]:
+def _frequency_grid(skin: SoundingSkin) -> Float[np.ndarray, " G"]:
     """Frequencies (G,) in Hz from half an octave below the band to half an octave above it, with equal ratios."""
     low, high = skin.readout.band
     return np.geomspace(low / np.sqrt(2), high * np.sqrt(2), _FREQUENCIES)
@@ -104,16 +104,16 @@ def _received_power(skin: SoundingSkin, places: Array, frequencies: Array) -> Ar
     of the sources."""
     total = jnp.zeros((skin.microphones.shape[0], len(frequencies)))
 
-    def add(index, total):
+    def add_source(index, total):
         return total + jnp.abs(transfer(skin, frequencies, places[index])) ** 2
 
-    return jax.lax.fori_loop(0, len(places), add, total) / len(places)
+    return jax.lax.fori_loop(0, len(places), add_source, total) / len(places)
 
 
 def _density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.ndarray, "M G"]:
     """Power spectral densities (M, G) at the microphones, in 1/Hz, for sources of total mean square 1. `received` (M,
     G): received power divided by source power."""
-    grid = _grid(skin)
+    grid = _frequency_grid(skin)
     shape = np.asarray(band_filter(skin, jnp.asarray(grid))) * (grid / grid[0]) ** -slope
     return np.asarray(received) * shape / np.trapezoid(shape, grid)
 
@@ -121,9 +121,9 @@ def _density(skin: SoundingSkin, slope: float, received: ArrayLike) -> Float[np.
 def _coloured_noise(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "M G"], count: int) -> np.ndarray:
     """Simulate `count` samples (M, S) of independent noises with the power spectral densities `density`."""
     size = transform_size(count, RINGING, skin.rate)
-    bins = filled_bins(skin, size)
+    bins = num_filled_bins(skin, size)
     frequencies = np.asarray(bin_frequencies(skin, size, bins))
-    grid = _grid(skin)
+    grid = _frequency_grid(skin)
     # In a real signal of `size` samples, bin k > 0 with variance v_k contributes 2 v_k / size² to the mean square.
     variance = np.stack([np.interp(frequencies, grid, one, left=0.0, right=0.0) for one in density])
     draws = np.asarray(jax.random.normal(key, (2, len(density), bins)))
@@ -131,12 +131,12 @@ def _coloured_noise(skin: SoundingSkin, key: Array, density: Float[np.ndarray, "
     return np.fft.irfft(spectrum, size)[:, :count]
 
 
-def _slow_noise(key: Array, count: int, correlated: float) -> Float[np.ndarray, " S"]:
-    """Slowly varying normal noise (S,) of variance 1, with a correlation length of `correlated` samples."""
-    knots = int(np.ceil(count / correlated)) + 3
+def _slow_noise(key: Array, count: int, correlation_length: float) -> Float[np.ndarray, " S"]:
+    """Slowly varying normal noise (S,) of variance 1, with a correlation length of `correlation_length` samples."""
+    knots = int(np.ceil(count / correlation_length)) + 3
     values = np.asarray(jax.random.normal(key, (knots,)))
     # The interpolation weights are the cosine and sine of the same angle, so the variance is 1 everywhere.
-    at = np.arange(count) / correlated
+    at = np.arange(count) / correlation_length
     first = at.astype(int)
     angle = np.pi / 2 * (at - first)
     return np.cos(angle) * values[first] + np.sin(angle) * values[first + 1]

@@ -122,7 +122,7 @@ def reconstruct(
             output,
             method=method,
             frame=which,
-            unused=unused,
+            unused_options=unused,
             quiet=quiet,
         )
         return

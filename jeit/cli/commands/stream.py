@@ -99,7 +99,7 @@ def stream(
             "as-is": as_is or None,
         }
         given = data if data == "-" else Path(data), reference, format, description
-        image_by_network(model, given, output, method=method, unused=unused, quiet=quiet, streamed=True)
+        image_by_network(model, given, output, method=method, unused_options=unused, quiet=quiet, streamed=True)
         return
     import numpy as np
 

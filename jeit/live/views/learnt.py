@@ -17,7 +17,7 @@ from jeit.live.views.scene import closed_outline, electrode_curves
 from jeit.touch import LearntSkin, Touches
 from jeit.touch.learnt.presses import NO_TOUCH
 from jeit.touch.networks import FrameDepth, ImageNetwork, resting_frame, stream_depths
-from jeit.touch.networks.sensed import centroids_of
+from jeit.touch.networks.linear_channels import depth_centroids
 from jeit.touch.simulate.contact.indent_sets import pixel_places
 
 # Radius that holds 68 % of a round normal distribution of standard deviation 1; nodes of a mesh for drawing alone;
@@ -121,7 +121,7 @@ class DepthView(AbstractView):
         deepest = float(one.depth.max())
         if deepest <= self.network.floor:
             return Picture(pixels, status=FrameStatus.UNCHANGED)
-        x, y = centroids_of(one.depth[None], self._places)[0].tolist()
+        x, y = depth_centroids(one.depth[None], self._places)[0].tolist()
         return Picture(pixels, (Marker(x, y, f"{1e3 * deepest:.2f} mm"),))
 
     def set_reference(self, frames: Float[np.ndarray, "N M"]) -> None:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 _LOUDNESS = {"auto": None, "counts": True, "ignored": False}
 
 
-class _ByArguments(TyperCommand):
-    """Command that is called by the name of its group, also in its help and its errors."""
+class _NamedByGroup(TyperCommand):
+    """Command that help texts and error messages call by the name of its group: `jeit listen`."""
 
     def make_context(self, info_name: Any, args: Any, parent: Any = None, **extra: Any) -> Any:
         return super().make_context(parent.info_name, args, parent=parent.parent, **extra)
@@ -39,7 +39,7 @@ class _RecordingFirst(TyperGroup):
 listen = typer.Typer(
     name="listen",
     cls=_RecordingFirst,
-    help="Name the sounds in a recording, every 0.1 s; 'listen fit' learns what from labelled clips.",
+    help="Classify the sounds in a recording, every 0.1 s; 'listen fit' trains the classifier on labelled clips.",
 )
 
 
@@ -49,19 +49,24 @@ def _top(context: typer.Context) -> None:
         typer.echo(context.get_help())
 
 
-@listen.command("recording", cls=_ByArguments, hidden=True)
+@listen.command("recording", cls=_NamedByGroup, hidden=True)
 def hear(
     recording: Annotated[
         Path,
         typer.Argument(
-            help="WAV file of one channel or many, or NPZ file with samples (M, S) and rate in hertz; FLAC, Ogg and "
-            "others where soundfile is installed.",
+            help="WAV file of one or more channels, or NPZ file with samples (M, S) and rate in hertz; FLAC, Ogg and "
+            "other formats if soundfile is installed.",
             show_default=False,
         ),
     ],
     model: Annotated[
         Path,
-        typer.Option("--model", "-m", help="Folder of 'jeit listen fit', or its listener.jeit.", show_default=False),
+        typer.Option(
+            "--model",
+            "-m",
+            help="Folder that 'jeit listen fit' wrote, or the file listener.jeit in it.",
+            show_default=False,
+        ),
     ],
     output: Annotated[
         Path,
@@ -72,15 +77,15 @@ def hear(
         typer.Option(
             "--calibration",
             "-c",
-            help="File of jeit calibrate-microphones: estimates places.",
+            help="File that 'jeit calibrate-microphones' wrote; with it, places are estimated.",
             show_default=False,
         ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Name the sounds in a recording, every 0.1 s; writes events.csv, report.json and timeline.png.
+    """Classify the sounds in a recording, every 0.1 s; writes events.csv, report.json and timeline.png.
 
-    What is named, a MODEL has learnt from labelled clips: see 'jeit listen fit --help'.
+    MODEL is a classifier trained on labelled clips: see 'jeit listen fit --help'.
     """
     from jeit.acoustic import Calibration, Recording, read_recording
     from jeit.cli.console import Steps, plain_console, say_written
@@ -95,13 +100,13 @@ def hear(
         known = None if calibration is None else Calibration.load(calibration)
         sound = read_recording(recording)
         if not isinstance(sound, Recording):
-            raise ValueError(f"{recording.name}: it holds intensities; sounds are recognised in samples.")
+            raise ValueError(f"{recording.name}: it holds intensities; sounds can be classified only in samples.")
         step("listen")
         labels = listener.hear(sound, calibration=known)
         step("write")
         write_sound_labels(labels, output, model=str(model))
     if not quiet:
-        _show(console, labels)
+        _print_summary(console, labels)
         say_written(console, output / "events.csv", "report.json", "timeline.png")
 
 
@@ -111,8 +116,9 @@ def fit(
         Path,
         typer.Argument(
             metavar="FOLDER-BY-CLASS",
-            help="Folder with a sub-folder for each class, and clips of it in it: WAV, NPZ, or what soundfile reads. "
-            "Folders within them, such as one for each person, are held out together.",
+            help="Folder with a sub-folder for each class, which contains clips of that class: WAV, NPZ, or a "
+            "format that "
+            "soundfile reads. Clips in a folder within these, such as of one person, are held out together.",
             show_default=False,
         ),
     ],
@@ -122,26 +128,31 @@ def fit(
     method: Annotated[
         str,
         typer.Option(
-            help="network, paper-network, trees, spectrum or linear; auto: what is right most often of clips held out."
+            help="network, paper-network, trees, spectrum or linear; auto: the method that classifies most "
+            "held-out clips "
+            "correctly."
         ),
     ] = "auto",
     loudness: Annotated[
         str,
         typer.Option(
-            help="counts, or ignored, so that gain does not matter; auto: counts where more clips held out are then "
-            "named right."
+            help="counts: loudness is a feature; ignored: it is not, so that gain does not matter; auto: counts "
+            "if more "
+            "held-out clips are then classified correctly."
         ),
     ] = "auto",
     batches: Annotated[
-        int | None, typer.Option(help="Batches a network is trained for, at most (default 1500).")
+        int | None, typer.Option(help="Maximum number of batches for which a network is trained (default 1500).")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of the random numbers that networks are drawn and trained by.")] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Seed of the random numbers for the initial weights and the training of networks.")
+    ] = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Learn to name sounds from labelled clips; says how well, on clips that were held out.
+    """Train a classifier of sounds on labelled clips; prints its accuracy on held-out clips.
 
     Writes listener.jeit, report.json and learning.png, the confusion matrix, to the folder MODEL.
-    Killed and called again, it goes on where it was.
+    If the command is interrupted, the same command resumes the training.
     """
     import shutil
 
@@ -154,12 +165,12 @@ def fit(
     from jeit.touch.listening.learners import BATCHES
     from jeit.touch.reports.listener import LISTENER_FILES, summary, write_listener
 
-    need_extra("learn", "learning what is heard")
+    need_extra("learn", "training a classifier of sounds")
     if loudness not in _LOUDNESS:
         raise ValueError(f"--loudness must be one of {', '.join(_LOUDNESS)}; it is '{loudness}'.")
     check_at_least({"--batches": (batches, 1), "--seed": (seed, 0)})
     if batches is not None and method in ("trees", "spectrum", "linear"):
-        raise ValueError(f"--batches is for networks, and --method {method} has none; leave one out.")
+        raise ValueError(f"--batches applies to networks only, not to --method {method}; leave one out.")
     if clips.resolve() in output.resolve().parents or clips.resolve() == output.resolve():
         raise ValueError(f"--output {output} lies in the folder of clips, where it would be a class; give another.")
     make_folder(output, LISTENER_FILES)
@@ -199,8 +210,8 @@ def fit(
     say_written(console, output / "listener.jeit", "report.json", "learning.png")
 
 
-def _show(console, result: "SoundLabels") -> None:
-    """The whole, and a line for each event."""
+def _print_summary(console, result: "SoundLabels") -> None:
+    """Print the class of the whole recording, and a line for each event."""
     from rich.table import Table
 
     from jeit.cli.console import pairs

@@ -17,9 +17,12 @@ if TYPE_CHECKING:
     from jeit.touch.networks import FrameDepth, ImageNetwork
 
 
-class _Given(NamedTuple):
-    """Frames of a file, volts, NaN where there is no reading, what number each has there, and the reference beside
-    them, if there is one."""
+class _FrameFile(NamedTuple):
+    """Frames read from a file.
+
+    `frames` (F, M): volts, NaN where there is no reading; `numbers` (F,): number of each frame in the file; `reference`
+    (r, M): frames of the untouched skin in the same file, volts, or None.
+    """
 
     frames: "Float[np.ndarray, 'F M']"
     numbers: "Int[np.ndarray, ' F']"
@@ -28,21 +31,23 @@ class _Given(NamedTuple):
 
 def image_by_network(
     model: Path | None,
-    given: tuple[Any, Path | None, str | None, str | None],
+    inputs: tuple[Any, Path | None, str | None, str | None],
     output: Path,
     *,
     method: str | None,
-    unused: dict[str, Any],
+    unused_options: dict[str, Any],
     quiet: bool,
     frame: int | str | None = None,
     streamed: bool = False,
 ) -> None:
-    """Image a file's frames, all of them where they are `streamed`, or those of standard input, "-".
+    """Image frames by the network in the file or folder `model`, and write the results to the folder `output`.
 
-    `given`: data, reference, format and description: that of the skin which the network learnt, or of a measurement; a
-    table of one frame a row needs neither. `unused`: options that a network has no use for, None where they were not
-    given. Raises `ValueError` where one was, without a model or a reference, for another method, data of another skin
-    or protocol, and where no frame could be imaged.
+    `inputs`: data file, or "-" for standard input; file of the reference; format of both; and description of the skin
+    that the network was trained for, or of a measurement. A table with one frame in each row needs neither format nor
+    description. `frame`: number of the frame to image, by default the first; if `streamed`, all frames are imaged.
+    `unused_options`: values of command-line options that do not apply to networks, None if not given. Raises
+    `ValueError` if one of them was given, without a model or a reference, for another method, for data of another skin
+    or protocol, and if no frame could be imaged.
     """
     import numpy as np
 
@@ -60,9 +65,9 @@ def image_by_network(
         raise ValueError(f"--model is for --method network, not {method or 'the default'}; leave one out.")
     if model is None:
         raise ValueError("--method network needs --model, the folder of 'jeit learn image'.")
-    if idle := [name for name, value in unused.items() if value is not None]:
+    if idle := [name for name, value in unused_options.items() if value is not None]:
         raise ValueError(f"--{idle[0]} has no use with --method network; leave it out.")
-    data, reference, kind, description = given
+    data, reference, kind, description = inputs
     console = plain_console()
     with Stopping() as stopping, Steps(console, quiet=quiet) as step:
         make_folder(output, DEPTH_FILES)
@@ -75,17 +80,19 @@ def image_by_network(
         base = (
             None
             if reference is None
-            else _read("--reference", reference, kind, description, network, None, plain=plain)
+            else _read_frame_file("--reference", reference, kind, description, network, None, is_table=plain)
         )
         still = None if base is None else base.frames
         if data == "-":
             frames, numbers = parse_frames(sys.stdin), None
         else:
             one = None if streamed else 0 if frame is None else frame
-            measured = _read("DATA", data, kind, description, network, one, plain=plain, like=reference)
+            measured = _read_frame_file(
+                "DATA", data, kind, description, network, one, is_table=plain, same_format_as=reference
+            )
             frames, numbers, still = measured.frames, measured.numbers, measured.reference if still is None else still
         if still is None:
-            raise ValueError("--reference: give a file of frames of the skin that nobody touches.")
+            raise ValueError("--reference: give a file of frames of the untouched skin.")
         rest = resting_frame(still, str(reference or data))
         step("image")
         come = FrameCounter(step, None if numbers is None else len(numbers))
@@ -113,7 +120,7 @@ def image_by_network(
     say_written(console, output / "frames.csv", "depth.npz", "depth.png", "report.json")
 
 
-def _read(
+def _read_frame_file(
     option: str,
     path: Path,
     kind: str | None,
@@ -121,11 +128,14 @@ def _read(
     network: "ImageNetwork",
     frame: int | str | None,
     *,
-    plain: bool,
-    like: Path | None = None,
-) -> _Given:
-    """All frames of a file, or the one asked for. A table that nothing describes has a frame a row, in the network's
-    order of channels, and so has one that is `plain`; its units and columns are those of the file that it is `like`."""
+    is_table: bool,
+    same_format_as: Path | None = None,
+) -> _FrameFile:
+    """Read all frames of a file, or only the one with the number `frame`.
+
+    A table without a description has one frame in each row, with its channels in the order of the network; so has every
+    file if `is_table`. Its units and columns are those of the file `same_format_as`, if that has a description.
+    """
     import numpy as np
 
     from jeit.cli.options import read_file
@@ -135,8 +145,8 @@ def _read(
     from jeit.touch.networks.measured import check_measured
 
     described = kind is not None or description is not None or table.find_description(path) is not None
-    if plain or (table.recognises(path) and not described):
-        beside = None if like is None or plain else table.find_description(like)
+    if is_table or (table.recognises(path) and not described):
+        beside = None if same_format_as is None or is_table else table.find_description(same_format_as)
         recording = read_frame_recording(path, None if beside is None else load_description(beside))
         frames, still = recording.frames, recording.reference
         if frames.shape[1] != network.made_for["channels"]:
@@ -149,7 +159,7 @@ def _read(
             if not (isinstance(frame, int) and -len(frames) <= frame < len(frames)):
                 raise ValueError(f"--frame must be a number from 0 to {len(frames) - 1}; it is {frame!r}.")
             numbers = numbers[[frame]]
-        return _Given(frames[numbers], numbers, still)
+        return _FrameFile(frames[numbers], numbers, still)
     measured = read_file(option, path, kind, description)
     check_measured(network, measured)
     names, numbers = measured.frame_names, np.arange(measured.num_frames)
@@ -158,10 +168,10 @@ def _read(
     if frame is not None:
         frames = frames_of(measured.frame(frame))
         numbers = numbers[[names.index(frame) if isinstance(frame, str) else frame]]
-    return _Given(frames, numbers, still)
+    return _FrameFile(frames, numbers, still)
 
 
-learn = typer.Typer(name="learn", help="Networks that learn from simulated touches of a described skin.")
+learn = typer.Typer(name="learn", help="Train networks on simulated touches of a described skin.")
 
 
 @learn.callback(invoke_without_command=True)
@@ -183,25 +193,26 @@ def image(
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="MODEL", help="Folder for the network.", show_default=False)
     ],
-    preset: Annotated[str, typer.Option(help="full, or quick: two minutes, for a first look.")] = "full",
+    preset: Annotated[str, typer.Option(help="full; or quick, a training of two minutes.")] = "full",
     design: Annotated[
         str,
-        typer.Option(help="unrolled: a network that knows the skin's physics; three-stages: that of Park et al. 2022."),
+        typer.Option(help="unrolled: a network with the skin's forward model; three-stages: that of Park et al. 2022."),
     ] = "unrolled",
     touches: Annotated[
-        int | None, typer.Option(help="How many touches to learn from; as the preset says unless given.", min=1)
+        int | None,
+        typer.Option(help="Number of simulated touches in the training set (default: that of the preset).", min=1),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of touches and starting weights.", min=0)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the random touches and of the initial weights.", min=0)] = 0,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="Address of a dask scheduler, whose workers simulate; in this process unless given."),
+        typer.Option(help="Address of a dask scheduler whose workers simulate the touches (default: this process)."),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Learn to image how deep a skin is indented: simulates touches, trains a network, and says how well it does.
+    """Train a network that images indentation depth: simulates touches, trains on them, and prints the accuracy.
 
-    Writes network.jeit, report.json and learning.png to the folder MODEL; touches and trainings under way stay in
-    MODEL/work. Stopped or killed at any moment, the same command goes on where it was.
+    Writes network.jeit, report.json and learning.png to the folder MODEL. Simulated touches and unfinished trainings
+    are stored in MODEL/work: if the command is interrupted, the same command resumes.
     """
     from contextlib import ExitStack
 

@@ -48,27 +48,31 @@ def fit(
     method: Annotated[
         str | None,
         typer.Option(
-            help="ridge, neighbours, gaussian-process, trees, forest, network, som, blend for places and forces; one "
-            "of the classifiers of labels; auto (default): what errs least on presses held out."
+            help="ridge, neighbours, gaussian-process, trees, forest, network, som, blend for places and forces; or "
+            "a classifier of labels; auto (default): the method with the lowest error on held-out presses."
         ),
     ] = None,
     description: Annotated[
         Path | None,
         typer.Option(
             metavar="SKIN.toml",
-            help="Geometry, electrodes and protocol of the skin, if they are known: its images are then learnt from "
-            "too, and fewer presses are enough.",
+            help="Geometry, electrodes and protocol of the skin, if known: images of the skin are then used as "
+            "features too, so that fewer presses are needed.",
         ),
     ] = None,
     channels: Annotated[
-        int | None, typer.Option(help="Use only so many channels, the most informative (default: all).")
+        int | None, typer.Option(help="Number of channels to use, the most informative ones (default: all).")
     ] = None,
     per_session: Annotated[
-        bool, typer.Option("--per-session", help="Standardise the changes of each group by themselves, against drift.")
+        bool,
+        typer.Option(
+            "--per-session",
+            help="Standardise the changes of each group separately, which removes drift between groups.",
+        ),
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Learn a skin from recorded presses; says how well, on presses that were held out, in stretches of time.
+    """Train models of a skin on recorded presses; prints their errors on presses held out in intervals of time.
 
     Writes skin.skops, report.json and learning.png, a picture of the errors, to the folder SKIN.
     """
@@ -116,7 +120,10 @@ def fit(
 @touch.command()
 def predict(
     skin: Annotated[
-        Path, typer.Argument(metavar="SKIN", help="Folder of 'jeit touch fit', or its skin.skops.", show_default=False)
+        Path,
+        typer.Argument(
+            metavar="SKIN", help="Folder that 'jeit touch fit' wrote, or the file skin.skops in it.", show_default=False
+        ),
     ],
     frames: Annotated[
         Path,

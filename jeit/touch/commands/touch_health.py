@@ -10,20 +10,22 @@ import typer
 from jeit.cli.options import Quiet, check_positive, make_folder, naming_options
 
 # Number of frames processed between two progress messages.
-_AT_ONCE = 500
+_FRAMES_PER_MESSAGE = 500
 
 
 def health(
     recording: Annotated[
         Path,
         typer.Argument(
-            help="Frames of the skin to be judged: .npz with frames (F, M) and seconds (F,), or a table of them.",
+            help="Recording of the skin to be checked: .npz with frames (F, M) and seconds (F,), or a table of frames.",
             show_default=False,
         ),
     ],
     healthy: Annotated[
         Path,
-        typer.Option(help="The same of the skin while it was healthy, with touches at best.", show_default=False),
+        typer.Option(
+            help="Recording of the same skin while it was healthy, preferably with touches.", show_default=False
+        ),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for events.csv and health.png.", show_default=False)
@@ -32,27 +34,31 @@ def health(
         Path | None,
         typer.Option(
             metavar="SKIN.toml",
-            help="Description of the skin: with its protocol electrodes are named, with geometry and electrodes too "
-            "cuts are drawn.",
+            help="Description of the skin: with a protocol, failing electrodes are identified; with geometry and "
+            "electrodes too, cuts are located and drawn.",
         ),
     ] = None,
     lowers: Annotated[
         bool, typer.Option("--lowers", help="A touch lowers conductivity, as on hydrogel (default: it raises it).")
     ] = False,
     rate: Annotated[
-        float | None, typer.Option(help="Frames in a second, where no times say; else frames count.")
+        float | None,
+        typer.Option(
+            help="Frames per second, if the recordings have no times; without it, times are numbers of frames."
+        ),
     ] = None,
     patience: Annotated[
         float | None,
         typer.Option(
-            help="Seconds (frames, where there are no times) that no touch is held (default 30 s, or three windows)."
+            help="Time that no touch lasts, in seconds, or in frames if there are no times (default 30 s, or three "
+            "windows)."
         ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Detect cuts, failing electrodes and repair of a skin: a recording, compared with one of the healthy skin.
+    """Detect cuts, failing electrodes and repairs by comparing a recording with one of the healthy skin.
 
-    Writes events.csv, report.json and health.png. Nothing is asked of the skin: any number of channels, any unit.
+    Writes events.csv, report.json and health.png. The skin may have any number of channels, in any unit.
     """
     import numpy as np
 
@@ -90,9 +96,11 @@ def health(
         with naming_options({"frames": f"'{recording}'"}):
             doubts = doubts_of(sound, known, judged.frames)
         now = sound
-        for first in range(0, len(times), _AT_ONCE):
+        for first in range(0, len(times), _FRAMES_PER_MESSAGE):
             step.report(f"{first:,} of {counted(len(times), 'frame')}")
-            now = watch(now, judged.frames[first : first + _AT_ONCE], times[first : first + _AT_ONCE])
+            now = watch(
+                now, judged.frames[first : first + _FRAMES_PER_MESSAGE], times[first : first + _FRAMES_PER_MESSAGE]
+            )
         step("write")
         write_health(now, times, judged.frames, output, name=recording.name, timed=seconds is not None, notes=doubts)
     if quiet:

@@ -23,8 +23,8 @@ def gestures(
         typer.Argument(
             metavar="RECORDINGS.npz",
             help="n recordings, one after the other: voltages (F, M) and seconds (F,) of all frames; start (n + 1,), "
-            "where each begins among them; gesture (n,) text; person (n,), if more than one; reference (M,) and "
-            "untouched (u, M), frames of the untouched skin.",
+            "number of the first frame of each recording, and F; gesture (n,) text; person (n,), if more than one; "
+            "reference (M,) and untouched (u, M), frames of the untouched skin.",
             show_default=False,
         ),
     ],
@@ -36,13 +36,13 @@ def gestures(
     method: Annotated[
         str | None,
         typer.Option(
-            help="logit-boost, linear-discriminant, temporal-network or another classifier; auto (default): what is "
-            "right most often of people held out."
+            help="logit-boost, linear-discriminant, temporal-network or another classifier; auto (default): the "
+            "classifier that is most accurate for held-out people."
         ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Learn gestures from recordings of them; says how often those of people who were held out are named correctly.
+    """Train a gesture classifier on recordings; prints its accuracy for people who were held out of the training.
 
     Writes gestures.skops, report.json and gestures.png, the confusion matrix, to the folder MODEL.
     """
@@ -84,34 +84,40 @@ def watch(
     stream: Annotated[
         str,
         typer.Argument(
-            help="File of frames (.npz with frames and seconds, or a table), or - for standard input: a frame a line, "
-            "its voltages parted by spaces or commas (nan: no reading).",
+            help="File of frames (.npz with frames and seconds, or a table), or - for standard input: one frame in "
+            "each line, its voltages separated by spaces or commas (nan: no reading).",
             show_default=False,
         ),
     ],
     skin: Skin,
     gestures: Annotated[
-        Path, typer.Option(metavar="MODEL", help="Folder of 'jeit touch gestures', or its file.", show_default=False)
+        Path,
+        typer.Option(
+            metavar="MODEL", help="Folder that 'jeit touch gestures' wrote, or the file in it.", show_default=False
+        ),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for events.csv and timeline.png.", show_default=False)
     ],
     reference: Annotated[
         Path | None,
-        typer.Option(help="File of frames of the untouched skin; else the stream's own, or how it begins."),
+        typer.Option(
+            help="File of frames of the untouched skin; by default the reference in the stream's file, or the first "
+            "frames of the stream."
+        ),
     ] = None,
     untouched: Annotated[
-        float, typer.Option(help="Seconds at the stream's beginning in which nobody touches the skin.")
+        float, typer.Option(help="Seconds at the start of the stream in which nobody touches the skin.")
     ] = 1.0,
     rate: Annotated[
         float | None,
         typer.Option(
-            help="Frames in a second, where no times say; that of what was learnt unless given. Standard "
-            "input: the clock."
+            help="Frames per second, if the stream has no times; by default that of the training recordings. Frames "
+            "from standard input are timed by the clock."
         ),
     ] = None,
     patience: Annotated[
-        float, typer.Option(help="Seconds after which a touch is taken for how the skin is now.")
+        float, typer.Option(help="Seconds after which a lasting touch becomes part of the reference.")
     ] = 30.0,
     quiet: Quiet = False,
     as_is: AsIs = False,
@@ -154,7 +160,7 @@ def watch(
                     still = live.untouched(untouched)
                 frames, own = live, live.rate_seen
             else:
-                frames, still, own = _recorded(Path(stream), description, still, untouched, rate or usual)
+                frames, still, own = _read_recording(Path(stream), description, still, untouched, rate or usual)
             step("prepare")
             images = TouchImages.prepare(description, still, replace(TOUCH_IMAGES, as_is=as_is), progress=step.report)
             watch = TouchWatch.create(images, model, still, rate=own, patience=patience)
@@ -171,16 +177,16 @@ def watch(
             # prediction.
             ended = one.ended if stream != "-" else () if one.named is None else (one.named,)
             for touch in () if quiet else ended:
-                console.print(_line(touch))
+                console.print(_touch_line(touch))
 
         written = write_watch(watch.follow(stopping.until(frames)), watch, output, name=stream, progress=show)
     if not quiet:
-        _say(console, written, live, output)
+        _print_summary(console, written, live, output)
     if stopping.signal == signal.SIGTERM:
         raise typer.Exit(128 + signal.SIGTERM)
 
 
-def _say(console, written, live, output: Path) -> None:
+def _print_summary(console, written, live, output: Path) -> None:
     """Print a summary of the touches."""
     import numpy as np
 
@@ -201,7 +207,7 @@ def _say(console, written, live, output: Path) -> None:
     say_written(console, output / "events.csv", "paths.csv", "report.json", "timeline.png")
 
 
-def _recorded(path: Path, description, still, span: float, rate: float):
+def _read_recording(path: Path, description, untouched, span: float, rate: float):
     """Frames of a file with their seconds, those of the untouched skin, and the rate."""
     import numpy as np
 
@@ -214,17 +220,16 @@ def _recorded(path: Path, description, still, span: float, rate: float):
         seconds = np.arange(len(recording.frames)) / rate
     elif len(seconds) > 1 and np.median(np.diff(seconds)) > 0:
         rate = 1 / float(np.median(np.diff(seconds)))
-    if still is None:
+    if untouched is None:
         with naming_options({"untouched": "--untouched"}):
-            still = untouched_frames(recording, seconds, span)
-    return zip(seconds.tolist(), recording.frames, strict=True), still, rate
+            untouched = untouched_frames(recording, seconds, span)
+    return zip(seconds.tolist(), recording.frames, strict=True), untouched, rate
 
 
-def _line(one) -> str:
-    course = one.touch.course
+def _touch_line(touch) -> str:
+    course = touch.touch.course
     x, y = 1e3 * course.centroid[int(course.peak.argmax())]
-    name = "unlike any" if one.unlike else f"{one.gesture:<12}{100 * one.probability:3.0f} %"
-    name += ", held" if one.held else ", cut off" if one.touch.cut_off else ""
-    return (
-        f"  {one.touch.onset:8.2f} s  {one.touch.offset - one.touch.onset:5.2f} s  {name:<18} ({x:+.0f}, {y:+.0f}) mm"
-    )
+    name = "unlike any" if touch.unlike else f"{touch.gesture:<12}{100 * touch.probability:3.0f} %"
+    name += ", held" if touch.held else ", cut off" if touch.touch.cut_off else ""
+    duration = touch.touch.offset - touch.touch.onset
+    return f"  {touch.touch.onset:8.2f} s  {duration:5.2f} s  {name:<18} ({x:+.0f}, {y:+.0f}) mm"

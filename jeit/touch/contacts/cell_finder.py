@@ -133,9 +133,9 @@ class CellFinder(AbstractFinder):
         basin = basins(clear, self.shared, floor=0.0, least_prominence=self.least_prominence)
         peaks = np.unique(basin[basin >= 0])
         strong = peaks[change[peaks] >= self.least_peak * change[peaks].max(initial=0.0)]
-        return [self._contact(change, noise, peak, basin == peak) for peak in strong.tolist()]
+        return [self._describe_contact(change, noise, peak, basin == peak) for peak in strong.tolist()]
 
-    def _contact(self, change: np.ndarray, noise: ImageNoise, peak: int, basin: np.ndarray) -> Contact:
+    def _describe_contact(self, change: np.ndarray, noise: ImageNoise, peak: int, basin: np.ndarray) -> Contact:
         level = self.level * change[peak]
         region = np.flatnonzero(basin & (change >= level))
         area, centre = self.areas[region], self.centres[region]

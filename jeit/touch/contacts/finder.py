@@ -70,18 +70,20 @@ def find_contacts(
     ignored. Raises `ValueError` for an image of another mesh, NaN, and noise of another mesh.
     """
     check_kind("finder", finder, AbstractFinder, "a finder, such as CellFinder(mesh)")
-    change = checked_image(finder, image)
-    return turned(finder, finder.find(change, checked_noise(change, noise)))
+    change = signed_image(finder, image)
+    return restore_sign(finder, finder.find(change, noise_or_estimate(change, noise)))
 
 
-def turned(finder: AbstractFinder, found: list[Contact]) -> list[Contact]:
+def restore_sign(finder: AbstractFinder, contacts: list[Contact]) -> list[Contact]:
     """Restore the original sign of contacts found in a change that makes them positive; sort them, strongest first."""
     if finder.sign < 0:
-        found = [eqx.tree_at(lambda one: (one.peak, one.integral), one, (-one.peak, -one.integral)) for one in found]
-    return sorted(found, key=lambda one: -abs(one.peak))
+        contacts = [
+            eqx.tree_at(lambda one: (one.peak, one.integral), one, (-one.peak, -one.integral)) for one in contacts
+        ]
+    return sorted(contacts, key=lambda one: -abs(one.peak))
 
 
-def checked_noise(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> ImageNoise:
+def noise_or_estimate(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> ImageNoise:
     """Return the `noise` of a change (m,), estimated from the change if None.
 
     Raises `ValueError` for noise of another mesh, and for anything but `ImageNoise`.
@@ -90,11 +92,13 @@ def checked_noise(change: Float[np.ndarray, " m"], noise: ImageNoise | None) -> 
         return ImageNoise.of_image(change)
     check_kind("noise", noise, ImageNoise, "ImageNoise, such as ImageNoise.of_frames(reconstruction, frames)")
     if noise.deviation.shape != change.shape:
-        raise ValueError(f"noise is of {noise.deviation.size} cells, and the image of {change.size}; both of one mesh.")
+        raise ValueError(
+            f"noise is of {noise.deviation.size} cells, and the image of {change.size}; give both on the same mesh."
+        )
     return noise
 
 
-def checked_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
+def signed_image(finder: AbstractFinder, image) -> Float[np.ndarray, " m"]:
     """Return an image multiplied by the finder's sign, so that contacts are positive.
 
     Raises `ValueError` unless the image is real, finite, and on the finder's mesh.
@@ -125,7 +129,7 @@ def check_finder(mesh: Mesh, sign: int, floor: float, *, flat: bool = True) -> N
         raise ValueError("mesh has three dimensions; contacts are found on sheets: reconstruct on a 2-D mesh.")
     if not (is_number(sign) and sign in (1, -1)):
         raise ValueError(
-            f"sign must be 1, where touched skin conducts better, or -1, where worse; it is {describe(sign)}."
+            f"sign must be 1, if touched skin conducts better, or -1, if it conducts worse; it is {describe(sign)}."
         )
     if not (is_number(floor) and floor >= 0):
         raise ValueError(f"floor must be zero or more, in standard deviations; it is {describe(floor)}.")
@@ -134,4 +138,4 @@ def check_finder(mesh: Mesh, sign: int, floor: float, *, flat: bool = True) -> N
 def check_share(name: str, value) -> None:
     """Check that a value is a fraction, from 0 to below 1. Raises `ValueError` otherwise."""
     if not (is_number(value) and 0 <= value < 1):
-        raise ValueError(f"{name} must be a share, from 0 to below 1; it is {describe(value)}.")
+        raise ValueError(f"{name} must be a fraction, from 0 to below 1; it is {describe(value)}.")

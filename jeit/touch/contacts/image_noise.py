@@ -16,7 +16,7 @@ from jeit.inverse.linear.one_step import LinearReconstruction
 _LEAST_FRAMES = 10
 # For normal noise: ratio of the standard deviation to the median absolute value; number of standard deviations within
 # which cells are kept; ratio of the standard deviation of all cells to that of the cells kept.
-_NORMAL, _OFF, _WITHIN = 1.4826, 3.0, 1.0136
+_DEVIATION_PER_MEDIAN, _CLIP_AT, _CLIPPED_DEVIATION = 1.4826, 3.0, 1.0136
 # Maximum number of rounds of clipping.
 _ROUNDS = 20
 
@@ -65,7 +65,7 @@ class ImageNoise(eqx.Module):
         if (frames == frames[0]).all():
             raise ValueError("frames are all the same and show no noise. Give what was read, not copies of a frame.")
         strayed = np.asarray(reconstruction.image(frames - frames.mean(axis=0)))
-        return cls._of_factor(strayed / np.sqrt(len(frames) - 1))
+        return cls._from_factor(strayed / np.sqrt(len(frames) - 1))
 
     @classmethod
     def of_channels(cls, reconstruction: LinearReconstruction, deviation: ArrayLike) -> "ImageNoise":
@@ -81,7 +81,7 @@ class ImageNoise(eqx.Module):
             raise ValueError(f"deviation has shape {deviation.shape}; give one number, or ({number},), volts.")
         if not (np.isfinite(deviation).all() and (deviation >= 0).all() and deviation.any()):
             raise ValueError("deviation must be finite, zero or more, and not zero for all channels, in volts.")
-        return cls._of_factor(np.broadcast_to(deviation, number)[:, None] * np.asarray(reconstruction.matrix).T)
+        return cls._from_factor(np.broadcast_to(deviation, number)[:, None] * np.asarray(reconstruction.matrix).T)
 
     @classmethod
     def of_image(cls, image: Float[np.ndarray, " m"]) -> "ImageNoise":
@@ -98,7 +98,7 @@ class ImageNoise(eqx.Module):
         return cls(np.full(values.shape, _clipped_deviation(values)))
 
     @classmethod
-    def _of_factor(cls, factor: np.ndarray) -> "ImageNoise":
+    def _from_factor(cls, factor: np.ndarray) -> "ImageNoise":
         return cls(np.sqrt((factor**2).sum(axis=0)), factor)
 
     def distance(self, slope: Float[np.ndarray, "m 2"]) -> float:
@@ -129,9 +129,9 @@ def _clipped_deviation(values: Float[np.ndarray, " m"]) -> float:
     kept = values
     for _ in range(_ROUNDS):
         middle = np.median(kept)
-        spread = _NORMAL * np.median(np.abs(kept - middle))
-        within = values[np.abs(values - middle) <= _OFF * spread]
+        spread = _DEVIATION_PER_MEDIAN * np.median(np.abs(kept - middle))
+        within = values[np.abs(values - middle) <= _CLIP_AT * spread]
         if len(within) == len(kept):
             break
         kept = within
-    return float(_WITHIN * kept.std())
+    return float(_CLIPPED_DEVIATION * kept.std())

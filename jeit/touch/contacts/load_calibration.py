@@ -98,16 +98,18 @@ class LoadCalibration(eqx.Module):
         logarithm = np.log(np.abs(peaks))
         begin = np.array([logarithm.max(), 0.0, 0.0, np.log(np.median(loads))])
 
-        def left(parameters):
+        def residuals(parameters):
             return _log_peak(parameters, distance, loads) - logarithm
 
         # Weak priors, each with the weight of a thousandth of a reading, for parameters that places or loads do not
         # determine.
         weak = np.sqrt(1e-3) * np.array([0.0, 0.3, 0.3, 0.3])
-        found = least_squares(lambda parameters: np.concatenate([left(parameters), weak * (parameters - begin)]), begin)
+        found = least_squares(
+            lambda parameters: np.concatenate([residuals(parameters), weak * (parameters - begin)]), begin
+        )
         if not found.success:
             raise ValueError(f"contacts and loads: no curve fits them ({found.message}).")
-        scatter = float(np.sqrt((left(found.x) ** 2).sum() / (len(loads) - len(begin))))
+        scatter = float(np.sqrt((residuals(found.x) ** 2).sum() / (len(loads) - len(begin))))
         covariance = scatter**2 * np.linalg.inv(found.jac.T @ found.jac)
         highest = float((loads / (loads + np.exp(found.x[3]))).max())
         span = float(loads.min()), float(loads.max())

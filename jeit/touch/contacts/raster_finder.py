@@ -20,7 +20,14 @@ from jeit.arguments.extras import optional
 from jeit.image import Raster
 from jeit.mesh import Mesh
 from jeit.touch.contacts.cell_finder import gaussian_means
-from jeit.touch.contacts.finder import AbstractFinder, Contact, check_finder, checked_image, checked_noise, turned
+from jeit.touch.contacts.finder import (
+    AbstractFinder,
+    Contact,
+    check_finder,
+    noise_or_estimate,
+    restore_sign,
+    signed_image,
+)
 from jeit.touch.contacts.image_noise import ImageNoise
 
 # Width in pixels of the band along a contact's edge in which cells may join or leave the contact.
@@ -83,7 +90,7 @@ class RasterFinder(AbstractFinder):
         `ImportError` without OpenCV, and `ValueError` for a three-dimensional mesh and sizes that are not odd numbers
         of pixels.
         """
-        _opencv()
+        _import_opencv()
         check_finder(mesh, sign, floor)
         for name, value, least in (("block", block, 3), ("opening", opening, 1)):
             if not (isinstance(value, int) and value >= least and value % 2):
@@ -105,14 +112,14 @@ class RasterFinder(AbstractFinder):
     def stages(self, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None) -> RasterStages:
         """Compute the results of all steps for an image (m,) and its noise; arguments and errors are those of
         `find_contacts`."""
-        change = checked_image(self, image)
-        found = self._stages(change, checked_noise(change, noise))
-        own = self.sign * found.region, turned(self, found.contacts)
+        change = signed_image(self, image)
+        found = self._stages(change, noise_or_estimate(change, noise))
+        own = self.sign * found.region, restore_sign(self, found.contacts)
         return eqx.tree_at(lambda stages: (stages.region, stages.contacts), found, own)
 
     def _stages(self, change: Float[np.ndarray, " m"], noise: ImageNoise) -> RasterStages:
         """Compute the results of all steps for a `change` (m,) whose sign makes contacts positive."""
-        opencv = _opencv()
+        opencv = _import_opencv()
         cell = np.asarray(self.raster.cell)
         inside = cell >= 0
         change, clear = self.above_noise(change, noise)
@@ -200,5 +207,5 @@ class RasterFinder(AbstractFinder):
         return density / deviation, np.sqrt(np.maximum(chance * (1 - chance) - density**2, 0.0))
 
 
-def _opencv() -> Any:
+def _import_opencv() -> Any:
     return optional("cv2", "RasterFinder", "CellFinder needs nothing more.")

@@ -13,9 +13,9 @@ from jeit.arguments import check_kind, check_metres, describe, is_number, real_a
 from jeit.touch.contacts.finder import Contact
 
 # Fraction of a contact's prediction error that corrects the velocity: one half averages the noise of two frames.
-_BELIEVED = 0.5
+_VELOCITY_GAIN = 0.5
 # Number of gaps for which a touch is kept while it is hidden by another touch's contact.
-_HIDDEN = 4
+_HIDDEN_GAPS = 4
 
 
 class TouchPath(eqx.Module):
@@ -126,7 +126,7 @@ class ContactTracker(eqx.Module):
         # The interval between frames is added, up to the gap, so that a single missing frame of a slow stream is
         # bridged too.
         spare = min(passed, self.gap)
-        waited = [time - one.seen[-1][0] > self.gap * (_HIDDEN if one.hidden else 1) + spare for one in self.open]
+        waited = [time - one.seen[-1][0] > self.gap * (_HIDDEN_GAPS if one.hidden else 1) + spare for one in self.open]
         late = [one for one, over in zip(self.open, waited, strict=True) if over]
         going = [one for one, over in zip(self.open, waited, strict=True) if not over]
         expected = np.array([one.at(time) for one in going]).reshape(-1, 1, 2)
@@ -140,7 +140,7 @@ class ContactTracker(eqx.Module):
         lost = [row for row in range(len(going)) if row not in pairs]
         hidden = {row for row in lost for one in pairs.values() if distance[row, one] <= wide[one]}
         followed = [
-            _updated_touch(one, time, contacts[pairs[row]])
+            _update_touch(one, time, contacts[pairs[row]])
             if row in pairs
             else _TrackedTouch(one.number, time, one.at(time), one.velocity, one.seen, row in hidden)
             for row, one in enumerate(going)
@@ -149,17 +149,17 @@ class ContactTracker(eqx.Module):
         first = [
             _TrackedTouch(self.number + k, time, one.centroid, np.zeros(2), ((time, one),)) for k, one in enumerate(new)
         ]
-        closed = self.closed + self._paths_of(late)
+        closed = self.closed + self._finished_paths(late)
         values = (time, (*followed, *first), closed, self.number + len(new))
         return ContactTracker(self.gap, self.reach, self.fastest, self.least, *values)
 
     @property
     def touches(self) -> list[TouchPath]:
         """All touches so far, including the current ones, in order of onset."""
-        return sorted(self.closed + self._paths_of(self.open), key=lambda path: path.number)
+        return sorted(self.closed + self._finished_paths(self.open), key=lambda path: path.number)
 
-    def _paths_of(self, followed: Iterable[_TrackedTouch]) -> tuple[TouchPath, ...]:
-        return tuple(one.path() for one in followed if len(one.seen) >= self.least)
+    def _finished_paths(self, tracked: Iterable[_TrackedTouch]) -> tuple[TouchPath, ...]:
+        return tuple(one.path() for one in tracked if len(one.seen) >= self.least)
 
 
 def track_contacts(
@@ -184,8 +184,8 @@ def track_contacts(
     return tracker.touches
 
 
-def _updated_touch(one: _TrackedTouch, time: float, contact: Contact) -> _TrackedTouch:
+def _update_touch(touch: _TrackedTouch, time: float, contact: Contact) -> _TrackedTouch:
     """Return the state of a touch after a frame in which it is seen as this contact."""
-    off = (contact.centroid - one.at(time)) / (time - one.time)
-    velocity = one.velocity + _BELIEVED * off
-    return _TrackedTouch(one.number, time, contact.centroid, velocity, (*one.seen, (time, contact)))
+    off = (contact.centroid - touch.at(time)) / (time - touch.time)
+    velocity = touch.velocity + _VELOCITY_GAIN * off
+    return _TrackedTouch(touch.number, time, contact.centroid, velocity, (*touch.seen, (time, contact)))

@@ -24,12 +24,12 @@ FEATURES = {
 """Names of the seven features of a touch, and their units; "image" stands for the unit of the images."""
 
 # Number of instants, evenly spaced from onset to end of a touch, at which the maximum change P is sampled.
-_PLACES = 16
+_INSTANTS = 16
 _FURTHER = (
     "area", "area spread", "path length", "farthest", "speed", "fastest", "straightness", "peaks", "rise", "decay",
     "roughness", "pauses", "centre of gravity", "breadth",
 )  # fmt: skip
-COURSE_FEATURES = (*FEATURES, *_FURTHER, *(f"course {one + 1}" for one in range(_PLACES)))
+COURSE_FEATURES = (*FEATURES, *_FURTHER, *(f"course {one + 1}" for one in range(_INSTANTS)))
 """Names of the features of `course_features`: the seven, further ones of the time course, and samples of P."""
 
 SEQUENCE_PLACES = 32
@@ -67,7 +67,7 @@ def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Touc
     between the first and the last centroid, m. Silvera Tawil et al. (2011), table II and section IV-A. Raises
     `ValueError` if `touches` is not a list of touches.
     """
-    courses = _courses(touches)
+    courses = _time_courses(touches)
     values = np.array([_seven_features(one) for one in courses]).reshape(len(courses), len(FEATURES))
     return TouchFeatures(values, tuple(FEATURES), tuple(FEATURES.values()))
 
@@ -82,10 +82,10 @@ def course_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Tou
     time, divided by the duration and weighted by P; P / max P at instants evenly spaced in time. Raises `ValueError` if
     `touches` is not a list of touches.
     """
-    courses = _courses(touches)
+    courses = _time_courses(touches)
     seven = touch_features(touches)
-    values = np.array([_further_features(one) for one in courses]).reshape(len(courses), len(_FURTHER) + _PLACES)
-    units = ("m²", "1", "m", "m", "m/s", "m/s", "1", "1", "s", "s", "1", "1", "1", "1", *["1"] * _PLACES)
+    values = np.array([_further_features(one) for one in courses]).reshape(len(courses), len(_FURTHER) + _INSTANTS)
+    units = ("m²", "1", "m", "m", "m/s", "m/s", "1", "1", "s", "s", "1", "1", "1", "1", *["1"] * _INSTANTS)
     return TouchFeatures(np.hstack([seven.values, values]), COURSE_FEATURES, (*seven.units, *units))
 
 
@@ -97,7 +97,7 @@ def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> T
     position of the centroid along its main direction of movement, with the sign that makes the largest displacement
     positive. Raises `ValueError` if `touches` is not a list of touches.
     """
-    courses = _courses(touches)
+    courses = _time_courses(touches)
     whole = course_features(touches)
     wide = SEQUENCE_PLACES * len(SEQUENCE_VALUES)
     values = np.array([_sampled_course(one).ravel() for one in courses]).reshape(len(courses), wide)
@@ -105,7 +105,7 @@ def sequence_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> T
     return TouchFeatures(np.hstack([whole.values, values]), SEQUENCE_FEATURES, (*whole.units, *units))
 
 
-def _courses(touches) -> list[ChangeCourse]:
+def _time_courses(touches) -> list[ChangeCourse]:
     check_kind("touches", touches, (list, tuple), "a list of touches, such as of find_touches")
     for number, one in enumerate(touches):
         check_kind(f"touches[{number}]", one, StreamTouch, "a StreamTouch, such as of find_touches")
@@ -156,7 +156,7 @@ def _further_features(course: ChangeCourse) -> list[float]:
         float(np.mean(share < 0.5)),
         middle,
         float(np.sqrt(weight @ (when - middle) ** 2)),
-        *np.interp(np.linspace(0, 1, _PLACES), when, share),
+        *np.interp(np.linspace(0, 1, _INSTANTS), when, share),
     ]
 
 

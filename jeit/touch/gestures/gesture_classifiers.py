@@ -17,7 +17,7 @@ from jeit.touch.gestures.features import (
     touch_features,
 )
 from jeit.touch.learnt.array_models import Forest
-from jeit.touch.learnt.extras import over_folds
+from jeit.touch.learnt.extras import apply_over_folds
 from jeit.touch.learnt.methods import CLASSIFIERS, log_odds
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
@@ -27,7 +27,7 @@ def logit_boost(features: Float[np.ndarray, "n k"], label: np.ndarray) -> Forest
     faster."""
     from jeit.touch.gestures.logit_boost import LogitBoostClassifier
 
-    return Forest.of_stumps(LogitBoostClassifier().fit(features, label))
+    return Forest.from_stumps(LogitBoostClassifier().fit(features, label))
 
 
 def temporal_network(features: Float[np.ndarray, "n k"], label: np.ndarray) -> TemporalNetwork:
@@ -42,7 +42,7 @@ GESTURE_CLASSIFIERS: dict[str, Callable[..., Any]] = {
 }
 """Functions that fit classifiers, by name: LogitBoost, the nine of learnt skins, and a network for the time course."""
 
-FORMS: dict[str, Callable[..., Any]] = {
+FEATURE_FORMS: dict[str, Callable[..., Any]] = {
     "seven": touch_features,
     "course": course_features,
     "sequence": sequence_features,
@@ -50,8 +50,8 @@ FORMS: dict[str, Callable[..., Any]] = {
 """Functions that compute features of touches, by name: the seven, those with more of the time course, and all."""
 
 
-def forms_of(method: str) -> tuple[str, ...]:
-    """Return the names in `FORMS` of the features that a classifier can be fitted to."""
+def feature_forms(method: str) -> tuple[str, ...]:
+    """Return the names in `FEATURE_FORMS` of the features that a classifier can be fitted to."""
     return ("sequence",) if method == "temporal-network" else ("seven", "course")
 
 
@@ -68,7 +68,7 @@ class Scale:
     deviation: Float[np.ndarray, " k"]
 
     @classmethod
-    def of(cls, values: Float[np.ndarray, "n k"]) -> "Scale":
+    def from_features(cls, values: Float[np.ndarray, "n k"]) -> "Scale":
         """Estimate the scale from features (n, k); `size` is the median of |x|. Constant features become zero."""
         size = np.median(np.abs(values), axis=0)
         size = np.where(size > 0, size, np.maximum(np.abs(values).max(axis=0), 1e-300))
@@ -82,44 +82,47 @@ class Scale:
 
 
 def held_out_odds(
-    method: str, values: Float[np.ndarray, "n k"], right: Int[np.ndarray, " n"], folds: Int[np.ndarray, " n"]
+    method: str, features: Float[np.ndarray, "n k"], true_classes: Int[np.ndarray, " n"], folds: Int[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n C"]:
     """Compute log-odds (n, C) of the classes of n touches by cross-validation.
 
-    The touches of each fold are classified by the classifier `method`, fitted to all other folds. `values` (n, k):
-    features; `right` (n,): true classes, 0 … C − 1; `folds` (n,): number of the fold of each touch. The log-odds are
-    those of `log_odds`; a class that the other folds lack has −1000. Raises `ValueError` if the other folds contain
+    The touches of each fold are classified by the classifier `method`, fitted to all other folds. `features` (n, k):
+    features; `true_classes` (n,): true classes, 0 … C − 1; `folds` (n,): number of the fold of each touch. The log-odds
+    are those of `log_odds`; a class that the other folds lack has −1000. Raises `ValueError` if the other folds contain
     only one class.
     """
-    odds = np.full((len(right), right.max() + 1), -1e3)
+    odds = np.full((len(true_classes), true_classes.max() + 1), -1e3)
 
     def predict(fold: int) -> None:
         out = folds == fold
-        if len(np.unique(right[~out])) < 2:
-            raise ValueError("labels: but for one fold, or person, there is one gesture only; give touches of more.")
-        scale = Scale.of(values[~out])
-        model = GESTURE_CLASSIFIERS[method](scale(values[~out]), right[~out])
-        odds[np.ix_(out, model.classes_)] = log_odds(model, scale(values[out]))
+        if len(np.unique(true_classes[~out])) < 2:
+            raise ValueError(
+                "labels: without the touches of one fold, or person, only one gesture remains; give touches of more."
+            )
+        scale = Scale.from_features(features[~out])
+        model = GESTURE_CLASSIFIERS[method](scale(features[~out]), true_classes[~out])
+        odds[np.ix_(out, model.classes_)] = log_odds(model, scale(features[out]))
 
-    over_folds(predict, int(folds.max()) + 1)
+    apply_over_folds(predict, int(folds.max()) + 1)
     return odds
 
 
-def random_folds(right: np.ndarray, number: int, seed: int = 0) -> Int[np.ndarray, " n"]:
-    """Assign touches to `number` folds at random, with the touches of each class spread evenly.
+def random_folds(true_classes: np.ndarray, num_folds: int, seed: int = 0) -> Int[np.ndarray, " n"]:
+    """Assign touches to `num_folds` folds at random, with the touches of each class spread evenly.
 
-    Returns the number of the fold of each touch (n,). With fewer touches than `number`, there are fewer folds.
+    Returns the number of the fold of each touch (n,). With fewer touches than `num_folds`, there are fewer folds.
     """
     rng = np.random.default_rng(seed)
-    fold, first = np.empty(len(right), int), 0
-    for one in np.unique(right):
-        own = rng.permutation(np.flatnonzero(right == one))
-        fold[own] = (first + np.arange(len(own))) % number
+    fold, first = np.empty(len(true_classes), int), 0
+    for one in np.unique(true_classes):
+        own = rng.permutation(np.flatnonzero(true_classes == one))
+        fold[own] = (first + np.arange(len(own))) % num_folds
         first += len(own)
     return np.unique(fold, return_inverse=True)[1]
 
 
-def person_folds(people: np.ndarray, most: int | None = None) -> Int[np.ndarray, " n"]:
-    """Assign touches to folds (n,): one fold for each person, or at most `most` folds with equally many people each."""
+def person_folds(people: np.ndarray, max_folds: int | None = None) -> Int[np.ndarray, " n"]:
+    """Assign touches to folds (n,): one fold for each person, or at most `max_folds` folds with equally many people
+    each."""
     number = np.unique(people, return_inverse=True)[1].ravel()
-    return number if most is None else number % most
+    return number if max_folds is None else number % max_folds

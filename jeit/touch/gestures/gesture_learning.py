@@ -17,7 +17,7 @@ from jeit.touch.gestures.gesture_model import METHODS, Reading, check_labels
 from jeit.touch.gestures.touch_images import TouchImages
 
 # Maximum number of recordings used to determine the sign of touches.
-_SIGNED = 60
+_RECORDINGS_FOR_SIGN = 60
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def learn_gestures(
     check_labels(recordings.gesture)
     images = TouchImages.prepare(description, recordings.reference[None], progress=report)
     still = images.changes(recordings.untouched)
-    level, sign = _level_and_sign(images, still, recordings)
+    level, sign = _touch_level_and_sign(images, still, recordings)
     touches: list[StreamTouch] = []
     kept, without_touch = [], []
     for number, (seconds, changes) in enumerate(_times_and_changes(images, recordings, range(len(recordings)))):
@@ -84,26 +84,26 @@ def learn_gestures(
     return LearntGestures(model, images, tuple(without_touch))
 
 
-def _level_and_sign(images: TouchImages, still: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:
+def _touch_level_and_sign(images: TouchImages, untouched: np.ndarray, recordings: GestureSet) -> tuple[TouchLevel, int]:
     """Determine the sign of touches, and their level: with this sign, touches exceed their level by the larger
     factor."""
-    some = np.unique(np.linspace(0, len(recordings) - 1, min(_SIGNED, len(recordings))).astype(int))
+    some = np.unique(np.linspace(0, len(recordings) - 1, min(_RECORDINGS_FOR_SIGN, len(recordings))).astype(int))
     changes = [one for _, one in _times_and_changes(images, recordings, some.tolist())]
     found = []
     for sign in (1, -1):
-        level = TouchLevel.of_untouched(images.mesh, sign * still)
+        level = TouchLevel.of_untouched(images.mesh, sign * untouched)
         exceeds = [np.nanmax(sign * one) / level.level for one in changes if np.isfinite(one).any()]
         found.append((float(np.median(exceeds)) if exceeds else 0.0, level, sign))
     return max(found, key=lambda one: one[0])[1:]
 
 
 def _times_and_changes(
-    images: TouchImages, recordings: GestureSet, which: Sequence[int]
+    images: TouchImages, recordings: GestureSet, indices: Sequence[int]
 ) -> Iterator[tuple[Float[np.ndarray, " T"], Float[np.ndarray, "T m"]]]:
-    """Yield the times and the images of change of the recordings `which`, all imaged as one stream."""
-    frames = (frame for one in which for frame in recordings.recording(one)[1])
+    """Yield the times and the images of change of the recordings `indices`, all imaged as one stream."""
+    frames = (frame for one in indices for frame in recordings.recording(one)[1])
     found = images.stream(frames)
-    for one in which:
+    for one in indices:
         seconds, _ = recordings.recording(one)
         own = [change for _, change in islice(found, len(seconds))]
         yield seconds, np.array(own).reshape(len(seconds), images.mesh.num_cells)

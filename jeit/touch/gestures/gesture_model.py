@@ -15,19 +15,19 @@ from jeit.arguments import check_kind, check_name, describe, is_number
 from jeit.arguments.extras import need_extra
 from jeit.touch.gestures.features import course_features
 from jeit.touch.gestures.gesture_classifiers import (
-    FORMS,
+    FEATURE_FORMS,
     GESTURE_CLASSIFIERS,
     Scale,
-    forms_of,
+    feature_forms,
     held_out_odds,
     person_folds,
     random_folds,
 )
 from jeit.touch.gestures.segmentation import StreamTouch
 from jeit.touch.learnt.answers import Standing
-from jeit.touch.learnt.extras import in_parts
+from jeit.touch.learnt.extras import apply_in_parts
 from jeit.touch.learnt.file import read_plain, write_plain
-from jeit.touch.learnt.methods import log_odds, probabilities, sharpness_of
+from jeit.touch.learnt.methods import fit_sharpness, log_odds, probabilities
 
 # Minimum factor between the conductivities of two skins that are considered different, or given in different units.
 _OTHER_SKIN = 5.0
@@ -170,7 +170,7 @@ class GestureModel:
         """
         need_extra("learn", "learning gestures")
         check_name("method", method, METHODS)
-        check_name("form", form, ("auto", *FORMS))
+        check_name("form", form, ("auto", *FEATURE_FORMS))
         named, people_of = _check_labels_and_people(touches, labels, people)
         names, right = np.unique(named, return_inverse=True)
         remarks = list(notes)
@@ -180,22 +180,22 @@ class GestureModel:
             folds = random_folds(right, _FOLDS)
             remarks.append("one person, or nobody, is named: chosen on touches held out at random, not on people.")
         found = []
-        for shape in FORMS:
-            values = FORMS[shape](touches).values
+        for shape in FEATURE_FORMS:
+            values = FEATURE_FORMS[shape](touches).values
             for name in GESTURE_CLASSIFIERS:
-                if method not in ("auto", name) or form not in ("auto", shape) or shape not in forms_of(name):
+                if method not in ("auto", name) or form not in ("auto", shape) or shape not in feature_forms(name):
                     continue
                 if progress is not None:
                     progress(f"{name} on {shape}")
                 odds = held_out_odds(name, values, right, folds)
                 found.append((float(np.mean(odds.argmax(axis=1) != right)), name, shape, odds))
         if not found:
-            raise ValueError(f"form: '{method}' takes {' or '.join(forms_of(method))}; '{form}' was asked for.")
+            raise ValueError(f"form: '{method}' takes {' or '.join(feature_forms(method))}; '{form}' was asked for.")
         found.sort(key=lambda one: one[0])
         _, chosen, shape, odds = found[0]
-        values, courses = FORMS[shape](touches).values, course_features(touches).values
+        values, courses = FEATURE_FORMS[shape](touches).values, course_features(touches).values
         tried = [(f"{name} on {shape}", error) for error, name, shape, _ in found]
-        scale, known_scale = Scale.of(values), Scale.of(courses)
+        scale, known_scale = Scale.from_features(values), Scale.from_features(courses)
         known = known_scale(courses)
         return cls(
             names=tuple(str(one) for one in names),
@@ -203,10 +203,10 @@ class GestureModel:
             form=shape,
             scale=scale,
             model=GESTURE_CLASSIFIERS[chosen](scale(values), right),
-            sharpness=sharpness_of(odds, right),
+            sharpness=fit_sharpness(odds, right),
             known=known,
             known_scale=known_scale,
-            farthest=_farthest(known, folds),
+            farthest=_held_out_distance(known, folds),
             reading=reading,
             standing=Standing(tried[0][0], tried, names[odds.argmax(axis=1)], named),
             notes=tuple(remarks),
@@ -218,7 +218,7 @@ class GestureModel:
         Predictions are less certain for touches that are cut off, of which only a part is known. Raises `ValueError` if
         `touches` is not a list of touches.
         """
-        values = FORMS[self.form](touches).values
+        values = FEATURE_FORMS[self.form](touches).values
         if not len(values):
             nothing = np.empty(0)
             return Gestures(
@@ -227,7 +227,7 @@ class GestureModel:
         odds = np.full((len(values), len(self.names)), -1e3)
         odds[:, self.model.classes_] = log_odds(self.model, self.scale(values))
         shares = probabilities(odds, self.sharpness)
-        distance = _nearest(self.known, self.known_scale(course_features(touches).values))
+        distance = _nearest_distance(self.known, self.known_scale(course_features(touches).values))
         said = np.array(self.names)[shares.argmax(axis=1)]
         return Gestures(said, shares.max(axis=1), shares, self.names, distance > self.farthest)
 
@@ -285,14 +285,17 @@ def check_labels(labels: np.ndarray) -> None:
         raise ValueError(f"labels: there is only one touch of '{names[count.argmin()]}'; give two of each, or more.")
 
 
-def _nearest(known: np.ndarray, values: np.ndarray) -> Float[np.ndarray, " n"]:
-    """Distance (n,) of each row of `values` (n, k) from the nearest row of the `known` features (N, k)."""
+def _nearest_distance(training_features: np.ndarray, features: np.ndarray) -> Float[np.ndarray, " n"]:
+    """Distance (n,) of each row of `features` (n, k) from the nearest row of the `training_features` features (N,
+    k)."""
     from scipy.spatial.distance import cdist
 
-    return in_parts(lambda some: cdist(some, known).min(axis=1), values, _AT_ONCE)
+    return apply_in_parts(lambda some: cdist(some, training_features).min(axis=1), features, _AT_ONCE)
 
 
-def _farthest(known: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
+def _held_out_distance(training_features: Float[np.ndarray, "N k"], folds: Int[np.ndarray, " N"]) -> float:
     """99 % quantile of the distance of held-out touches from the nearest touch of the other folds."""
-    apart = [_nearest(known[folds != one], known[folds == one]) for one in np.unique(folds)]
+    apart = [
+        _nearest_distance(training_features[folds != one], training_features[folds == one]) for one in np.unique(folds)
+    ]
     return float(np.quantile(np.concatenate(apart), _LIKE))

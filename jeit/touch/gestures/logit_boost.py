@@ -66,7 +66,7 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         score = np.zeros(right.shape)
         stumps, steps, likelihood = [], [], [_log_likelihood(score, number)]
         for _ in range(self.n_estimators):
-            stump = _stumps(X, right, _softmax(score))
+            stump = _fit_stumps(X, right, _softmax(score))
             gained = _stump_values(X, *stump)
             step, found = _largest_step(score, gained, number, float(self.learning_rate), likelihood[-1])
             score = score + step * gained
@@ -121,17 +121,17 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
         return last
 
 
-def _stumps(X: np.ndarray, right: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, ...]:
+def _fit_stumps(X: np.ndarray, class_indicators: np.ndarray, probability: np.ndarray) -> tuple[np.ndarray, ...]:
     """Fit a stump for each class; returns features, thresholds, and values below and above the thresholds, each (J,).
 
     A stump that finds no split is constant, with an infinite threshold.
     """
-    off = right - probability
+    off = class_indicators - probability
     variance = probability * (1 - probability)
     response = np.clip(off / np.maximum(variance, _LEAST_WEIGHT), -_MOST_RESPONSE, _MOST_RESPONSE)
     weight = np.maximum(np.where(response == 0, 0.0, off / np.where(response == 0, 1.0, response)), _LEAST_WEIGHT)
     response = off / weight  # smaller where the weight was raised, to keep the gradient
-    number = right.shape[1]
+    number = class_indicators.shape[1]
     found = []
     for one in range(number):
         tree = DecisionTreeRegressor(max_depth=1, random_state=0).fit(X, response[:, one], weight[:, one]).tree_
@@ -149,24 +149,25 @@ def _stump_values(X: np.ndarray, feature, threshold, below, above) -> Float[np.n
     return said - said.mean(axis=1, keepdims=True)
 
 
-def _largest_step(score, gained, number, step: float, before: float) -> tuple[float, float]:
-    """Find the largest step of `step`, `step` / 2, `step` / 4 … that keeps the log-likelihood at `before` or above.
+def _largest_step(score, increments, class_indices, step: float, least_likelihood: float) -> tuple[float, float]:
+    """Find the largest step of `step`, `step` / 2, `step` / 4 … that keeps the log-likelihood at `least_likelihood` or
+    above.
 
-    Returns the step, and the log-likelihood of the classes `number` (n,) after it. The step is 0 if the remaining gain
-    is below rounding errors.
+    Returns the step, and the log-likelihood of the classes `class_indices` (n,) after it. The step is 0 if the
+    remaining gain is below rounding errors.
     """
     for _ in range(_MOST_HALVINGS):
-        found = _log_likelihood(score + step * gained, number)
-        if found >= before:
+        found = _log_likelihood(score + step * increments, class_indices)
+        if found >= least_likelihood:
             return step, found
         step /= 2
-    return 0.0, before
+    return 0.0, least_likelihood
 
 
-def _log_likelihood(score: np.ndarray, number: np.ndarray) -> float:
-    """Mean natural log-likelihood of the classes `number` (n,) for the scores (n, J)."""
+def _log_likelihood(score: np.ndarray, class_indices: np.ndarray) -> float:
+    """Mean natural log-likelihood of the classes `class_indices` (n,) for the scores (n, J)."""
     shifted = score - score.max(axis=1, keepdims=True)
-    return float(np.mean(shifted[np.arange(len(number)), number] - np.log(np.exp(shifted).sum(axis=1))))
+    return float(np.mean(shifted[np.arange(len(class_indices)), class_indices] - np.log(np.exp(shifted).sum(axis=1))))
 
 
 def _softmax(score: np.ndarray) -> Float[np.ndarray, "n J"]:

@@ -43,9 +43,9 @@ class ChangeCourse(eqx.Module):
         """Number of frames."""
         return len(self.seconds)
 
-    def of_frames(self, which: slice | np.ndarray) -> "ChangeCourse":
+    def select(self, frames: slice | np.ndarray) -> "ChangeCourse":
         """Return the time course of some of the frames."""
-        return ChangeCourse(*(getattr(self, name)[which] for name in _COLUMNS))
+        return ChangeCourse(*(getattr(self, name)[frames] for name in _COLUMNS))
 
     @classmethod
     def joined(cls, courses: "list[ChangeCourse]") -> "ChangeCourse":
@@ -128,24 +128,24 @@ class TouchLevel(eqx.Module):
         )
 
 
-def check_images(images: Float[np.ndarray, "F m"], number: int) -> Float[np.ndarray, "F m"]:
-    """Convert images on a mesh of `number` elements to an array (F, m). Raises `ValueError` for another shape."""
-    images = real_array("images", images, f"images of change (F, {number}), a row a frame")
-    if images.ndim != 2 or images.shape[1] != number:
+def check_images(images: Float[np.ndarray, "F m"], num_elements: int) -> Float[np.ndarray, "F m"]:
+    """Convert images on a mesh of `num_elements` elements to an array (F, m). Raises `ValueError` for another shape."""
+    images = real_array("images", images, f"images of change (F, {num_elements}), a row a frame")
+    if images.ndim != 2 or images.shape[1] != num_elements:
         raise ValueError(
-            f"images have shape {images.shape}; give (F, {number}), a row a frame, of the mesh's elements."
+            f"images have shape {images.shape}; give (F, {num_elements}), a row a frame, of the mesh's elements."
         )
     return images
 
 
-def check_seconds(seconds: Float[np.ndarray, " F"], number: int) -> Float[np.ndarray, " F"]:
-    """Convert the times of `number` frames to an array (F,).
+def check_seconds(seconds: Float[np.ndarray, " F"], num_frames: int) -> Float[np.ndarray, " F"]:
+    """Convert the times of `num_frames` frames to an array (F,).
 
     Raises `ValueError` if their number differs, if they decrease, or if they are not finite.
     """
-    seconds = real_array("seconds", seconds, f"times ({number},) of the frames")
-    if seconds.shape != (number,):
-        raise ValueError(f"seconds have shape {seconds.shape}; give one for each of the {number} frames.")
+    seconds = real_array("seconds", seconds, f"times ({num_frames},) of the frames")
+    if seconds.shape != (num_frames,):
+        raise ValueError(f"seconds have shape {seconds.shape}; give one for each of the {num_frames} frames.")
     if not np.isfinite(seconds).all() or (np.diff(seconds) < 0).any():
         raise ValueError("seconds must be finite, and must not fall: sort frames by time.")
     return seconds
@@ -216,7 +216,7 @@ class TouchStream(eqx.Module):
 
     def __check_init__(self):
         """Check the fields. Raises `ValueError` for an invalid level, gap or number of frames."""
-        _check(self.level, self.gap, self.least)
+        _check_settings(self.level, self.gap, self.least)
 
     def follow(self, second: float, image: Float[np.ndarray, " m"]) -> "TouchStream":
         """Return the state after an image (m,) at time `second`.
@@ -268,7 +268,7 @@ def find_touches(
     Raises `ValueError` for times that decrease or are not finite, images of another mesh, and frames whose median
     interval is not below the `gap`.
     """
-    _check(level, gap, least)
+    _check_settings(level, gap, least)
     images = check_images(images, len(level.areas))
     seconds = check_seconds(seconds, len(images))
     finite = np.flatnonzero(np.isfinite(images).all(axis=1))
@@ -289,12 +289,12 @@ def find_touches(
             continue
         first, last = part[0], part[-1]
         lost = int(used[last] - used[first] - (last - first))
-        own = course.of_frames(slice(first, last + 1))
+        own = course.select(slice(first, last + 1))
         found.append(StreamTouch(own, lost, bool(unseen[first]), bool(unseen[last + 1])))
     return found
 
 
-def _check(level, gap, least) -> None:
+def _check_settings(level, gap, least) -> None:
     check_kind("level", level, TouchLevel, "a TouchLevel, such as TouchLevel.of_untouched(mesh, images)")
     if not (is_number(gap) and gap > 0):
         raise ValueError(f"gap must be positive, in seconds; it is {describe(gap)}.")

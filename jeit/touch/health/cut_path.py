@@ -69,9 +69,9 @@ class _FittedUnknowns:
     misfit: float
 
 
-def _length(found: _FittedUnknowns) -> float:
+def _length(fitted: _FittedUnknowns) -> float:
     """Length of a fitted path, metres."""
-    return float(np.linalg.norm(np.diff(found.unknowns[:-2].reshape(-1, 2), axis=0), axis=1).sum())
+    return float(np.linalg.norm(np.diff(fitted.unknowns[:-2].reshape(-1, 2), axis=0), axis=1).sum())
 
 
 class LossFit:
@@ -105,7 +105,7 @@ class LossFit:
         protocol = model.protocol
         self.driven = np.asarray(protocol.drive)[np.asarray(protocol.drive_index)[channels]]
         self.measured = np.asarray(protocol.measurement)[np.asarray(protocol.measurement_index)[channels]]
-        self.rest = self._volts(self.region.impedance(np.zeros(len(self.conductivity))))
+        self.rest = self._channel_voltages(self.region.impedance(np.zeros(len(self.conductivity))))
         size = np.sqrt(np.mean(change**2))
         self.weight = 1 / np.hypot(noise, _MODEL * np.hypot(change, size))
         self.change = change
@@ -114,7 +114,7 @@ class LossFit:
         self.drift = whole / np.linalg.norm(whole)
         self.energy = float(np.sum(self._weight_residual(change) ** 2))
 
-    def line(self, starts: list[np.ndarray]) -> FittedLoss:
+    def fit_line(self, starts: list[np.ndarray]) -> FittedLoss:
         """Fit a straight cut near one of the places (x, y) in `starts`, or a bent cut if it fits much better."""
         angles = np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
         ways = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -140,7 +140,7 @@ class LossFit:
         deviation = float(np.hypot(self._deviation(best), unsure))
         return FittedLoss(path, best.misfit, self._conductivity_on_mesh(best.unknowns), is_through, deviation)
 
-    def spot(self, start: np.ndarray) -> FittedLoss:
+    def fit_spot(self, start: np.ndarray) -> FittedLoss:
         """Fit a round spot of lost or gained conductivity near a place (x, y)."""
         begun = [np.array([*start, np.log(_SPOT), depth, 0.0]) for depth in _SPOT_DEPTHS]
         best = min((self._fit(one) for one in begun), key=lambda one: one.misfit)
@@ -158,52 +158,53 @@ class LossFit:
         return bent if bent.misfit < _BEND * straight.misfit else straight
 
     def _fit(self, start: np.ndarray, *, fixed: bool = False) -> _FittedUnknowns:
-        """Fit the unknowns from a `start`; if `fixed`, the added length across the cut does not change."""
+        """Minimise the misfit over the unknowns, beginning at `start`; if `fixed`, the added length across the cut is
+        not fitted."""
         from scipy.optimize import least_squares
 
         low, high, scale = self._bounds(len(start))
         free = np.ones(len(start), bool)
         free[-2] = not fixed
 
-        def whole(some: np.ndarray) -> np.ndarray:
+        def all_unknowns(fitted: np.ndarray) -> np.ndarray:
             unknowns = start.copy()
-            unknowns[free] = some
+            unknowns[free] = fitted
             return unknowns
 
         inside = np.clip(start, low + 1e-9, high - 1e-9)
         found = least_squares(
-            lambda some: self._residual(whole(some)),
+            lambda fitted: self._residual(all_unknowns(fitted)),
             inside[free],
-            lambda some: self._slope(whole(some))[:, free],  # pyright: ignore[reportArgumentType]
+            lambda fitted: self._jacobian(all_unknowns(fitted))[:, free],  # pyright: ignore[reportArgumentType]
             bounds=(low[free], high[free]),
             x_scale=scale[free],
             max_nfev=_STEPS,
             ftol=1e-3,
             xtol=1e-3,
         )
-        return _FittedUnknowns(whole(found.x), 2 * found.cost / self.energy)
+        return _FittedUnknowns(all_unknowns(found.x), 2 * found.cost / self.energy)
 
-    def _bounds(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Lower and upper bounds of the unknowns, and their scales."""
-        if number == 5:  # a spot
+    def _bounds(self, num_unknowns: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lower bounds, upper bounds and scales of the `num_unknowns` unknowns, each (number,)."""
+        if num_unknowns == 5:  # a spot
             low, high = (
                 [*self.low, np.log(self.band / self.side), -_MOST_DEPTH],
                 [*self.high, np.log(_MOST_SPOT), _MOST_DEPTH],
             )
             scale = [0.05 * self.side, 0.05 * self.side, 0.5, 0.5]
         else:
-            places = (number - 2) // 2
+            places = (num_unknowns - 2) // 2
             low = [*np.tile(self.low, places), np.log(_LEAST)]
             high = [*np.tile(self.high, places), np.log(_THROUGH) + 1e-6]
             scale = [*np.full(2 * places, 0.05 * self.side), 1.0]
         return np.array([*low, -0.5]), np.array([*high, 0.5]), np.array([*scale, _FACTOR])
 
-    def _deviation(self, found: _FittedUnknowns) -> float:
+    def _deviation(self, fitted: _FittedUnknowns) -> float:
         """Standard deviation of a path's length, metres: that of both ends, each combined with half an edge of the
         mesh."""
-        least = found.misfit * self.energy
-        each = least / max(len(self.change) - len(found.unknowns), 1)
-        path = found.unknowns[:-2].reshape(-1, 2)
+        least = fitted.misfit * self.energy
+        each = least / max(len(self.change) - len(fitted.unknowns), 1)
+        path = fitted.unknowns[:-2].reshape(-1, 2)
         square = 2 * (0.5 * self.edge) ** 2
         for end, next_one in ((0, 1), (-1, -2)):
             way = path[end] - path[next_one]
@@ -212,7 +213,7 @@ class LossFit:
             for sign in (1.0, -1.0):
                 moved = path.copy()
                 moved[end] += sign * way
-                rises.append(self._misfit(np.array([*moved.ravel(), *found.unknowns[-2:]])) - least)
+                rises.append(self._misfit(np.array([*moved.ravel(), *fitted.unknowns[-2:]])) - least)
             square += self.edge**2 * min(each / max(max(rises), 1e-12 * self.energy), _WIDEST**2)
         return float(np.sqrt(square))
 
@@ -223,49 +224,51 @@ class LossFit:
     def _misfit(self, unknowns: np.ndarray) -> float:
         return float(np.sum(self._residual(unknowns) ** 2))
 
-    def _volts(self, impedance: np.ndarray) -> np.ndarray:
+    def _channel_voltages(self, impedance: np.ndarray) -> np.ndarray:
         """Voltages (K,) of the channels, computed from a transfer impedance (L, L)."""
         return np.einsum("kl,kl->k", self.measured @ impedance, self.driven)
 
     def _predicted_change(self, unknowns: np.ndarray) -> np.ndarray:
-        return self._volts(self.region.impedance(self._change(unknowns))) - self.rest
+        return self._channel_voltages(self.region.impedance(self._conductivity_change(unknowns))) - self.rest
 
     def _residual(self, unknowns: np.ndarray) -> np.ndarray:
         left = (1 + unknowns[-1]) * self._predicted_change(unknowns) - self.change
         return np.append(self._weight_residual(left), unknowns[-1] / _FACTOR)
 
-    def _slope(self, unknowns: np.ndarray) -> np.ndarray:
-        """Derivatives (K + 1, q) of the residual with respect to the unknowns."""
-        change = self._change(unknowns)
+    def _jacobian(self, unknowns: np.ndarray) -> np.ndarray:
+        """Derivatives (K + 1, q) of the weighted residuals with respect to the q unknowns."""
+        change = self._conductivity_change(unknowns)
         steps = np.full(len(unknowns) - 1, _STEP)
         steps[: 2 if len(unknowns) == 5 else -1] *= self.side
         ways = []
         for number, step in enumerate(steps):
             more = unknowns.copy()
             more[number] += step
-            ways.append((self._change(more) - change) / step)
-        impedance, slopes = self.region.slopes(change, ways)
-        found = np.column_stack([*(self._volts(one) for one in slopes), self._volts(impedance) - self.rest])
+            ways.append((self._conductivity_change(more) - change) / step)
+        impedance, slopes = self.region.derivatives(change, ways)
+        found = np.column_stack(
+            [*(self._channel_voltages(one) for one in slopes), self._channel_voltages(impedance) - self.rest]
+        )
         found[:, :-1] *= 1 + unknowns[-1]
         last = np.zeros(len(unknowns))
         last[-1] = 1 / _FACTOR
         return np.concatenate([self._weight_residual(found), last[None]])
 
-    def _change(self, unknowns: np.ndarray) -> np.ndarray:
+    def _conductivity_change(self, unknowns: np.ndarray) -> np.ndarray:
         """Change of the region's conductivity: scalars (c,) for a spot, tensors (c, d, d) for a path."""
         if len(unknowns) == 5:
-            return self.conductivity * np.expm1(self._spot_log(unknowns))
-        left, across = self._across(unknowns)
+            return self.conductivity * np.expm1(self._log_spot(unknowns))
+        left, across = self._fraction_across_path(unknowns)
         change = np.zeros((len(left), self.dimension, self.dimension))
         change[:, :2, :2] = (self.conductivity * (left - 1))[:, None, None] * across[:, :, None] * across[:, None, :]
         return change
 
-    def _spot_log(self, unknowns: np.ndarray) -> np.ndarray:
+    def _log_spot(self, unknowns: np.ndarray) -> np.ndarray:
         """Logarithm (c,) of the fraction of conductivity that is left in a spot."""
         square = np.sum((self.centres - unknowns[:2]) ** 2, axis=1) / (np.exp(unknowns[2]) * self.side) ** 2
         return -unknowns[3] * np.where(square < _REACH**2, np.exp(-square / 2), 0.0)
 
-    def _across(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _fraction_across_path(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Fraction of conductivity (m,) left across the nearest part of a path, and the direction (m, 2) across it."""
         path = unknowns[:-2].reshape(-1, 2)
         start, along = path[:-1], np.diff(path, axis=0)
@@ -290,5 +293,5 @@ class LossFit:
     def _conductivity_on_mesh(self, unknowns: np.ndarray) -> np.ndarray:
         """Conductivity on the mesh of the model before refinement, one value for each cell."""
         # Conductivity is lost across a path, not along it: the geometric mean of both directions is used.
-        lost = self._spot_log(unknowns) if len(unknowns) == 5 else 0.5 * np.log(self._across(unknowns)[0])
+        lost = self._log_spot(unknowns) if len(unknowns) == 5 else 0.5 * np.log(self._fraction_across_path(unknowns)[0])
         return self.whole * np.exp(np.bincount(self.parent, lost, len(self.whole)) / self.parts)

@@ -120,10 +120,10 @@ class Step:
 def window_change(frames: Float[np.ndarray, "2w M"]) -> Float[np.ndarray, " M"]:
     """Change from the median of the first half of frames to that of the second; NaN if a half has no reading."""
     half = len(frames) // 2
-    return median(frames[half:]) - median(frames[:half])
+    return channel_medians(frames[half:]) - channel_medians(frames[:half])
 
 
-def median(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
+def channel_medians(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
     """Median of every channel over its readings; NaN for channels without readings."""
     if not np.isnan(frames).any():
         return np.median(frames, axis=0)
@@ -133,7 +133,7 @@ def median(frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, " M"]:
     return found
 
 
-def size_of(scaled: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
+def change_size(scaled: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "..."]:
     """Size of changes (..., M) divided by their healthy scale: a power mean over the channels that have readings."""
     powers = np.minimum(np.abs(scaled), 1e9) ** _POWER
     there = np.isfinite(powers)
@@ -148,16 +148,16 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     lasts for all of the second window.
     """
     change = window_change(frames)
-    size = float(size_of(change / scale))
+    size = float(change_size(change / scale))
     if size <= limit:
         return None
     direction = np.nan_to_num(change / scale**2)
     half = len(frames) // 2
-    before = np.where(np.isfinite(change), median(frames[:half]), 0.0)
+    before = np.where(np.isfinite(change), channel_medians(frames[:half]), 0.0)
     readings = np.where(np.isfinite(frames), frames, before)
     # Component of the frames along the step: 0 before the step, 1 after it.
     along = (readings - before) @ direction / max(np.nan_to_num(change) @ direction, 1e-300)
-    first = _best_split(np.clip(along, -1.0, 2.0), half)
+    first = _best_split_index(np.clip(along, -1.0, 2.0), half)
     quarter = max(2, half // 4)
     if first < half // 2 or first + quarter > len(along):
         return None
@@ -167,24 +167,24 @@ def lasting_step(frames: Float[np.ndarray, "2w M"], scale: Float[np.ndarray, " M
     if sharp < _SHARP or min(thirds) < _STAYED or max(earlier) > _NOT_YET or not is_distinct(along, first):
         return None
     # The step may not be where the windows meet.
-    return Step(median(frames[first:]) - median(frames[:first]), size, first)
+    return Step(channel_medians(frames[first:]) - channel_medians(frames[:first]), size, first)
 
 
-def is_distinct(along: Float[np.ndarray, " n"], first: int) -> bool:
+def is_distinct(projections: Float[np.ndarray, " n"], first: int) -> bool:
     """Whether frames are 0 before index `first` and 1 from it on, apart from noise and a few exceptions.
 
     Between two touches, in contrast, frames return to 0.
     """
-    noise = 1.4826 * np.median(np.abs(np.diff(along))) / np.sqrt(2)
+    noise = 1.4826 * np.median(np.abs(np.diff(projections))) / np.sqrt(2)
     most = max(_SOME, 1.5 * float(ndtr((_BACK - 1) / max(noise, 1e-12))))
-    early = np.mean(along[:first] > 1 - _BACK) if first else 0.0
-    return bool(np.mean(along[first:] < _BACK) <= most and early <= most)
+    early = np.mean(projections[:first] > 1 - _BACK) if first else 0.0
+    return bool(np.mean(projections[first:] < _BACK) <= most and early <= most)
 
 
-def _best_split(along: np.ndarray, half: int) -> int:
+def _best_split_index(projections: np.ndarray, half: int) -> int:
     """Find the index at which splitting the frames into two constant parts fits best."""
-    number = len(along)
-    total, sums = along.sum(), np.cumsum(along)[:-1]
+    number = len(projections)
+    total, sums = projections.sum(), np.cumsum(projections)[:-1]
     count = np.arange(1, number)
     between = sums**2 / count + (total - sums) ** 2 / (number - count)
     allowed = slice(max(3, half // 2) - 1, number - 3)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from jeit.touch.health.cut_path import FittedLoss
 from jeit.touch.health.event import EventKind
-from jeit.touch.health.healthy import Healthy
+from jeit.touch.health.healthy import HealthyState
 from jeit.touch.health.imaged_skin import ImagedSkin
 
 # Failing electrodes: maximum fraction of a change's energy that they may leave unexplained; minimum fraction of an
@@ -26,12 +26,12 @@ _MOST = 10.0
 
 
 def faulty_electrodes(
-    change: Float[np.ndarray, " M"], reference: Float[np.ndarray, " M"], touching: Bool[np.ndarray, "L M"]
+    change: Float[np.ndarray, " M"], reference: Float[np.ndarray, " M"], uses_electrode: Bool[np.ndarray, "L M"]
 ) -> list[int]:
     """Find the electrodes whose failure alone explains a change from the reference, volts.
 
-    Returns the numbers of these electrodes, or an empty list if the skin must have changed too. `touching` (L, M):
-    whether each channel uses each electrode.
+    Returns the numbers of these electrodes, or an empty list if the skin must have changed too. `uses_electrode` (L,
+    M): whether each channel uses each electrode.
     """
     size = np.sqrt(np.mean(reference[np.isfinite(reference)] ** 2))
     relative = np.abs(np.nan_to_num(change)) / np.maximum(np.abs(reference), 0.1 * size)
@@ -39,14 +39,14 @@ def faulty_electrodes(
     # The change of a channel with a weak reading is compared with the mean reading, not with its own.
     energy = np.minimum(np.abs(np.nan_to_num(change)) / size, relative) ** 2
     total, left, found = energy.sum(), np.ones(len(energy), bool), []
-    while total > 0 and energy[left].sum() > _LEFT * total and len(found) < max(1, _AT_ONCE * len(touching)):
-        own = np.array([energy[left & one].sum() / max(1, (left & one).sum()) ** 0.5 for one in touching])
+    while total > 0 and energy[left].sum() > _LEFT * total and len(found) < max(1, _AT_ONCE * len(uses_electrode)):
+        own = np.array([energy[left & one].sum() / max(1, (left & one).sum()) ** 0.5 for one in uses_electrode])
         best = int(own.argmax())
-        mine = touching[best] & left
+        mine = uses_electrode[best] & left
         if not mine.any() or np.mean(relative[mine] > _RELATIVE) < _OWN:
             return []
         found.append(best)
-        left &= ~touching[best]
+        left &= ~uses_electrode[best]
     return found if total > 0 and energy[left].sum() <= _LEFT * total else []
 
 
@@ -54,14 +54,18 @@ def kind_of_fault(
     frames: Float[np.ndarray, "n M"],
     reference: Float[np.ndarray, " M"],
     noise: Float[np.ndarray, " M"],
-    own: Bool[np.ndarray, " M"],
+    electrode_channels: Bool[np.ndarray, " M"],
 ) -> EventKind:
-    """Classify the fault of an electrode with channels `own` (M,) from its latest `frames` (n, M)."""
-    now = frames[:, own]
+    """Classify the fault of an electrode with channels `electrode_channels` (M,) from its latest `frames` (n, M)."""
+    now = frames[:, electrode_channels]
     middle = np.nanmedian(now, axis=0)
-    size = np.sqrt(np.mean(reference[own] ** 2))
-    constant = len(middle) > 1 and np.ptp(middle) <= 0.02 * np.abs(middle).max() and np.ptp(reference[own]) > 0.1 * size
-    if constant or np.median(np.abs(middle)) < _NOTHING * np.median(np.abs(reference[own])):
+    size = np.sqrt(np.mean(reference[electrode_channels] ** 2))
+    constant = (
+        len(middle) > 1
+        and np.ptp(middle) <= 0.02 * np.abs(middle).max()
+        and np.ptp(reference[electrode_channels]) > 0.1 * size
+    )
+    if constant or np.median(np.abs(middle)) < _NOTHING * np.median(np.abs(reference[electrode_channels])):
         return EventKind.TORN
     # Touches hardly affect differences from frame to frame.
     steps = np.diff(now, axis=0)
@@ -69,8 +73,10 @@ def kind_of_fault(
     wander = np.zeros(len(middle))
     if some.any():
         wander[some] = _DEVIATION * np.nanmedian(np.abs(steps[:, some]), axis=0)
-    wander /= np.minimum(noise[own], size)
-    if np.median(wander) > _WANDERS and np.median(np.abs(middle)) < _MOST * np.median(np.abs(reference[own])):
+    wander /= np.minimum(noise[electrode_channels], size)
+    if np.median(wander) > _WANDERS and np.median(np.abs(middle)) < _MOST * np.median(
+        np.abs(reference[electrode_channels])
+    ):
         return EventKind.LOOSE
     return EventKind.DEAD
 
@@ -81,7 +87,7 @@ _CUT_BESIDE = 0.1
 
 
 @dataclass(frozen=True)
-class Change:
+class LastingChange:
     """A lasting change.
 
     **Fields**: `vector` (M,): change of each channel, volts; `size`: size relative to healthy changes; `time`, `frame`:
@@ -112,11 +118,11 @@ class Finding:
     own: Bool[np.ndarray, " M"] | None = None
 
 
-def findings(
+def classify_change(
     change: np.ndarray,
     frames: Float[np.ndarray, "n M"],
     reference: np.ndarray,
-    healthy: Healthy,
+    healthy: HealthyState,
     touching: Bool[np.ndarray, "L M"] | None,
     skin: ImagedSkin | None,
 ) -> list[Finding]:
@@ -133,10 +139,10 @@ def findings(
     # does not increase the current at the electrode.
     if faults and (skin is None or any(one.kind != EventKind.DEAD for one in faults)):
         return faults
-    loss = None if skin is None else skin.loss(change, used, healthy.scale)
+    loss = None if skin is None else skin.fit_cut(change, used, healthy.scale)
     if faults and (loss is None or loss.misfit > _CUT_BESIDE):
         return faults
-    outside = healthy.outside(change)
+    outside = healthy.fraction_outside(change)
     unlike = outside > healthy.unlike
     said = (
         f"{100 * outside:.0f} % of it is in no direction of touches; of those, {100 * healthy.unlike:.0f} % at most."
@@ -146,10 +152,10 @@ def findings(
     if loss is not None:
         across = "through the whole skin" if loss.through else "perhaps through a part of its depth"
         said = f"Conductivity is lost along a line, {across}. {said}"
-        return [Finding(EventKind.CUT, said, unlike or _opposite(skin), loss=loss)]
+        return [Finding(EventKind.CUT, said, unlike or _loss_is_opposite_to_touch(skin), loss=loss)]
     return [Finding(EventKind.CHANGED, said, unlike)]
 
 
-def _opposite(skin: ImagedSkin | None) -> bool:
-    """Whether a loss of conductivity is opposite to the change that a touch makes."""
+def _loss_is_opposite_to_touch(skin: ImagedSkin | None) -> bool:
+    """Whether touches raise the conductivity, so that a loss of conductivity cannot be a touch."""
     return skin is not None and skin.sign > 0

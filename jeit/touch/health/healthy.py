@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jeit.touch.health.event import lasting_step, median, size_of, window_change
+from jeit.touch.health.event import change_size, channel_medians, lasting_step, window_change
 
 # Fraction of a window's changes, the smallest ones, that measure noise; minimum fraction of changes with a reading.
 _SMALL, _READ = 0.5, 0.5
@@ -46,55 +46,72 @@ class Steadiness:
         `noise` (M,): noise of the channels, volts; infinite for channels without readings.
         """
         starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
-        found = np.array([_measures(steps[start : start + window]) for start in starts])  # (n, 2, M)
+        found = np.array([_variation_measures(steps[start : start + window]) for start in starts])  # (n, 2, M)
         half, ratios = len(found) // 2, [np.zeros((1, *found.shape[1:]))]
         for learnt, other in ((found[:half], found[half:]), (found[half:], found[:half])):
             if len(learnt) and len(other):
-                ratios.append(_above_others(np.nan_to_num(other / _usual(learnt, noise))))
+                ratios.append(_relative_to_others(np.nan_to_num(other / _usual_variation(learnt, noise))))
         most = np.concatenate(ratios).max(axis=(0, 2))
         limits = np.maximum(_LEAST, (_BEYOND_UNSTEADY + _FEW_UNSTEADY / max(len(found), 1)) * most)
         # With a coarse analogue-to-digital converter, a channel may read the same value throughout a window.
         moves = np.diff(steps, axis=0)
         still = np.isfinite(noise) & (np.sum(np.abs(moves) > 0, axis=0) > _MOVES * np.isfinite(moves).sum(axis=0))
-        return cls(_usual(found, noise), limits, still)
+        return cls(_usual_variation(found, noise), limits, still)
 
-    def noisy(self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
-        """Whether each channel (M,) is noisy, or jumps, in both of two windows, far more than nearly all others."""
+    def noisy_channels(
+        self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]
+    ) -> Bool[np.ndarray, " M"]:
+        """Whether each channel (M,) is noisy, or jumps, in both of two windows, far more than nearly all other
+        channels.
+
+        `steps` (2w, M): changes from step to step in both windows, volts; `trusted` (M,): channels that may be used.
+        """
         half, found = len(steps) // 2, []
         for part in (steps[:half], steps[half:]):
-            over = np.where(trusted, np.nan_to_num(_measures(part) / self.usual), 0.0)
-            found.append((_above_others(over) > self.limits[:, None]).any(axis=0))
-        return self._unless_many(found, trusted)
+            over = np.where(trusted, np.nan_to_num(_variation_measures(part) / self.usual), 0.0)
+            found.append((_relative_to_others(over) > self.limits[:, None]).any(axis=0))
+        return self._unless_many_channels(found, trusted)
 
-    def stuck(self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]) -> Bool[np.ndarray, " M"]:
-        """Whether each channel (M,) does not change at all in both of two windows, while others do."""
+    def stuck_channels(
+        self, steps: Float[np.ndarray, "2w M"], trusted: Bool[np.ndarray, " M"]
+    ) -> Bool[np.ndarray, " M"]:
+        """Whether each channel (M,) is constant in both of two windows while other channels change; arguments as for
+        `noisy_channels`."""
         half = len(steps) // 2
-        return self._unless_many(
-            [(_measures(part)[1] == 0) & self.still for part in (steps[:half], steps[half:])], trusted
+        return self._unless_many_channels(
+            [(_variation_measures(part)[1] == 0) & self.still for part in (steps[:half], steps[half:])], trusted
         )
 
     @staticmethod
-    def _unless_many(each: list[np.ndarray], trusted: np.ndarray) -> Bool[np.ndarray, " M"]:
-        found = each[0] & each[1] & trusted
+    def _unless_many_channels(exceeds_by_window: list[np.ndarray], trusted: np.ndarray) -> Bool[np.ndarray, " M"]:
+        found = exceeds_by_window[0] & exceeds_by_window[1] & trusted
         # A channel that was steady in the first window is detected later; if too many channels are unsteady at once,
         # none is.
         at_once = max(1, _AT_ONCE * trusted.sum())
         return (
-            found if 0 < found.sum() <= at_once and (each[1] & trusted).sum() <= 2 * at_once else np.zeros_like(found)
+            found
+            if 0 < found.sum() <= at_once and (exceeds_by_window[1] & trusted).sum() <= 2 * at_once
+            else np.zeros_like(found)
         )
 
 
-def _above_others(over: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "... M"]:
-    """Divide ratios to the usual values by the highest ratio among all channels but a few, if it is above 1."""
-    few = max(1, int(_AT_ONCE * over.shape[-1]))
-    if few >= over.shape[-1]:
-        return over
-    return over / np.maximum(np.sort(over, axis=-1)[..., -(few + 1), None], 1.0)
+def _relative_to_others(ratios: Float[np.ndarray, "... M"]) -> Float[np.ndarray, "... M"]:
+    """Divide the `ratios` of the measures to their usual values by a high quantile of the ratios over the channels, if
+    that is above 1: a change common to nearly all channels is then not attributed to single ones."""
+    few = max(1, int(_AT_ONCE * ratios.shape[-1]))
+    if few >= ratios.shape[-1]:
+        return ratios
+    return ratios / np.maximum(np.sort(ratios, axis=-1)[..., -(few + 1), None], 1.0)
 
 
-def _measures(steps: Float[np.ndarray, "w M"]) -> Float[np.ndarray, "2 M"]:
-    """Compute the two measures of a window; NaN for channels with too few readings."""
-    sizes = np.sort(np.abs(np.diff(steps, axis=0)), axis=0)  # NaN last
+def _variation_measures(window_steps: Float[np.ndarray, "w M"]) -> Float[np.ndarray, "2 M"]:
+    """Compute, for each channel, the two measures (2, M) of variation in a window from its changes `window_steps` (w,
+    M).
+
+    They are the mean of the smaller half of the magnitudes of the changes, and the mean of all; NaN for channels with
+    too few readings.
+    """
+    sizes = np.sort(np.abs(np.diff(window_steps, axis=0)), axis=0)  # NaN last
     there = np.isfinite(sizes).sum(axis=0)
     sizes, sums = np.nan_to_num(sizes), np.cumsum(np.nan_to_num(sizes), axis=0)
     small = np.maximum((_SMALL * there).astype(int), 1)
@@ -103,10 +120,10 @@ def _measures(steps: Float[np.ndarray, "w M"]) -> Float[np.ndarray, "2 M"]:
     return np.where(there >= max(2, _READ * len(sizes)), found, np.nan)
 
 
-def _usual(found: Float[np.ndarray, "n 2 M"], noise: Float[np.ndarray, " M"]) -> Float[np.ndarray, "2 M"]:
-    """Mean of the measures over healthy windows, but at least a tenth of the noise, since a coarse converter hides
-    noise."""
-    usual = np.nan_to_num(found).mean(axis=0)
+def _usual_variation(measures: Float[np.ndarray, "n 2 M"], noise: Float[np.ndarray, " M"]) -> Float[np.ndarray, "2 M"]:
+    """Mean (2, M) of the `measures` (n, 2, M) over n healthy windows, but at least a tenth of the `noise` (M,): a
+    coarse analogue-to-digital converter hides noise."""
+    usual = np.nan_to_num(measures).mean(axis=0)
     return np.where(np.isfinite(noise), np.maximum(usual, 0.1 * np.where(np.isfinite(noise), noise, 1.0)), np.inf)
 
 
@@ -145,16 +162,16 @@ _MEAN = float(np.sqrt(np.pi / 2))
 
 
 @dataclass(frozen=True)
-class Healthy:
+class HealthyState:
     """Healthy state of a skin with M channels, and its variation.
 
     **Fields**: `reference` (M,): voltages of the untouched skin, volts; `used` (M,): whether channels have readings;
     `noise` (M,): noise from frame to frame, volts; `span` (2, M): minimum and maximum change in the recording, volts;
     `stride`: number of frames averaged to a step; `window`: number of steps of a window; `scale` (M,): change between
-    consecutive windows, volts; `limit`: limit of `size_of` for a step that lasts; `sudden`: its limit for a step that
-    may be a touch; `level` (M,): change between any two windows, volts; `level_limit`: limit of `size_of` for a change
-    of level; `touches` (M, k): directions of touches, orthonormal in units of noise; `unlike`: fraction of a change's
-    energy outside of these directions that touches do not exceed; `steadiness`: steadiness of single channels;
+    consecutive windows, volts; `limit`: limit of `change_size` for a step that lasts; `sudden`: its limit for a step
+    that may be a touch; `level` (M,): change between any two windows, volts; `level_limit`: limit of `change_size` for
+    a change of level; `touches` (M, k): directions of touches, orthonormal in units of noise; `unlike`: fraction of a
+    change's energy outside of these directions that touches do not exceed; `steadiness`: steadiness of single channels;
     `period`: seconds between frames, or 1; `brief`: whether the recording was too short for its touches, so that limits
     are twice as high.
     """
@@ -177,7 +194,9 @@ class Healthy:
     brief: bool
 
     @classmethod
-    def learn(cls, frames: Float[np.ndarray, "F M"], period: float = 1.0, longest: float | None = None) -> "Healthy":
+    def learn(
+        cls, frames: Float[np.ndarray, "F M"], period: float = 1.0, longest: float | None = None
+    ) -> "HealthyState":
         """Learn from healthy frames (F, M), with or without touches, `period` seconds apart.
 
         `longest`: length of a window, seconds, which must exceed that of every touch; by default estimated from the
@@ -191,25 +210,25 @@ class Healthy:
             )
         frames = np.where(np.isfinite(frames), frames, np.nan)
         used = np.isfinite(frames).mean(axis=0) > 0.5
-        centre = median(frames)
-        noise = _noise(frames)
+        centre = channel_medians(frames)
+        noise = _estimate_noise(frames)
         used &= noise > 1e-12 * np.nanmax(np.abs(centre), initial=0.0)
         used &= noise > 0
         if not used.any():
-            raise ValueError(
-                "healthy: no channel reads anything, or all are constant; is this a recording of the skin?"
-            )
+            raise ValueError("healthy: every channel lacks readings or is constant; is this a recording of the skin?")
         noise = np.where(used, noise, np.inf)
         frames = np.where(used, frames, np.nan)
-        window, wanted = _window(frames, noise, period, longest)
+        window, wanted = _window_length(frames, noise, period, longest)
         brief = wanted > _SHORT * window
         doubt = _DOUBT if brief else 1.0
         stride = max(1, -(-window // _MOST))
-        steps = averaged(frames, stride)
+        steps = average_frames(frames, stride)
         window = max(_FEWEST, window // stride)
-        scale, limit, sudden = _step_limits(_triples(steps, window), window, _floor(noise, stride * window))
-        level, level_limit = _level_limit(_levels(steps, window), scale)
-        touches, unlike = _touches(frames, noise, stride * window)
+        scale, limit, sudden = _step_limits(
+            _window_triples(steps, window), window, _median_noise(noise, stride * window)
+        )
+        level, level_limit = _level_limit(_window_levels(steps, window), scale)
+        touches, unlike = _touch_directions(frames, noise, stride * window)
         local = frames - centre
         span = np.stack([np.nanmin(local, axis=0, initial=0.0), np.nanmax(local, axis=0, initial=0.0)])
         fixed = np.where(used, np.nan_to_num(centre), 0.0)
@@ -233,12 +252,12 @@ class Healthy:
             brief=brief,
         )
 
-    def outside(self, change: Float[np.ndarray, " M"]) -> float:
+    def fraction_outside(self, change: Float[np.ndarray, " M"]) -> float:
         """Fraction of a change's energy, in units of noise, that is outside of the directions of touches."""
         return float(_fraction_outside((np.nan_to_num(change) / self.noise)[None], self.touches)[0])
 
 
-def averaged(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.ndarray, "n M"]:
+def average_frames(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.ndarray, "n M"]:
     """Average every `stride` frames, for each channel over its readings."""
     if stride == 1:
         return frames
@@ -248,7 +267,7 @@ def averaged(frames: Float[np.ndarray, "F M"], stride: int) -> Float[np.ndarray,
     return np.where(number > 0, np.where(there, groups, 0.0).sum(axis=1) / np.maximum(number, 1), np.nan)
 
 
-def _noise(frames: np.ndarray) -> np.ndarray:
+def _estimate_noise(frames: np.ndarray) -> np.ndarray:
     """Noise of every channel from frame to frame: its standard deviation, estimated from the smaller changes."""
     steps = np.diff(frames, axis=0)
     some = np.isfinite(steps).any(axis=0)
@@ -266,12 +285,12 @@ def _noise(frames: np.ndarray) -> np.ndarray:
     return np.where(quiet > 0.05 * whole, quiet, whole)
 
 
-def _window(frames: np.ndarray, noise: np.ndarray, period: float, longest: float | None) -> tuple[int, float]:
+def _window_length(frames: np.ndarray, noise: np.ndarray, period: float, longest: float | None) -> tuple[int, float]:
     """Number of frames of a window, and the number that a sufficiently long recording would allow."""
     most = max(_FEWEST, len(frames) // _WINDOWS)
     if longest is not None:
         return int(np.clip(np.ceil(longest / period), _FEWEST, most)), longest / period
-    off = size_of((frames - median(frames)) / noise)
+    off = change_size((frames - channel_medians(frames)) / noise)
     quiet = np.quantile(off, _QUIET)
     touched = off > _STANDS_OUT * quiet
     edges = np.flatnonzero(np.diff(np.concatenate([[0], touched.astype(int), [0]])))
@@ -283,21 +302,21 @@ def _window(frames: np.ndarray, noise: np.ndarray, period: float, longest: float
     return int(np.clip(wanted, least, most)), wanted
 
 
-def _floor(noise: np.ndarray, frames: int) -> np.ndarray:
-    """Minimum difference between the medians of two windows of `frames` frames that contain only noise."""
-    return noise * np.sqrt(np.pi / max(frames, 2))
+def _median_noise(noise: np.ndarray, num_frames: int) -> np.ndarray:
+    """Minimum difference between the medians of two windows of `num_frames` frames that contain only noise."""
+    return noise * np.sqrt(np.pi / max(num_frames, 2))
 
 
-def _triples(steps: np.ndarray, window: int) -> np.ndarray:
-    """Triples (n, 3w, M) of consecutive windows throughout a recording."""
+def _window_triples(steps: np.ndarray, window: int) -> np.ndarray:
+    """Triples (n, 3w, M) of consecutive windows of `window` = w steps each, throughout a recording."""
     starts = range(0, max(1, len(steps) - 3 * window + 1), max(1, window // 4))
     return np.array([steps[start : start + 3 * window] for start in starts])
 
 
-def _levels(steps: np.ndarray, window: int) -> np.ndarray:
+def _window_levels(steps: np.ndarray, window: int) -> np.ndarray:
     """Differences (n, M) of the medians of windows from the median of all steps."""
     starts = range(0, max(1, len(steps) - window + 1), max(1, window // 2))
-    return np.array([median(steps[start : start + window]) for start in starts]) - median(steps)
+    return np.array([channel_medians(steps[start : start + window]) for start in starts]) - channel_medians(steps)
 
 
 def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[np.ndarray, float, float]:
@@ -309,25 +328,25 @@ def _step_limits(triples: np.ndarray, window: int, floor: np.ndarray) -> tuple[n
     pairs = triples[:, : 2 * window]
     changes = np.nan_to_num(np.array([window_change(one) for one in pairs]))
     half, stayed, sizes = len(changes) // 2, [0.0], [0.0]
-    rest = median(np.concatenate(list(triples[:: max(1, len(triples) // _WINDOWS)])))
+    rest = channel_medians(np.concatenate(list(triples[:: max(1, len(triples) // _WINDOWS)])))
     for learnt, other in ((slice(None, half), slice(half, None)), (slice(half, None), slice(None, half))):
-        scale = _scale(changes[learnt], floor)
+        scale = _deviation_of_changes(changes[learnt], floor)
         for triple, pair in zip(triples[other], pairs[other], strict=True):
             step = lasting_step(pair, scale, 0.0)
             if step is None:
                 continue
             sizes.append(step.size)
             direction = np.nan_to_num(step.change / scale**2)
-            now = median(triple[2 * window :])
-            if size_of((now - rest) / scale) < _STILL * step.size:  # the end of a touch
+            now = channel_medians(triple[2 * window :])
+            if change_size((now - rest) / scale) < _STILL * step.size:  # the end of a touch
                 continue
-            later = np.nan_to_num(now - median(pair[:window]))
+            later = np.nan_to_num(now - channel_medians(pair[:window]))
             if later @ direction > _STILL * (np.nan_to_num(step.change) @ direction):
                 stayed.append(step.size)
-        stayed.append(float(np.median(size_of(changes[other] / scale))) if len(changes[other]) else 0.0)
+        stayed.append(float(np.median(change_size(changes[other] / scale))) if len(changes[other]) else 0.0)
     beyond = _BEYOND + _FEW / max(len(changes), 1)
     lasting = max(_LEAST_SIZE, beyond * max(stayed))
-    return _scale(changes, floor), lasting, max(lasting, beyond * max(sizes))
+    return _deviation_of_changes(changes, floor), lasting, max(lasting, beyond * max(sizes))
 
 
 def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, float]:
@@ -336,14 +355,14 @@ def _level_limit(changes: np.ndarray, floor: np.ndarray) -> tuple[np.ndarray, fl
     changes = np.nan_to_num(changes)
     half = len(changes) // 2
     sizes = [
-        size_of(changes[half:] / _scale(changes[:half], floor)),
-        size_of(changes[:half] / _scale(changes[half:], floor)),
+        change_size(changes[half:] / _deviation_of_changes(changes[:half], floor)),
+        change_size(changes[:half] / _deviation_of_changes(changes[half:], floor)),
     ]
     most = float(np.concatenate(sizes).max(initial=0.0))
-    return _scale(changes, floor), max(_LEAST_SIZE, (_BEYOND_LEVEL + _FEW / max(len(changes), 1)) * most)
+    return _deviation_of_changes(changes, floor), max(_LEAST_SIZE, (_BEYOND_LEVEL + _FEW / max(len(changes), 1)) * most)
 
 
-def _scale(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
+def _deviation_of_changes(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
     """Standard deviation of changes (n, M), estimated from their mean magnitude as for a normal variable."""
     own = _MEAN * np.mean(np.abs(changes), axis=0) if len(changes) else np.zeros(changes.shape[1])
     # A channel that hardly changed while others did may have done so by chance.
@@ -351,12 +370,15 @@ def _scale(changes: np.ndarray, floor: np.ndarray) -> np.ndarray:
     return np.maximum(own, np.maximum(1.0, 0.5 * typical) * floor)
 
 
-def _touches(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.ndarray, float]:
+def _touch_directions(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.ndarray, float]:
     """Directions (M, k) of healthy changes, in units of noise, and 99 % quantile of the fraction of energy outside of
     them."""
-    there = np.where(np.isfinite(frames), frames, median(frames))
+    there = np.where(np.isfinite(frames), frames, channel_medians(frames))
     centres = np.concatenate(
-        [np.tile(median(part), (len(part), 1)) for part in np.array_split(there, max(1, len(there) // (2 * window)))]
+        [
+            np.tile(channel_medians(part), (len(part), 1))
+            for part in np.array_split(there, max(1, len(there) // (2 * window)))
+        ]
     )
     scaled = np.nan_to_num((there - centres) / noise)
     energy = np.sum(scaled**2, axis=1)
@@ -366,12 +388,12 @@ def _touches(frames: np.ndarray, noise: np.ndarray, window: int) -> tuple[np.nda
     half, shares = len(strong) // 2, []
     for learnt, other in ((strong[:half], strong[half:]), (strong[half:], strong[:half])):
         if len(learnt) and len(other):
-            shares.append(_fraction_outside(other, _directions(learnt)))
+            shares.append(_fraction_outside(other, _principal_directions(learnt)))
     unlike = float(np.quantile(np.concatenate(shares), _UNLIKE)) if shares else 1.0
-    return _directions(strong), unlike
+    return _principal_directions(strong), unlike
 
 
-def _directions(frames: np.ndarray) -> np.ndarray:
+def _principal_directions(frames: np.ndarray) -> np.ndarray:
     """Principal directions (M, k) of frames."""
     _, values, rows = np.linalg.svd(frames, full_matrices=False)
     explained = np.cumsum(values**2) / max(np.sum(values**2), 1e-300)

@@ -74,7 +74,7 @@ class ImagedSkin:
         gain = np.where(used & (each > ratio / _AGREES) & (each < ratio * _AGREES), each, ratio)
         return cls(model, values, values, gain, noise, int(sign))
 
-    def linear(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
+    def linear_reconstruction(self, usable: Bool[np.ndarray, " M"]) -> LinearReconstruction:
         """One-step reconstruction from the model's voltages of the `usable` channels (M,), about the current
         conductivity."""
         noise = np.where(np.isfinite(self.noise), self.noise / np.abs(self.gain), 1.0)
@@ -92,10 +92,10 @@ class ImagedSkin:
         for number, pattern in enumerate(patterns):
             if pattern.any():
                 rows = kind.ravel() == number
-                found[rows] = np.asarray(self.linear(pattern).image(as_array(volts[rows])))
+                found[rows] = np.asarray(self.linear_reconstruction(pattern).image(as_array(volts[rows])))
         return found
 
-    def loss(
+    def fit_cut(
         self, change: Float[np.ndarray, " M"], usable: Bool[np.ndarray, " M"], noise: Float[np.ndarray, " M"]
     ) -> FittedLoss | None:
         """Fit a cut to a change (M,), volts; returns None if no cut explains it, or a press explains it as well.
@@ -104,7 +104,7 @@ class ImagedSkin:
         """
         there = usable & np.isfinite(change)
         volts = np.where(there, change / self.gain, 0.0)
-        image = np.asarray(self.linear(there).image(as_array(volts)))
+        image = np.asarray(self.linear_reconstruction(there).image(as_array(volts)))
         lost = np.maximum(-image, 0.0)
         if not lost.max() > 0:
             return None
@@ -114,19 +114,19 @@ class ImagedSkin:
         channels = np.flatnonzero(there)
         own = noise[channels] / np.abs(self.gain[channels])
         fit = LossFit(self.model, self.conductivity, volts[channels], channels, own, start)
-        spot = fit.spot(start)
+        spot = fit.fit_spot(start)
         starts = [start]
         if np.linalg.norm(spot.path[0] - start) > _APART * fit.side:
             starts.append(spot.path[0])
-        line = fit.line(starts)
+        line = fit.fit_line(starts)
         if line.misfit > _EXPLAINS or line.misfit > _BETTER * spot.misfit:
             return None
         return line
 
-    def with_loss(self, loss: FittedLoss) -> "ImagedSkin":
+    def with_cut(self, loss: FittedLoss) -> "ImagedSkin":
         """Return the skin with a cut added."""
         return replace(self, conductivity=loss.conductivity)
 
-    def healed(self) -> "ImagedSkin":
+    def without_cuts(self) -> "ImagedSkin":
         """Return the skin without any cuts."""
         return replace(self, conductivity=self.healthy)

@@ -7,8 +7,8 @@ no hanging nodes.
 If the conductivity changes in one region only, voltages are computed by dense low-rank updates of one solution. With
 the grounded matrix A of stiffness and contact mass, the loads B (`jeit.forward.transfer`) and a change D of the
 stiffness between a few nodes t, the Woodbury identity gives Bᵀ(A + D)⁻¹B = BᵀX − X_tᵀ (1 + D G)⁻¹ D X_t, where X =
-A⁻¹B, and G is A⁻¹ between the nodes t. G is computed once for all nodes of the region; each change then requires the
-solution of a system with as many unknowns as the change has nodes.
+A⁻¹B, and G is A⁻¹ between the nodes t. G is computed once for all nodes of the region. The
+voltages for any change then follow from a dense system with one unknown for each node t that the change touches.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from jeit_solvers.engines import on_host
 # Maximum number of times that a cell is halved.
 _ROUNDS = 12
 # Electrodes that remain valid if the mesh of the skin gets more nodes.
-_FREE = (BoundaryElectrodes, SheetDiscs, PointElectrodes, NodeElectrodes)
+_MESH_INDEPENDENT = (BoundaryElectrodes, SheetDiscs, PointElectrodes, NodeElectrodes)
 
 
 def finer_model(
@@ -46,7 +46,7 @@ def finer_model(
     """
     mesh = model.mesh
     check_flat(mesh, "cuts")
-    if mesh.dimension == 2 and isinstance(model.electrodes, _FREE):
+    if mesh.dimension == 2 and isinstance(model.electrodes, _MESH_INDEPENDENT):
         finer, parent = finer_mesh(mesh, centre, radius, 0.5 * edge**2)
         return ForwardModel(finer, model.electrodes, model.protocol), parent, edge
     extent = np.ptp(np.asarray(mesh.points), axis=0)
@@ -119,7 +119,7 @@ def _halve(points: np.ndarray, cells: np.ndarray, parent: np.ndarray, large: Boo
 # Maximum number of nodes of a region.
 _MOST_NODES = 2500
 # Factor by which the radius of a region with too many nodes is reduced.
-_LESS = 0.85
+_SHRINKAGE = 0.85
 
 
 class LocalChange:
@@ -137,7 +137,7 @@ class LocalChange:
         away = np.linalg.norm(np.asarray(centroids(mesh))[:, :2] - centre, axis=1)
         corners = np.asarray(mesh.cells)
         while len(nodes := np.unique(corners[away < radius])) > _MOST_NODES:
-            radius *= _LESS
+            radius *= _SHRINKAGE
         self.radius = radius
         self.cells: Int[np.ndarray, " c"] = np.flatnonzero(away < radius)
         place = np.full(mesh.num_points, -1)
@@ -154,28 +154,28 @@ class LocalChange:
 
     def impedance(self, change: Float[np.ndarray, "c ..."]) -> Float[np.ndarray, "L L"]:
         """Transfer impedance (L, L), ohms, after a change of conductivity: scalars (c,) or tensors (c, d, d)."""
-        return self._impedance(self._solve(change)[1])
+        return self._impedance(self._solve_change(change)[1])
 
-    def slopes(
-        self, change: Float[np.ndarray, "c ..."], ways: list[Float[np.ndarray, "c ..."]]
+    def derivatives(
+        self, change: Float[np.ndarray, "c ..."], directions: list[Float[np.ndarray, "c ..."]]
     ) -> tuple[Float[np.ndarray, "L L"], list[Float[np.ndarray, "L L"]]]:
         """Transfer impedance (L, L), ohms, after a `change` of conductivity, and its derivatives (L, L) in the
-        directions `ways`."""
-        cells, product, solution = self._solve(change)
+        directions `directions`."""
+        cells, product, solution = self._solve_change(change)
         fields: Any = unit_fields(solution, product, self.resistance)[0]  # pyright: ignore[reportArgumentType]
         table = np.zeros((self.solution.shape[0], fields.shape[1]))
         nodes = np.unique(self.corners[cells])
         table[nodes] = fields
         slope = np.einsum("ckd,ckl->dcl", self.gradients[cells], table[self.corners[cells]], optimize=True)
         found = []
-        for way in ways:
+        for way in directions:
             part = way[cells] * self.measures[cells].reshape((-1,) + (1,) * (way.ndim - 1))
             turned = np.einsum("cab,bcl->acl", part, slope) if part.ndim == 3 else part[:, None] * slope
             energy = np.tensordot(slope, turned, axes=([0, 1], [0, 1]))
             found.append(-np.asarray(centred(energy)))  # pyright: ignore[reportArgumentType]
         return self._impedance(product), found
 
-    def _solve(self, change: np.ndarray):
+    def _solve_change(self, change: np.ndarray):
         """Solve for a change; returns the changed cells, Bᵀ(A + D)⁻¹B, and (A + D)⁻¹B at the nodes of these cells, in
         order."""
         size = np.abs(change).reshape(len(change), -1).max(axis=1)

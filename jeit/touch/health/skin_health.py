@@ -19,13 +19,13 @@ from jeit.touch.health.event import (
     EventStatus,
     HealthEvent,
     Step,
+    change_size,
+    channel_medians,
     is_distinct,
     lasting_step,
-    median,
-    size_of,
 )
-from jeit.touch.health.finding import Change, Finding, findings
-from jeit.touch.health.healthy import Healthy, averaged
+from jeit.touch.health.finding import Finding, LastingChange, classify_change
+from jeit.touch.health.healthy import HealthyState, average_frames
 from jeit.touch.health.imaged_skin import ImagedSkin
 
 # Time that no touch is held for: seconds; number of windows if frames have no times.
@@ -42,7 +42,10 @@ _GONE, _REFUSED = 0.6, 0.5
 _SPANS, _FEW = 3.0, 0.34
 
 # Appended to the reason of an event that the first window shows.
-_SINCE = "It was there from the first frame: gains or contacts that changed since the healthy recording do the same."
+_SINCE = (
+    "The change is present from the first frame on: gains or contacts that changed since the healthy "
+    "recording have the same effect."
+)
 
 _OF_CHANNELS = (EventKind.NOISY, EventKind.STUCK)
 
@@ -58,10 +61,10 @@ class WatchStatus(StrEnum):
 
 
 @dataclass(frozen=True)
-class _Pending:
+class _PendingChange:
     """A change that looks like a touch, which is pending until it disappears or has lasted."""
 
-    change: Change
+    change: LastingChange
     finding: Finding
 
 
@@ -84,7 +87,7 @@ class SkinHealth:
     Create it with `SkinHealth.fit`.
     """
 
-    healthy: Healthy
+    healthy: HealthyState
     reference: Float[np.ndarray, " M"]
     trusted: Bool[np.ndarray, " M"]
     patience: float
@@ -100,7 +103,7 @@ class SkinHealth:
     _part: tuple[np.ndarray, ...] = ()
     _steps: int = 0
     _settled: bool = False
-    _pending: _Pending | None = None
+    _pending: _PendingChange | None = None
 
     @classmethod
     def fit(
@@ -123,17 +126,17 @@ class SkinHealth:
         for frames that are no recording of this skin, fewer than 20 frames, times that do not rise, and a patience that
         is not positive.
         """
-        frames = _frames("healthy", healthy)
+        frames = _check_frames("healthy", healthy)
         period = 1.0
         if times is not None:
-            seconds = _times(times, len(frames))
+            seconds = _check_times(times, len(frames))
             if (np.diff(seconds) <= 0).any():
-                raise ValueError("times must rise from frame to frame, in seconds; some do not.")
+                raise ValueError("times must increase from frame to frame, in seconds; some do not.")
             period = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
         if patience is not None and not (is_number(patience) and patience > 0):
             raise ValueError(f"patience must be positive, in seconds; it is {describe(patience)}.")
         wanted = PATIENCE if times is not None and patience is None else patience
-        learnt = Healthy.learn(frames, period, None if wanted is None else float(wanted) / _WINDOW)
+        learnt = HealthyState.learn(frames, period, None if wanted is None else float(wanted) / _WINDOW)
         window = learnt.window * learnt.stride * learnt.period
         wanted = max(_PATIENCE_WINDOWS * window if wanted is None else float(wanted), 2 * window)
         skin = None
@@ -207,16 +210,16 @@ class SkinHealth:
         since, such as gains, is then no event. Raises `ValueError` for frames with another number of channels, or
         without a reading in half of them.
         """
-        read = _frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
+        read = _check_frames("frames", np.atleast_2d(real_array("frames", frames, "(n, M) volts")))
         if read.shape[1] != self.reference.size:
             raise ValueError(f"frames have {read.shape[1]} channels, and this skin {self.reference.size}.")
-        fresh = median(np.where(np.isfinite(read), read, np.nan))
+        fresh = channel_medians(np.where(np.isfinite(read), read, np.nan))
         there = np.isfinite(fresh) & self.healthy.used
         if there.sum() < _REFUSED * self.healthy.used.sum():
             raise ValueError("frames: fewer than half of the channels have a reading; that is no reference.")
         mended = tuple(_with_new_status(one, EventStatus.MENDED) if one.open else one for one in self.events)
         change = np.where(there, fresh - self.reference, 0.0)
-        strength = float(size_of(change / self.healthy.scale)) / self.healthy.limit
+        strength = float(change_size(change / self.healthy.scale)) / self.healthy.limit
         event = HealthEvent(
             number=len(self.events),
             kind=EventKind.REPAIRED,
@@ -234,7 +237,7 @@ class SkinHealth:
             events=(*mended, event),
             reference=np.where(there, fresh, self.reference),
             trusted=there,
-            skin=None if self.skin is None else self.skin.healed(),
+            skin=None if self.skin is None else self.skin.without_cuts(),
             _window=(),
             _part=(),
             _settled=True,
@@ -248,8 +251,8 @@ class SkinHealth:
         for another number of channels.
         """
         if self.skin is None:
-            raise ValueError("images need a model: give it to SkinHealth.fit, with its conductivity.")
-        read = _frames("frames", frames)
+            raise ValueError("images need a forward model: give model and conductivity to SkinHealth.fit.")
+        read = _check_frames("frames", frames)
         if read.shape[1] != self.reference.size:
             raise ValueError(f"frames have {read.shape[1]} channels, and this skin {self.reference.size}.")
         return self.skin.images(read - self.reference, self.trusted)
@@ -260,32 +263,32 @@ class SkinHealth:
         one."""
         if self._pending is None:
             return None
-        return self._event(self._pending.change, self._pending.finding, EventStatus.HELD, len(self.events))
+        return self._create_event(self._pending.change, self._pending.finding, EventStatus.HELD, len(self.events))
 
     @property
     def open_events(self) -> list[HealthEvent]:
         """The events that still apply."""
         return [one for one in self.events if one.open]
 
-    def _process(self, time: float, values: np.ndarray, there: np.ndarray) -> "SkinHealth":
+    def _process(self, time: float, values: np.ndarray, has_reading: np.ndarray) -> "SkinHealth":
         healthy = self.healthy
         low, high = healthy.span + self.reference
         far = _SPANS * (high - low) + healthy.limit * np.where(healthy.used, healthy.noise, 0.0)
-        strange = there & ((values < low - far) | (values > high + far))
+        strange = has_reading & ((values < low - far) | (values > high + far))
         # If many channels are beyond their span, the skin has changed; the channels are not faulty.
         strange &= strange.sum() <= _FEW * healthy.used.sum()
-        usable = there & self.trusted & ~strange
+        usable = has_reading & self.trusted & ~strange
         lost = int((healthy.used & ~usable).sum())
         status, reason = WatchStatus.WATCHED, ""
         if lost:
             status, reason = WatchStatus.PARTIAL, f"{lost} of {int(healthy.used.sum())} channels are not to be trusted."
-        part = (*self._part, np.where(there, values, np.nan))
+        part = (*self._part, np.where(has_reading, values, np.nan))
         after = replace(
             self, time=time, frames=self.frames + 1, status=status, reason=reason, usable=usable, _part=part
         )
         if len(part) < healthy.stride:
             return after
-        (step,) = averaged(np.array(part), healthy.stride)
+        (step,) = average_frames(np.array(part), healthy.stride)
         first = self.frames + 1 - healthy.stride
         window = (*self._window, (time, first, step))[-2 * healthy.window :]
         after = replace(after, _part=(), _window=window, _steps=self._steps + 1)
@@ -297,9 +300,9 @@ class SkinHealth:
         if number < healthy.window:
             return self
         frames = np.array([one for _, _, one in self._window])
-        latest = median(frames[-healthy.window :])
+        latest = channel_medians(frames[-healthy.window :])
         if not self._settled:
-            return self._start(latest)
+            return self._process_first_window(latest)
         after = self._update_pending(latest)
         if number == 2 * healthy.window:
             # Changes in channels that are not trusted belong to known events.
@@ -308,12 +311,12 @@ class SkinHealth:
                 return after._process_step(step, frames)
             after = after._check_channels(frames)
         off = np.where(self.trusted & np.isfinite(latest), latest - self.reference, 0.0)
-        if after._pending is None and size_of(off / healthy.scale) < healthy.limit:
+        if after._pending is None and change_size(off / healthy.scale) < healthy.limit:
             followed = self.reference + _FOLLOWS * (latest - self.reference)
             after = replace(after, reference=np.where(np.isfinite(latest), followed, self.reference))
         return after
 
-    def _start(self, latest: np.ndarray) -> "SkinHealth":
+    def _process_first_window(self, latest: np.ndarray) -> "SkinHealth":
         """Return the state after the first window, which is compared with the healthy frames."""
         healthy = self.healthy
         change = np.where(np.isfinite(latest), latest - healthy.reference, 0.0)
@@ -322,16 +325,16 @@ class SkinHealth:
         scaled = np.where(healthy.used, change / healthy.level, 0.0)
         if whole @ whole > 0 and abs(scaled @ whole) < 0.1 * (whole @ whole):
             scaled = scaled - whole * (scaled @ whole) / (whole @ whole)
-        size = float(size_of(scaled))
+        size = float(change_size(scaled))
         first = np.array([one for _, _, one in self._window]) - healthy.reference
         along = np.nan_to_num(first / healthy.level**2) @ change / max((change / healthy.level**2) @ change, 1e-300)
         begun = replace(self, _settled=True, reference=np.where(np.isfinite(latest), latest, self.reference))
         if size <= healthy.level_limit or not is_distinct(along, 0):
             return begun
         time, frame, _ = self._window[0]
-        change = Change(change, size / healthy.level_limit * healthy.limit, time, frame, self.time)
+        change = LastingChange(change, size / healthy.level_limit * healthy.limit, time, frame, self.time)
         frames = np.array([one for _, _, one in self._window])
-        found = findings(change.vector, frames, healthy.reference, healthy, self.touching, self.skin)
+        found = classify_change(change.vector, frames, healthy.reference, healthy, self.touching, self.skin)
         found = [one if one.own is not None else replace(one, reason=f"{one.reason} {_SINCE}") for one in found]
         return replace(begun, reference=healthy.reference)._add_events(change, found, EventStatus.LASTING)
 
@@ -356,22 +359,22 @@ class SkinHealth:
     def _process_step(self, step: Step, frames: np.ndarray) -> "SkinHealth":
         """Return the state after a lasting step."""
         time, frame, _ = self._window[step.first]
-        change = Change(step.change, step.size, time, frame, self.time)
+        change = LastingChange(step.change, step.size, time, frame, self.time)
         fresh = replace(self, _window=self._window[step.first :])
-        off = np.where(np.isfinite(step.change), median(frames[step.first :]) - self.reference, 0.0)
+        off = np.where(np.isfinite(step.change), channel_medians(frames[step.first :]) - self.reference, 0.0)
         scale = np.where(self.trusted, self.healthy.scale, np.inf)
-        if size_of(off / scale) <= self.healthy.limit:  # the skin is as it was before a touch
+        if change_size(off / scale) <= self.healthy.limit:  # the skin is as it was before a touch
             return fresh
-        undone = fresh._undo(change)
+        undone = fresh._reverse_change(change)
         if undone is not None:
             return undone
         after = frames[step.first :]
-        found = findings(step.change, after, self.reference, self.healthy, self.touching, self.skin)
+        found = classify_change(step.change, after, self.reference, self.healthy, self.touching, self.skin)
         if found[0].electrode is not None or (found[0].sure and change.size > self.healthy.sudden):
             return fresh._add_events(change, found, EventStatus.LASTING)
         if self._pending is not None:  # only one change is pending at a time: the first
             return fresh
-        return replace(fresh, _pending=_Pending(change, found[0]))
+        return replace(fresh, _pending=_PendingChange(change, found[0]))
 
     def _check_channels(self, frames: np.ndarray) -> "SkinHealth":
         """Return the state after checking for single channels that are noisy or stuck."""
@@ -380,21 +383,21 @@ class SkinHealth:
             if one.kind in _OF_CHANNELS and one.status == EventStatus.DENIED:
                 asked &= ~one.channels
         for kind, which in (
-            (EventKind.NOISY, steadiness.noisy(frames, asked)),
-            (EventKind.STUCK, steadiness.stuck(frames, asked)),
+            (EventKind.NOISY, steadiness.noisy_channels(frames, asked)),
+            (EventKind.STUCK, steadiness.stuck_channels(frames, asked)),
         ):
             for channel in np.flatnonzero(which):
                 own = np.arange(self.reference.size) == channel
                 time, frame, _ = self._window[0]
-                change = Change(np.zeros(own.size), self.healthy.limit, time, frame, self.time)
+                change = LastingChange(np.zeros(own.size), self.healthy.limit, time, frame, self.time)
                 said = "is several times as noisy as it was, or jumps" if kind == EventKind.NOISY else "does not move"
                 finding = Finding(kind, f"Channel {channel} {said}.", True, own=own)
-                event = after._event(change, finding, EventStatus.LASTING, len(after.events))
+                event = after._create_event(change, finding, EventStatus.LASTING, len(after.events))
                 event = eqx.tree_at(lambda one: one.channels, event, own)
                 after = replace(after, events=(*after.events, event))
         return after if after is self else replace(after, trusted=after._trusted_channels())
 
-    def _undo(self, change: Change) -> "SkinHealth | None":
+    def _reverse_change(self, change: LastingChange) -> "SkinHealth | None":
         """Return the state after a step that reverses an earlier change; None if it reverses none."""
         for one in self.open_events:
             there = np.isfinite(one.change) & np.isfinite(change.vector) & self.trusted
@@ -408,26 +411,28 @@ class SkinHealth:
                 )
                 reason = f"Event {one.number} is gone: it was mended, or a press that has been lifted."
                 finding = Finding(EventKind.REPAIRED, reason, True)
-                event = self._event(change, finding, EventStatus.LASTING, len(events))
+                event = self._create_event(change, finding, EventStatus.LASTING, len(events))
                 after = replace(self, events=(*events, event))
                 fresh = np.where(np.isfinite(change.vector), self.reference + change.vector, self.reference)
                 return replace(after, reference=fresh, trusted=after._trusted_channels(), skin=after._current_skin())
         return None
 
-    def _add_events(self, change: Change, found: list[Finding], status: EventStatus) -> "SkinHealth":
+    def _add_events(self, change: LastingChange, found: list[Finding], status: EventStatus) -> "SkinHealth":
         """Return the state with events added; from now on, the reference contains their change."""
-        events = [self._event(change, one, status, len(self.events) + number) for number, one in enumerate(found)]
+        events = [
+            self._create_event(change, one, status, len(self.events) + number) for number, one in enumerate(found)
+        ]
         # If electrodes fail, the reference changes only in their channels: the skin may be touched at the time.
         own = np.logical_or.reduce([np.ones_like(self.trusted) if one.own is None else one.own for one in found])
         fresh = np.where(own & np.isfinite(change.vector), self.reference + change.vector, self.reference)
         skin = self.skin
         for one in found:
             if one.loss is not None and skin is not None:
-                skin = skin.with_loss(one.loss)
+                skin = skin.with_cut(one.loss)
         after = replace(self, events=(*self.events, *events), reference=fresh, skin=skin)
         return replace(after, trusted=after._trusted_channels())
 
-    def _event(self, change: Change, found: Finding, status: EventStatus, number: int) -> HealthEvent:
+    def _create_event(self, change: LastingChange, found: Finding, status: EventStatus, number: int) -> HealthEvent:
         own = np.ones(self.reference.size, bool) if found.own is None else found.own
         large = np.abs(np.nan_to_num(change.vector)) > self.healthy.limit * self.healthy.scale
         return HealthEvent(
@@ -451,14 +456,14 @@ class SkinHealth:
         """Return the state with another status of an event. Raises `ValueError` for an event of another skin."""
         check_kind("event", event, HealthEvent, "one of health.events, or health.held")
         if not event.number < len(self.events):
-            raise ValueError(f"event {event.number} is none of this skin's, which has {len(self.events)}.")
+            raise ValueError(f"event {event.number} does not belong to this skin, which has {len(self.events)} events.")
         events = [_with_new_status(one, status) if one.number == event.number else one for one in self.events]
         return replace(self, events=tuple(events))
 
     def _current_skin(self) -> ImagedSkin | None:
         """Return the model, without cuts if no open event is a cut."""
         cut = any(one.path is not None for one in self.open_events)
-        return self.skin if self.skin is None or cut else self.skin.healed()
+        return self.skin if self.skin is None or cut else self.skin.without_cuts()
 
     def _trusted_channels(self) -> Bool[np.ndarray, " M"]:
         """Whether each channel (M,) is trusted: it has readings, and no open event excludes it or its electrodes."""
@@ -485,7 +490,7 @@ def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None)
         first = health.time + 1 if np.isfinite(health.time) else 0.0
         seconds = first + np.arange(len(read))
     else:
-        seconds = _times(times, len(read))
+        seconds = _check_times(times, len(read))
     for time, frame in zip(seconds, read, strict=True):
         health = health.follow(float(time), frame)
     return health
@@ -495,15 +500,15 @@ def _with_new_status(event: HealthEvent, status: EventStatus) -> HealthEvent:
     return eqx.tree_at(lambda one: one.status, event, status)
 
 
-def _frames(name: str, given) -> Float[np.ndarray, "F M"]:
-    frames = real_array(name, given, "frames (F, M), volts")
+def _check_frames(name: str, values) -> Float[np.ndarray, "F M"]:
+    frames = real_array(name, values, "frames (F, M), volts")
     if frames.ndim != 2 or not frames.size:
         raise ValueError(f"{name} must be frames (F, M), volts, one row each; it has shape {frames.shape}.")
     return frames
 
 
-def _times(given, number: int) -> Float[np.ndarray, " F"]:
-    seconds = real_array("times", given, "seconds (F,), one for each frame")
-    if seconds.shape != (number,) or not np.isfinite(seconds).all():
-        raise ValueError(f"times: give one for each of the {number} frames; they have shape {seconds.shape}.")
+def _check_times(values, num_frames: int) -> Float[np.ndarray, " F"]:
+    seconds = real_array("times", values, "seconds (F,), one for each frame")
+    if seconds.shape != (num_frames,) or not np.isfinite(seconds).all():
+        raise ValueError(f"times: give one for each of the {num_frames} frames; they have shape {seconds.shape}.")
     return seconds

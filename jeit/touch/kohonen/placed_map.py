@@ -21,12 +21,12 @@ from jeit.files import need, npz_arrays, written_whole
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 
 # Number of neurons from which a place is estimated, and regularisation of their shares, relative to the mean square of
-# the differences of their frames: for the neurons nearest to the frame, then for 5 by 5 neurons on the grid around the
-# nearest.
-_NEAREST, _HELD = 9, 0.05
-_ON_GRID, _HELD_ON_GRID = 25, 0.005
+# the differences of their frames: first for the neurons nearest to the frame, then for the 5 by 5 neurons on the grid
+# around the nearest one.
+_NUM_NEAREST, _REGULARISATION = 9, 0.05
+_NUM_ON_GRID, _REGULARISATION_ON_GRID = 25, 0.005
 # Weight of the mean place of a neuron's presses in the fit of its place, relative to that of one press.
-_DOUBT = 0.3
+_MEAN_WEIGHT = 0.3
 _FEWEST = 10
 # What a file has of a `PlacedMap` beside its map.
 _OF_PLACES = "places", "widening", "missed", "fitted"
@@ -76,18 +76,18 @@ class PlacedMap:
         for fit in (False, True):
             off = spread = missed = 0.0
             for out in (odd, ~odd):
-                part = cls._of(learnt, frames[~out], positions[~out], winners[~out], fit)
-                placed = part._estimate(frames[out])
+                part = cls._from_presses(learnt, frames[~out], positions[~out], winners[~out], fit)
+                placed = part._estimate_places(frames[out])
                 off += float(np.sum((placed.places - positions[out]) ** 2))
                 spread += float(np.sum(placed.spread**2))
                 missed += float(np.sum(placed.left**2))
             ways.append((off, fit, float(np.sqrt(off / max(spread, 1e-300))), float(np.sqrt(missed / frames.size))))
         _, fit, widening, _ = min(ways)
-        whole = cls._of(learnt, frames, positions, winners, fit)
+        whole = cls._from_presses(learnt, frames, positions, winners, fit)
         return replace(whole, widening=widening, missed=ways[0][3])
 
     @classmethod
-    def _of(cls, learnt, frames, positions, winners, fit: bool) -> "PlacedMap":
+    def _from_presses(cls, learnt, frames, positions, winners, fit: bool) -> "PlacedMap":
         """Create a map with places from presses and their winners (N,).
 
         Its standard deviations are not yet calibrated.
@@ -99,11 +99,11 @@ class PlacedMap:
         placed = cls(learnt, means, 1.0, 0.0, means if fit else None)
         if not fit:
             return placed
-        near, shares, _ = placed._shares(frames)
+        near, shares, _ = placed._locating_neurons(frames)
         row = np.repeat(np.arange(len(frames)), near.shape[1])
         combined = csr_array((shares.ravel(), (row, near.ravel())), shape=(len(frames), np.count_nonzero(count)))
         off = positions - combined @ means[placed.placed]
-        moved = [lsqr(combined, one, damp=np.sqrt(_DOUBT), atol=1e-9, btol=1e-9)[0] for one in off.T]
+        moved = [lsqr(combined, one, damp=np.sqrt(_MEAN_WEIGHT), atol=1e-9, btol=1e-9)[0] for one in off.T]
         fitted = means.copy()
         fitted[placed.placed] += np.stack(moved, axis=1)
         return replace(placed, fitted=fitted)
@@ -116,18 +116,18 @@ class PlacedMap:
     def locate(self, frames: ArrayLike) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
         """Estimate the places (n, d) of frames (n, M), or one frame (M,), and their standard deviations (n, d), metres.
 
-        Neurons are combined with shares of sum 1 such that the combination of their frames is nearest to the given
-        frame. These are the neurons nearest to it, or, if there are `fitted` places, those around the nearest neuron on
-        the grid. The place is the combination of their places with the same shares (a map that is linear between
-        neurons; the shares are those of Roweis and Saul 2000). It is at most as far from the mean of their places, or
-        on the grid from the place of the nearest neuron, as the farthest of these places. Raises `ValueError` for
+        A frame is approximated by a combination of the frames of several neurons, with shares of sum 1 by least squares
+        (Roweis and Saul 2000). The place is the combination of the neurons' places with the same shares. The neurons
+        are those whose frames are nearest to the given frame; or, if there are `fitted` places, the nearest neuron and
+        those around it on the grid. The place is limited to the distance of the farthest of the neurons' places from
+        their mean, or, on the grid, from the place of the nearest neuron. Raises `ValueError` for
         frames with another number of channels, and NaN.
         """
-        placed = self._estimate(self.learnt.checked(frames))
+        placed = self._estimate_places(self.learnt.checked(frames))
         return placed.places, self.widening * placed.spread
 
-    def _estimate(self, frames: Float[np.ndarray, "n M"]) -> "_Estimate":
-        near, shares, left = self._shares(frames)
+    def _estimate_places(self, frames: Float[np.ndarray, "n M"]) -> "_Estimate":
+        near, shares, left = self._locating_neurons(frames)
         there = self._placed_neurons.places[near]
         own = there.mean(axis=1) if self.fitted is None else there[:, 0]
         offset = np.einsum("nq,nqd->nd", shares, there) - own
@@ -136,7 +136,7 @@ class PlacedMap:
         said = own + offset * np.minimum(1.0, most / np.maximum(length, 1e-300))[:, None]
         return _Estimate(said, np.sqrt(np.mean((there - said[:, None]) ** 2, axis=1)), left)
 
-    def _shares(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _locating_neurons(self, frames: Float[np.ndarray, "n M"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the neurons that locate frames.
 
         Returns their indices (n, q) among the neurons with places, their shares (n, q), and the residuals of the frames
@@ -144,9 +144,9 @@ class PlacedMap:
         """
         known = self._placed_neurons
         if self.fitted is None:
-            near, held = known.neurons.nearest(frames, min(_NEAREST, len(known.places)))[0], _HELD
+            near, held = known.neurons.nearest(frames, min(_NUM_NEAREST, len(known.places)))[0], _REGULARISATION
         else:
-            near, held = known.around[known.neurons.winners(frames)[:, 1]], _HELD_ON_GRID
+            near, held = known.around[known.neurons.winners(frames)[:, 1]], _REGULARISATION_ON_GRID
         shares, left = np.empty(near.shape), np.empty(frames.shape)
         for first in range(0, len(frames), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
@@ -162,7 +162,7 @@ class PlacedMap:
         neurons = SelfOrganisingMap(self.learnt.weights[self.placed][None], self.learnt.scale)
         places, grid = (self.places if self.fitted is None else self.fitted)[self.placed], np.argwhere(self.placed)
         # Sorted by the larger of the distances in rows and columns: the first is the neuron itself.
-        around = KDTree(grid).query(grid, min(_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
+        around = KDTree(grid).query(grid, min(_NUM_ON_GRID, len(grid)), p=np.inf)[1].reshape(len(grid), -1)
         return _PlacedNeurons(neurons, places, around)
 
 
@@ -188,17 +188,19 @@ class _Estimate(NamedTuple):
     left: Float[np.ndarray, "n M"]
 
 
-def _combination_shares(own: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], held: float):
+def _combination_shares(
+    neuron_frames: Float[np.ndarray, "n q M"], frames: Float[np.ndarray, "n M"], regularisation: float
+):
     """Compute shares (n, q) of sum 1 whose combinations of the neurons' frames are nearest to the given frames.
 
     Also returns the residuals (n, M).
     """
-    count = own.shape[1]
-    middle = own.mean(axis=1, keepdims=True)
-    apart = own - middle
+    count = neuron_frames.shape[1]
+    middle = neuron_frames.mean(axis=1, keepdims=True)
+    apart = neuron_frames - middle
     gram = apart @ np.swapaxes(apart, 1, 2)
     diagonal = np.einsum("nqq->nq", gram)  # a view of `gram`
-    diagonal += held * diagonal.mean(axis=1, keepdims=True) + 1e-300
+    diagonal += regularisation * diagonal.mean(axis=1, keepdims=True) + 1e-300
     change = frames - middle[:, 0]
     found = np.linalg.solve(gram, apart @ change[..., None])
     left = change - (np.swapaxes(found, 1, 2) @ apart)[:, 0]
@@ -270,16 +272,16 @@ def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
     try:
         arrays = npz_arrays(Path(path), "weights", "scale", *_OF_PLACES)
         need(arrays, "weights", "scale")
-        learnt = SelfOrganisingMap(arrays["weights"], _number("scale", arrays))
+        learnt = SelfOrganisingMap(arrays["weights"], _read_scalar("scale", arrays))
         if "places" not in arrays:
             return learnt
-        numbers = _number("widening", arrays), _number("missed", arrays)
+        numbers = _read_scalar("widening", arrays), _read_scalar("missed", arrays)
         return PlacedMap(learnt, arrays["places"], *numbers, arrays.get("fitted"))
     except ValueError as error:
         raise ValueError(f"'{path}' is no map: {error}") from None
 
 
-def _number(name: str, arrays: dict[str, np.ndarray]) -> float:
+def _read_scalar(name: str, arrays: dict[str, np.ndarray]) -> float:
     value = arrays.get(name, np.zeros(0))
     if value.dtype.kind not in "fiu" or value.shape != ():
         raise ValueError(f"{name} must be one number; it has shape {value.shape}.")

@@ -18,9 +18,9 @@ from jeit.touch.kohonen.training import Schedule, train
 # Minimum number of frames: fewer define no order.
 _FEWEST = 3
 # Standard deviation of the initial weights, relative to the frames' root mean square.
-_SMALL = 1e-3
+_INITIAL_DEVIATION = 1e-3
 # Radius, in grid steps, at which only the winner moves: for its neighbours, exp(−1/2ρ²) underflows.
-_ALONE = 0.01
+_WINNER_ONLY_RADIUS = 0.01
 # Number of frames whose distances to all neurons are computed at once.
 _AT_ONCE = 1024
 
@@ -112,7 +112,7 @@ class SelfOrganisingMap:
     def _squared_distances(self, frames: Float[np.ndarray, "n M"]) -> Float[np.ndarray, "n k"]:
         """Compute squared distances (n, k) as |w − m|² − 2 (w − m)·(x − m) + |x − m|², with m the mean of the
         weights."""
-        middle, weights, squares = self._about_middle
+        middle, weights, squares = self._centred_weights
         found = np.empty((len(frames), len(weights)))
         for first in range(0, len(frames), _AT_ONCE):
             own = frames[first : first + _AT_ONCE] - middle
@@ -124,7 +124,7 @@ class SelfOrganisingMap:
         return np.maximum(found, 0.0, out=found)
 
     @cached_property
-    def _about_middle(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _centred_weights(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         flat = self.weights.reshape(-1, self.weights.shape[2])
         middle = flat.mean(axis=0)
         return middle, flat - middle, np.sum((flat - middle) ** 2, axis=1)
@@ -170,26 +170,26 @@ def learn_weights(
     shape = _check_shape(shape)
     pairs = [(key, schedule) for key in keys for schedule in schedules]
     starts = np.stack([_initial_weights(frames, key, shape) for key, _ in pairs])
-    orders = np.stack([_order(key, len(frames), schedule.steps) for key, schedule in pairs])
+    orders = np.stack([_shuffled_order(key, len(frames), schedule.steps) for key, schedule in pairs])
     rates = np.stack([schedule.rates() for _, schedule in pairs])
     longest = max(schedule.ordering for schedule in schedules)
     radii = np.stack([_extend_radii(schedule.radii(shape), longest) for _, schedule in pairs])
-    many = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(pairs) > 1 else _train_one
+    many = jax.vmap(train, in_axes=(0, None, 0, 0, 0)) if len(pairs) > 1 else _train_single_map
     weights, curves = many(jnp.asarray(starts), jnp.asarray(frames), orders, rates, radii)
     return np.asarray(weights), np.asarray(curves)
 
 
-def checked_frames(given, channels: int | None = None) -> Float[np.ndarray, "n M"]:
+def checked_frames(values, num_channels: int | None = None) -> Float[np.ndarray, "n M"]:
     """Convert frames (n, M), or one frame (M,), to an array (n, M).
 
-    Raises `ValueError` for other shapes, for another number of channels than `channels`, and for NaN.
+    Raises `ValueError` for other shapes, for another number of channels than `num_channels`, and for NaN.
     """
-    frames = real_array("frames", given, "numbers (n, channels)")
+    frames = real_array("frames", values, "numbers (n, channels)")
     frames = frames[None] if frames.ndim == 1 else frames
     if frames.ndim != 2 or not frames.shape[1]:
         raise ValueError(f"frames has shape {frames.shape}; give (n, channels), a row for each frame.")
-    if channels is not None and frames.shape[1] != channels:
-        raise ValueError(f"frames has {frames.shape[1]} channels, and the map was learnt from {channels}.")
+    if num_channels is not None and frames.shape[1] != num_channels:
+        raise ValueError(f"frames has {frames.shape[1]} channels, and the map was learnt from {num_channels}.")
     if not np.isfinite(frames).all():
         rows = int((~np.isfinite(frames).all(axis=1)).sum())
         raise ValueError(
@@ -204,14 +204,15 @@ def _extend_radii(radii: Float[np.ndarray, " O"], longest: int) -> Float[np.ndar
 
     The added radii, which belong to the tuning phase, are almost 0.
     """
-    return np.concatenate([radii, np.full(longest - len(radii), _ALONE)])
+    return np.concatenate([radii, np.full(longest - len(radii), _WINNER_ONLY_RADIUS)])
 
 
-def _train_one(starts, frames, orders, rates, radii):
+def _train_single_map(starts, frames, orders, rates, radii):
     return tuple(one[None] for one in train(starts[0], frames, orders[0], rates[0], radii[0]))
 
 
 def _with_scale(weights: np.ndarray, frames: np.ndarray, scale: float | None) -> SelfOrganisingMap:
+    """Create a map; without a `scale`, it is the median distance of the frames from their winners."""
     learnt = SelfOrganisingMap(weights, 1.0 if scale is None else scale)
     if scale is not None:
         return learnt
@@ -221,15 +222,16 @@ def _with_scale(weights: np.ndarray, frames: np.ndarray, scale: float | None) ->
 
 def _initial_weights(frames: np.ndarray, key: Array, shape: tuple[int, int]) -> Float[np.ndarray, "R C M"]:
     """Draw the initial weights, which are small and random."""
-    size = _SMALL * float(np.sqrt(np.mean(frames**2)))
+    size = _INITIAL_DEVIATION * float(np.sqrt(np.mean(frames**2)))
     return size * np.asarray(jax.random.normal(key, (*shape, frames.shape[1])))
 
 
-def _order(key: Array, number: int, steps: int) -> Int[np.ndarray, " T"]:
-    """Draw the order of `number` frames for `steps` steps: a new permutation each time that all have been shown."""
+def _shuffled_order(key: Array, num_frames: int, num_steps: int) -> Int[np.ndarray, " T"]:
+    """Draw the order of `num_frames` frames for `num_steps` steps: a new permutation each time that all have been
+    shown."""
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    rounds = [random.permutation(number) for _ in range(-(-steps // number))]
-    return np.concatenate(rounds)[:steps]
+    rounds = [random.permutation(num_frames) for _ in range(-(-num_steps // num_frames))]
+    return np.concatenate(rounds)[:num_steps]
 
 
 def _check_shape(shape) -> tuple[int, int]:
@@ -239,5 +241,5 @@ def _check_shape(shape) -> tuple[int, int]:
         raise ValueError(f"shape must be {wanted}; it is {shape!r}.")
     rows, columns = int(shape[0]), int(shape[1])
     if rows * columns < 2:
-        raise ValueError("shape: one neuron alone is no map.")
+        raise ValueError("shape: a map needs two neurons or more.")
     return rows, columns

@@ -40,9 +40,9 @@ def neuron_shares(placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> 
     touches have one sign, so few of the non-negative shares are needed (Lawson and Hanson 1974). Raises `ValueError` if
     `placed` is no map with places, and for more than one frame, another number of channels, and NaN.
     """
-    sum_of = _Sum.of(placed, frame, reference)
+    sum_of = _TouchSum.from_frame(placed, frame, reference)
     shares = np.zeros(placed.learnt.shape)
-    shares[placed.placed] = sum_of.shares(np.ones(len(sum_of.places), bool))[0]
+    shares[placed.placed] = sum_of.fit_shares(np.ones(len(sum_of.places), bool))[0]
     return shares
 
 
@@ -67,25 +67,25 @@ def touches_reported(
         raise ValueError(f"least must be a share, from 0 to below 1; it is {describe(least)}.")
     if apart is not None and not (is_number(apart) and apart > 0):
         raise ValueError(f"apart must be positive, in metres; it is {describe(apart)}.")
-    sum_of = _Sum.of(placed, frame, reference)
+    sum_of = _TouchSum.from_frame(placed, frame, reference)
     if apart is None:
         apart = _APART * float(np.ptp(sum_of.places, axis=0).max())
-    shares, left = sum_of.shares(np.ones(len(sum_of.places), bool))
+    shares, left = sum_of.fit_shares(np.ones(len(sum_of.places), bool))
     own = np.count_nonzero(shares)
     if not own:
         return []
     variance = max(left / max(len(sum_of.change) - own, 1), sum_of.variance)
-    chosen = _select_groups(sum_of, sum_of.groups(shares, apart), variance)
+    chosen = _select_groups(sum_of, sum_of.group_neurons(shares, apart), variance)
     if not chosen:
         return []
-    shares, _ = sum_of.shares(np.any(chosen, axis=0))
-    touches = [_touch(sum_of.places[group], shares[group]) for group in chosen if shares[group].any()]
+    shares, _ = sum_of.fit_shares(np.any(chosen, axis=0))
+    touches = [_touch_of_group(sum_of.places[group], shares[group]) for group in chosen if shares[group].any()]
     touches.sort(key=lambda one: -one.strength)
     return [one for one in touches if one.strength >= least * max(1.0, touches[0].strength)]
 
 
 @dataclass(frozen=True)
-class _Sum:
+class _TouchSum:
     """Model of the `change` (M,) of a frame as a sum of the `changes` (k, M) of neurons at `places` (k, d).
 
     Changes are divided by the root mean square of the neurons' changes; `variance`: residual variance of a channel, in
@@ -98,7 +98,7 @@ class _Sum:
     variance: float
 
     @classmethod
-    def of(cls, placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_Sum":
+    def from_frame(cls, placed: PlacedMap, frame: ArrayLike, reference: ArrayLike) -> "_TouchSum":
         check_kind("placed", placed, PlacedMap, "a map with places, as of PlacedMap.learn")
         read, rest = (_check_frame(placed, name, given) for name, given in (("frame", frame), ("reference", reference)))
         changes = placed.learnt.weights[placed.placed] - rest
@@ -106,15 +106,15 @@ class _Sum:
         own = placed.places[placed.placed]
         return cls((read - rest) / size, changes / size, own, (placed.missed / size) ** 2)
 
-    def shares(self, some: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
-        """Fit the shares (k,) of the neurons `some`; also returns the residual sum of squares."""
+    def fit_shares(self, neurons: Bool[np.ndarray, " k"]) -> tuple[Float[np.ndarray, " k"], float]:
+        """Fit the shares (k,) of the neurons `neurons`; also returns the residual sum of squares."""
         from scipy.optimize import nnls
 
-        found = np.zeros(len(some))
-        found[some], distance = nnls(self.changes[some].T, self.change)
+        found = np.zeros(len(neurons))
+        found[neurons], distance = nnls(self.changes[neurons].T, self.change)
         return found, float(distance) ** 2
 
-    def groups(self, shares: Float[np.ndarray, " k"], apart: float) -> list[Bool[np.ndarray, " k"]]:
+    def group_neurons(self, shares: Float[np.ndarray, " k"], apart: float) -> list[Bool[np.ndarray, " k"]]:
         """Group the neurons with shares into clusters of nearby places.
 
         Returns the neurons (k,) near each of the clusters that change the frame most.
@@ -133,13 +133,13 @@ class _Sum:
         ]
 
 
-def _select_groups(sum_of: _Sum, groups: list[np.ndarray], variance: float) -> list[Bool[np.ndarray, " k"]]:
+def _select_groups(model: _TouchSum, groups: list[np.ndarray], variance: float) -> list[Bool[np.ndarray, " k"]]:
     """Select the groups of neurons that are needed to explain the frame, the most informative first."""
     chosen: list[np.ndarray] = []
-    left = float(sum_of.change @ sum_of.change)
+    left = float(model.change @ model.change)
     rest = list(groups)
     while rest:
-        after = [sum_of.shares(np.any([*chosen, one], axis=0))[1] for one in rest]
+        after = [model.fit_shares(np.any([*chosen, one], axis=0))[1] for one in rest]
         best = int(np.argmin(after))
         if left - after[best] < _EVIDENCE * variance:
             break
@@ -148,14 +148,14 @@ def _select_groups(sum_of: _Sum, groups: list[np.ndarray], variance: float) -> l
     return chosen
 
 
-def _touch(places: Float[np.ndarray, "k d"], shares: Float[np.ndarray, " k"]) -> MapTouch:
+def _touch_of_group(places: Float[np.ndarray, "k d"], shares: Float[np.ndarray, " k"]) -> MapTouch:
     middle = shares @ places / shares.sum()
     spread = np.sqrt(shares @ np.sum((places - middle) ** 2, axis=1) / shares.sum())
     return MapTouch(middle, float(spread), float(shares.sum()))
 
 
-def _check_frame(placed: PlacedMap, name: str, given) -> Float[np.ndarray, " M"]:
-    values = real_array(name, given, "one frame (M,)")
+def _check_frame(placed: PlacedMap, name: str, value) -> Float[np.ndarray, " M"]:
+    values = real_array(name, value, "one frame (M,)")
     if values.shape != placed.learnt.weights.shape[2:] or not np.isfinite(values).all():
         raise ValueError(
             f"{name} must be one finite frame of {placed.learnt.weights.shape[2]} channels; it has shape "

@@ -27,9 +27,10 @@ from jaxtyping import Array, Float, Int
 from jeit.arguments import describe, is_number, real_array
 
 # Number of frames after which the weights are moved, in the ordering and in the tuning phase.
-_ORDERED, _TUNED = 16, 64
-# Indices are always those of existing neurons: without this promise, JAX copies all distances.
-_THERE = "promise_in_bounds"
+_ORDERING_FRAMES, _TUNING_FRAMES = 16, 64
+# Mode of indexing in JAX: all indices are within bounds, since they are numbers of neurons. In other modes, JAX copies
+# all distances.
+_IN_BOUNDS = "promise_in_bounds"
 
 
 class Schedule(eqx.Module):
@@ -53,9 +54,9 @@ class Schedule(eqx.Module):
                 raise ValueError(f"{name} must be a whole number of frames, zero or more; it is {describe(value)}.")
         if not self.ordering + self.tuning:
             raise ValueError("ordering and tuning are both zero: nothing would be learnt.")
-        _check_falling("rate", self.rate, 1.0, "shares of the way to a frame, at most 1, such as (0.3, 0.02)")
+        _check_decreasing("rate", self.rate, 1.0, "shares of the way to a frame, at most 1, such as (0.3, 0.02)")
         if self.radius is not None:
-            _check_falling("radius", self.radius, np.inf, "steps of the grid, such as (16.0, 1.0)")
+            _check_decreasing("radius", self.radius, np.inf, "steps of the grid, such as (16.0, 1.0)")
 
     @property
     def steps(self) -> int:
@@ -88,25 +89,25 @@ def train(
     """
     shape, middle, ordering = weights.shape[:2], frames.mean(axis=0), len(radii)
 
-    def show_all(phase, flat, at_once, order, rates, *radii):
+    def train_phase(phase, flat, at_once, order, rates, *radii):
         more = -len(order) % at_once
         # Frames are added to fill the last part; at a rate of 0, they change nothing.
         order_rates = [jnp.pad(one, (0, more)) for one in (order, rates)]
         filled = *order_rates, *(jnp.pad(one, (0, more), "edge") for one in radii)
 
-        def show_some(flat, now):
+        def train_block(flat, now):
             some, *how = now
             return phase(shape, flat, frames[some] - middle, *how)
 
-        flat, curve = jax.lax.scan(show_some, flat, tuple(one.reshape(-1, at_once) for one in filled))
+        flat, curve = jax.lax.scan(train_block, flat, tuple(one.reshape(-1, at_once) for one in filled))
         return flat, curve.reshape(-1)[: len(order)]
 
     flat, curves = (weights - middle).reshape(-1, weights.shape[2]), []
     if ordering:
-        flat, curve = show_all(_ordering_phase, flat, _ORDERED, order[:ordering], rates[:ordering], radii)
+        flat, curve = train_phase(_ordering_phase, flat, _ORDERING_FRAMES, order[:ordering], rates[:ordering], radii)
         curves.append(curve)
     if len(order) > ordering:
-        flat, curve = show_all(_tuning_phase, flat, _TUNED, order[ordering:], rates[ordering:])
+        flat, curve = train_phase(_tuning_phase, flat, _TUNING_FRAMES, order[ordering:], rates[ordering:])
         curves.append(curve)
     return flat.reshape(weights.shape) + middle, jnp.concatenate(curves) + middle.mean()
 
@@ -118,7 +119,7 @@ def _ordering_phase(shape, flat, shown, rates, radii):
     """
     row, column = jnp.arange(shape[0])[:, None], jnp.arange(shape[1])
 
-    def show(state, now):
+    def show_frame(state, now):
         distances, level = state
         one, rate, radius, to_others, mean = now
         own = distances[one]
@@ -130,29 +131,31 @@ def _ordering_phase(shape, flat, shown, rates, radii):
 
     start, apart = (_squared_distances(shown, flat), flat.mean(axis=1)), _squared_distances(shown, shown)
     each = jnp.arange(len(shown)), rates, radii, apart, shown.mean(axis=1)
-    _, (shares, curve) = jax.lax.scan(show, start, each)
+    _, (shares, curve) = jax.lax.scan(show_frame, start, each)
     return _move_weights(flat, shares, shown), curve
 
 
 def _tuning_phase(shape, flat, shown, rates):
-    """Show frames in the tuning phase, in which only the winner moves; returns as `_ordering_phase` does."""
+    """Show frames in the tuning phase, in which only the winner moves.
 
-    def show(state, now):
+    Returns the weights (k, M) after these frames, and their mean after each frame (n,)."""
+
+    def show_frame(state, now):
         distances, level, (winner, moved) = state
         one, rate, to_others, mean = now
         # Write the distances of the previous frame's winner before any are read, which avoids a copy of all distances.
-        distances = distances.at[:, winner].set(moved, mode=_THERE)
+        distances = distances.at[:, winner].set(moved, mode=_IN_BOUNDS)
         row, column = _winner(distances[one], shape)
         winner = row * shape[1] + column
-        moved = distances.at[:, winner].get(mode=_THERE)
+        moved = distances.at[:, winner].get(mode=_IN_BOUNDS)
         moved = (1 - rate) * moved + rate * (to_others - (1 - rate) * moved[one])
-        level = level.at[winner].add(rate * (mean - level[winner]), mode=_THERE)
+        level = level.at[winner].add(rate * (mean - level[winner]), mode=_IN_BOUNDS)
         return (distances, level, (winner, moved)), (winner, level.mean())
 
     distances, apart = _squared_distances(shown, flat), _squared_distances(shown, shown)
     start = distances, flat.mean(axis=1), (jnp.zeros((), int), distances[:, 0])
     each = jnp.arange(len(shown)), rates, apart, shown.mean(axis=1)
-    _, (winners, curve) = jax.lax.scan(show, start, each)
+    _, (winners, curve) = jax.lax.scan(show_frame, start, each)
     shares = jnp.where(winners[:, None] == winners, rates[:, None], 0.0)
     return flat.at[winners].set(_move_weights(flat[winners], shares, shown)), curve
 
@@ -175,15 +178,17 @@ def _winner(distances, shape):
 def _move_weights(weights, shares, shown):
     """Move weights (k, M) towards frames (n, M), one after another, by `shares` (n, k) of the remaining way."""
 
-    def left(after, share):
+    def remaining_share(after, share):
         return after * (1 - share), after * share
 
     # From the last frame to the first: later frames reduce the contribution of a frame by their own shares.
-    kept, moved = jax.lax.scan(left, jnp.ones(len(weights)), shares, reverse=True)
+    kept, moved = jax.lax.scan(remaining_share, jnp.ones(len(weights)), shares, reverse=True)
     return kept[:, None] * weights + moved.T @ shown
 
 
-def _check_falling(name: str, value, most: float, wanted: str) -> None:
-    span = real_array(name, value, f"the first and the last: {wanted}")
-    if span.shape != (2,) or not 0 < span[1] <= span[0] <= most or not np.isfinite(span).all():
-        raise ValueError(f"{name} must be the first and the last, positive and not rising: {wanted}; it is {value!r}.")
+def _check_decreasing(name: str, value, maximum: float, requirement: str) -> None:
+    span = real_array(name, value, f"the first and the last: {requirement}")
+    if span.shape != (2,) or not 0 < span[1] <= span[0] <= maximum or not np.isfinite(span).all():
+        raise ValueError(
+            f"{name} must be the first and the last, positive and not rising: {requirement}; it is {value!r}."
+        )

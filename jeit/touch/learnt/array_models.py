@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jeit.touch.learnt.extras import in_parts
+from jeit.touch.learnt.extras import apply_in_parts
 
 # Number of frames evaluated at once, so that the data stay in the processor's cache.
 _AT_ONCE = 128
@@ -52,23 +52,23 @@ class Forest:
         below, above = ((one + first_node[:, None]).ravel() for one in (self.left, self.right))
         value = self.value.reshape(-1, targets)
 
-        def answer(some: np.ndarray) -> np.ndarray:
-            row = (some.shape[1] * np.arange(len(some)))[:, None]
-            flat = np.ascontiguousarray(some).ravel()
-            node = np.broadcast_to(first_node, (len(some), trees))
+        def evaluate(rows: np.ndarray) -> np.ndarray:
+            row = (rows.shape[1] * np.arange(len(rows)))[:, None]
+            flat = np.ascontiguousarray(rows).ravel()
+            node = np.broadcast_to(first_node, (len(rows), trees))
             for _ in range(self.depth):
                 further = flat.take(row + feature.take(node)) > threshold.take(node)
                 node = np.where(further, above.take(node), below.take(node))
             return value.take(node, axis=0).sum(axis=1)
 
-        return in_parts(answer, features, _AT_ONCE) + self.start
+        return apply_in_parts(evaluate, features, _AT_ONCE) + self.start
 
     def decision_function(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Compute the score of each class (n, d), for classifiers: the sum of the trees' values."""
         return self.predict(features)
 
     @classmethod
-    def of_boosted(cls, models: list[Any]) -> "Forest":
+    def from_boosted_regressors(cls, models: list[Any]) -> "Forest":
         """Convert scikit-learn's histogram gradient boosting regressors, one for each of d targets."""
         trees = []
         for target, model in enumerate(models):
@@ -82,7 +82,7 @@ class Forest:
         return cls._pack_trees(trees, start, np.arange(len(models)))
 
     @classmethod
-    def of_boosted_classes(cls, model: Any) -> "Forest":
+    def from_boosted_classifier(cls, model: Any) -> "Forest":
         """Convert scikit-learn's histogram gradient boosting classifier to a forest that predicts log-odds.
 
         With two classes, the second has half of the model's log-odds, and the first the same with opposite sign.
@@ -100,7 +100,7 @@ class Forest:
         return cls._pack_trees(trees, start, model.classes_)
 
     @classmethod
-    def of_averaged(cls, models: list[Any]) -> "Forest":
+    def from_averaged_trees(cls, models: list[Any]) -> "Forest":
         """Convert scikit-learn's regression trees to a forest that predicts their mean."""
         trees = []
         for model in models:
@@ -112,7 +112,9 @@ class Forest:
         return cls._pack_trees(trees, np.zeros(targets), np.arange(targets))
 
     @classmethod
-    def of_trees(cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool) -> "Forest":
+    def from_classification_trees(
+        cls, models: list[Any], weights: np.ndarray, classes: np.ndarray, *, votes: bool
+    ) -> "Forest":
         """Convert scikit-learn's classification trees to a forest that predicts the weighted sum of their class shares.
 
         If `votes`, each tree has one vote for its most frequent class instead.
@@ -130,7 +132,7 @@ class Forest:
         return cls._pack_trees(trees, np.zeros(len(classes)), classes)
 
     @classmethod
-    def of_stumps(cls, model: Any) -> "Forest":
+    def from_stumps(cls, model: Any) -> "Forest":
         """Convert a `LogitBoostClassifier`: each stump becomes a tree that contributes to the scores of all classes."""
         rounds, number = model.feature_.shape
         trees = []
@@ -167,7 +169,7 @@ _COUNTS = (3, 5, 8, 12)
 
 
 @dataclass(frozen=True)
-class Nearest:
+class NearestNeighbours:
     """Nearest neighbours: the mean over the `count` nearest presses, weighted by inverse distance.
 
     `features` (N, k): features of the presses; `known` (N, d): their targets, or for classes 1 in the column of each
@@ -180,11 +182,11 @@ class Nearest:
     classes_: np.ndarray
 
     @classmethod
-    def of_numbers(cls, features, targets) -> "Nearest":
+    def fit_regressor(cls, features, targets) -> "NearestNeighbours":
         """Create a regressor of targets (N, d), with the `count` that has the lowest leave-one-out error."""
         count = min(max(_COUNTS), len(features) - 1)
         every = cls(features, targets, count + 1, np.arange(targets.shape[1]))
-        distance, number = (one[:, 1:] for one in every._near(features))
+        distance, number = (one[:, 1:] for one in every._nearest_presses(features))
         weight = 1 / np.maximum(distance, 1e-12)[..., None]
         means = np.cumsum(weight * targets[number], axis=1) / np.cumsum(weight, axis=1)
         off = np.linalg.norm(means - targets[:, None], axis=-1).mean(axis=0)
@@ -192,14 +194,14 @@ class Nearest:
         return cls(features, targets, best, every.classes_)
 
     @classmethod
-    def of_classes(cls, features, label) -> "Nearest":
+    def fit_classifier(cls, features, label) -> "NearestNeighbours":
         """Create a classifier, which predicts the class of the single nearest press."""
         classes = np.unique(label)
         return cls(features, (np.asarray(label)[:, None] == classes).astype(float), 1, classes)
 
     def predict(self, features: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n d"]:
         """Predict targets (n, d)."""
-        distance, number = self._near(features)
+        distance, number = self._nearest_presses(features)
         weight = 1 / np.maximum(distance, 1e-12)
         return np.einsum("nc,ncd->nd", weight / weight.sum(axis=1, keepdims=True), self.known[number])
 
@@ -207,28 +209,28 @@ class Nearest:
         """Predict the share of each class (n, C) among the nearest presses."""
         return self.predict(features)
 
-    def _near(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
+    def _nearest_presses(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n c"], Int[np.ndarray, "n c"]]:
         """Find the nearest presses: their distances (n, c), the nearest first, and their indices (n, c)."""
 
-        def near(some: np.ndarray) -> np.ndarray:
-            squared = (-2 * some) @ self.features.T
-            squared += self._squares  # the frame's squared norm is left out: it is the same for all presses
+        def find_nearest(rows: np.ndarray) -> np.ndarray:
+            squared = (-2 * rows) @ self.features.T
+            squared += self._squared_norms  # the frame's squared norm is left out: it is the same for all presses
             number = np.argpartition(squared, self.count - 1, axis=1)[:, : self.count]
-            apart = np.linalg.norm(self.features[number] - some[:, None], axis=2)
+            apart = np.linalg.norm(self.features[number] - rows[:, None], axis=2)
             order = np.argsort(apart, axis=1, kind="stable")
             return np.stack([np.take_along_axis(one, order, axis=1) for one in (apart, number)], axis=-1)
 
-        found = in_parts(near, features, _FRAMES)
+        found = apply_in_parts(find_nearest, features, _FRAMES)
         return found[..., 0], found[..., 1].astype(int)
 
     @cached_property
-    def _squares(self) -> Float[np.ndarray, " N"]:
+    def _squared_norms(self) -> Float[np.ndarray, " N"]:
         """Squared norm of each press's features."""
         return np.sum(self.features**2, axis=1)
 
 
 @dataclass(frozen=True)
-class Machine:
+class SupportVectorMachine:
     """A support vector machine with one decision boundary for each pair of classes.
 
     `support` (S, k): support vectors, sorted by class; those of class c are the rows from `start[c]` to `start[c + 1]`;
@@ -248,7 +250,7 @@ class Machine:
     classes_: np.ndarray
 
     @classmethod
-    def of(cls, machine) -> "Machine":
+    def from_scikit_learn(cls, machine) -> "SupportVectorMachine":
         """Convert scikit-learn's support vector classifier with a linear or a polynomial kernel."""
         linear = machine.kernel == "linear"
         start = np.concatenate([[0], np.cumsum(machine.n_support_)])
@@ -272,7 +274,7 @@ class Machine:
 
         A term below 1/2 from the distances to the boundaries is added, which orders classes with equal counts.
         """
-        pairs, side = self._borders(features)
+        pairs, side = self._boundary_distances(features)
         votes = (pairs > 0) @ (side > 0).astype(float) + (pairs <= 0) @ (side < 0).astype(float)
         sure = pairs @ side
         return votes + sure / (3 * (np.abs(sure) + 1))
@@ -281,13 +283,13 @@ class Machine:
         """Compute, for each class, the sum of its log-probabilities relative to every other class (n, C).
 
         Relative to one other class, the probability is 1 / (1 + exp(-2 d)) at a distance d from the boundary between
-        the two, in units of its margin. Unlike votes, these sums measure confidence.
+        the two, in units of its margin. Unlike numbers of won decisions, the sums measure confidence.
         """
-        pairs, side = self._borders(features)
+        pairs, side = self._boundary_distances(features)
         won, lost = -np.logaddexp(0.0, -2 * pairs), -np.logaddexp(0.0, 2 * pairs)
         return won @ (side > 0).astype(float) + lost @ (side < 0).astype(float)
 
-    def _borders(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n P"], Float[np.ndarray, "P C"]]:
+    def _boundary_distances(self, features: np.ndarray) -> tuple[Float[np.ndarray, "n P"], Float[np.ndarray, "P C"]]:
         """Compute signed distances (n, P) from the boundaries of all pairs of classes.
 
         Also returns the sign of the distance on the side of each class (P, C), 0 for classes that are not of the pair.

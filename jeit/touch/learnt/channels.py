@@ -44,19 +44,19 @@ class Neighbourhood:
         kept = scores[:: -(-len(scores) // _MOST_KEPT), :_SCORES]
         size = float(np.median(np.linalg.norm(kept, axis=1))) or 1.0
         found = cls(kept, size, 1.0)
-        apart = found._relative(kept, second=True)
+        apart = found._relative_distances(kept, second=True)
         return cls(kept, size, max(float(np.quantile(apart, _USUAL_QUANTILE)), 1e-6))
 
     def __call__(self, scores: Float[np.ndarray, "n K"]) -> Float[np.ndarray, " n"]:
         """Compute the distances (n,) of frames with these scores from the nearest press, divided by `usual`."""
-        return self._relative(scores[:, :_SCORES]) / self.usual
+        return self._relative_distances(scores[:, :_SCORES]) / self.usual
 
-    def _relative(self, scores: np.ndarray, *, second: bool = False) -> np.ndarray:
-        distance = np.asarray(self._tree.query(scores, 2)[0])[:, int(second)]
+    def _relative_distances(self, scores: np.ndarray, *, second: bool = False) -> np.ndarray:
+        distance = np.asarray(self._search_tree.query(scores, 2)[0])[:, int(second)]
         return distance / (np.linalg.norm(scores, axis=1) + _SMALL * self.size)
 
     @cached_property
-    def _tree(self) -> KDTree:
+    def _search_tree(self) -> KDTree:
         return KDTree(self.scores)
 
 
@@ -130,9 +130,9 @@ class Channels:
         left, apart, misses = [], [], np.zeros((2, len(_DIAGONALS), int(used.sum())))
         for learnt, other in ((slice(None, half), slice(half, None)), (slice(half, None), slice(None, half))):
             variance, directions = _variances(scaled[learnt])
-            misses += _missed(scaled[other], variance, directions)
-            model = _factors(scaled[learnt], variance, directions)
-            scores, residual = _explain(scaled[other], there[other], *model)
+            misses += _leave_one_out_errors(scaled[other], variance, directions)
+            model = _fit_patterns(scaled[learnt], variance, directions)
+            scores, residual = _most_likely_scores(scaled[other], there[other], *model)
             left.append(np.where(there[other], np.abs(residual), np.nan))
             apart.append(_novelty(scores, residual, there[other], model[1]))
         left, apart = np.concatenate(left), np.concatenate(apart)
@@ -141,8 +141,8 @@ class Channels:
         variance, directions = _variances(scaled)
         best = int(misses[0].sum(axis=1).argmin())
         weight, unpredicted = variance / (variance + _DIAGONALS[best]), misses[1, best] / 2
-        patterns, spread, noise = _factors(scaled, variance, directions)
-        every, _ = _explain(scaled, there, patterns, spread, noise)
+        patterns, spread, noise = _fit_patterns(scaled, variance, directions)
+        every, _ = _most_likely_scores(scaled, there, patterns, spread, noise)
         usual = float(np.quantile(apart, 0.99))
         least, most = np.nanmin(changes[:, used], axis=0) / scale, np.nanmax(changes[:, used], axis=0) / scale
         far = np.stack([least - _SPANS * (most - least), most + _SPANS * (most - least)])
@@ -161,11 +161,11 @@ class Channels:
         # If many channels are out of range, the frame is unusual, and the channels are not dead.
         given &= ~far | (far.sum(axis=1, keepdims=True) > max(1, _FEW * whole.shape[1]))
         whole, alive = np.where(given, whole, 0.0), given.copy()
-        scores, residual = self._explain_all(whole)
+        scores, residual = self._scores_and_residuals(whole)
         left, alone = np.flatnonzero((np.abs(residual) > self.farthest).any(axis=1) | ~given.all(axis=1)), 0
         while left.size:
             # Most frames have the same dead channels, so the set found for one frame is tried on all remaining frames.
-            pattern = self._alive(whole[left[0]], given[left[0]])
+            pattern = self._working_channels(whole[left[0]], given[left[0]])
             some = left if alone < _ALONE else left[:1]
             beyond, some_scores, some_residual = self._deviations(whole[some], given[some], pattern)
             same = (beyond <= 1) == pattern
@@ -175,21 +175,21 @@ class Channels:
             rows = some[borne]
             alive[rows], scores[rows] = pattern, some_scores[borne]
             residual[rows] = np.where(pattern, some_residual[borne], 0.0)
-            whole[np.ix_(rows, ~pattern)] = self._predicted(whole[np.ix_(rows, pattern)], pattern)
+            whole[np.ix_(rows, ~pattern)] = self._predict_others(whole[np.ix_(rows, pattern)], pattern)
             left = np.setdiff1d(left, rows, assume_unique=True)
         novelty = _novelty(scores, residual, alive, self.spread) / self.usual
         novelty = np.maximum(novelty, _NEAR * self.neighbourhood(scores))
         return whole * self.scale, alive, novelty, self._excess(residual, alive)
 
-    def _alive(self, frame: np.ndarray, given: np.ndarray) -> np.ndarray:
+    def _working_channels(self, frame: np.ndarray, has_reading: np.ndarray) -> np.ndarray:
         """Determine which channels of a frame agree with the prediction from the others.
 
         The channels with the largest deviations are removed repeatedly; then channels that agree with the remaining
         ones are restored.
         """
-        alive, fewest, back = given.copy(), (1 - _MOST_DEAD) * len(frame), False
+        alive, fewest, back = has_reading.copy(), (1 - _MOST_DEAD) * len(frame), False
         while alive.sum() > fewest:
-            (beyond,) = self._deviations(frame[None], given[None], alive)[0]
+            (beyond,) = self._deviations(frame[None], has_reading[None], alive)[0]
             worst = np.max(beyond, where=alive, initial=0.0)
             if worst <= 1 and back:
                 break
@@ -199,34 +199,36 @@ class Channels:
                 alive &= beyond < (worst if back else max(1.0, worst / 2))
         return alive
 
-    def _deviations(self, whole, given, alive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _deviations(self, changes, has_reading, alive) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Compute the deviations of channels in frames (n, m) from the prediction by the channels `alive` (m,).
 
-        They are divided by the maximum deviation of a working channel, and infinite for readings that are not `given`
-        (n, m). Also returns the frames' scores (n, k) and residuals (n, m).
+        They are divided by the maximum deviation of a working channel, and infinite for readings that are not
+        `has_reading` (n, m). Also returns the frames' scores (n, k) and residuals (n, m).
         """
         weighted = self.patterns * (alive / self.noise**2)[:, None]
         gain = weighted @ np.linalg.inv(weighted.T @ self.patterns + np.diag(1 / self.spread**2))
-        scores = whole @ gain
-        residual = (whole - scores @ self.patterns.T) / self.noise
+        scores = changes @ gain
+        residual = (changes - scores @ self.patterns.T) / self.noise
         free = 1 - np.einsum(
             "ij,ij->i", self.patterns, gain
         )  # variance of a residual, which the channel's weight in its own prediction reduces
-        beyond = np.where(given, np.abs(residual) / np.sqrt(np.maximum(free, 1e-6)) / self.farthest, np.inf)
+        beyond = np.where(has_reading, np.abs(residual) / np.sqrt(np.maximum(free, 1e-6)) / self.farthest, np.inf)
         return beyond, scores, residual
 
-    def _predicted(self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray) -> Float[np.ndarray, "n m-a"]:
+    def _predict_others(
+        self, alive_readings: Float[np.ndarray, "n a"], alive: np.ndarray
+    ) -> Float[np.ndarray, "n m-a"]:
         """Predict the most likely readings of the channels that are not `alive` (m,) from those that are."""
         dead = self.directions[~alive] * self.weight
         predicted = dead @ (alive_readings @ self.directions[alive]).T
         return np.linalg.solve(np.eye(len(dead)) - dead @ self.directions[~alive].T, predicted).T
 
-    def unsure(self, alive: Bool[np.ndarray, "n m"], number: int) -> Float[np.ndarray, "q n m"]:
+    def prediction_errors(self, alive: Bool[np.ndarray, "n m"], max_errors: int) -> Float[np.ndarray, "q n m"]:
         """Compute the errors of readings that are predicted for frames with some channels `alive`.
 
-        Returns the q ≤ `number` largest independent errors, each of one standard deviation, in the unit of changes.
+        Returns the q ≤ `max_errors` largest independent errors, each of one standard deviation, in the unit of changes.
         """
-        found = np.zeros((min(number, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
+        found = np.zeros((min(max_errors, int((~alive).sum(axis=1).max(initial=0))), *alive.shape))
         patterns, kind = np.unique(alive, axis=0, return_inverse=True)
         for one, pattern in enumerate(patterns):
             dead, doubt = self.directions[~pattern], np.sqrt(self.unpredicted[~pattern])
@@ -251,13 +253,13 @@ class Channels:
         beyond = np.maximum(np.sum(np.where(alive, residual, 0.0) ** 2, axis=1) / number - usual, 0.0)
         return np.sqrt(beyond * number / free)[:, None] * np.where(alive, self.noise * self.scale, 0.0)
 
-    def _explain_all(self, whole: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _scores_and_residuals(self, changes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Compute scores and residuals of frames (n, m) whose channels are all alive."""
-        scores = whole @ self._gain
-        return scores, (whole - scores @ self.patterns.T) / self.noise
+        scores = changes @ self._score_matrix
+        return scores, (changes - scores @ self.patterns.T) / self.noise
 
     @cached_property
-    def _gain(self) -> Float[np.ndarray, "m k"]:
+    def _score_matrix(self) -> Float[np.ndarray, "m k"]:
         """Matrix that maps the readings of all channels to scores, if all channels are alive."""
         weighted = self.patterns / self.noise[:, None] ** 2
         return np.linalg.solve(weighted.T @ self.patterns + np.diag(1 / self.spread**2), weighted.T).T
@@ -275,7 +277,7 @@ def _variances(scaled: Float[np.ndarray, "N m"]) -> tuple[Float[np.ndarray, " r"
     return squares[kept] / number, directions[:, kept]
 
 
-def _factors(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _fit_patterns(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Compute the patterns (m, k), and the standard deviations of their scores (k,) and of the noise (m,).
 
     The noise is the part of each channel that the patterns do not explain.
@@ -289,11 +291,11 @@ def _factors(scaled, variance, directions) -> tuple[np.ndarray, np.ndarray, np.n
     return patterns, np.sqrt(variance[:number]), np.maximum(noise, 1e-6)
 
 
-def _missed(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
+def _leave_one_out_errors(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
     """Compute mean squared prediction errors of channels, for covariances with each of the diagonals.
 
     Returns two arrays (D, m): the error of each channel as predicted by the others, and this error times `free`, one
-    minus the weight of the channel in its own prediction; `unsure` uses the second.
+    minus the weight of the channel in its own prediction; `prediction_errors` uses the second.
     """
     scores, found = scaled @ directions, []
     for diagonal in _DIAGONALS:
@@ -304,18 +306,18 @@ def _missed(scaled, variance, directions) -> Float[np.ndarray, "2 D m"]:
     return np.swapaxes(np.array(found), 0, 1)
 
 
-def _explain(whole, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:
+def _most_likely_scores(changes, alive, patterns, spread, noise) -> tuple[np.ndarray, np.ndarray]:
     """Compute the most likely scores (n, k) of frames (n, m), and the residuals divided by the noise.
 
     Residuals are 0 for channels that are not `alive` (n, m).
     """
     weighted = patterns / noise[:, None] ** 2
     prior = np.diag(1 / spread**2)
-    scores = np.linalg.solve(weighted.T @ patterns + prior, weighted.T @ whole.T).T
+    scores = np.linalg.solve(weighted.T @ patterns + prior, weighted.T @ changes.T).T
     for frame in np.flatnonzero(~alive.all(axis=1)):
         own = weighted * alive[frame, :, None]
-        scores[frame] = np.linalg.solve(own.T @ patterns + prior, own.T @ whole[frame])
-    return scores, np.where(alive, (whole - scores @ patterns.T) / noise, 0.0)
+        scores[frame] = np.linalg.solve(own.T @ patterns + prior, own.T @ changes[frame])
+    return scores, np.where(alive, (changes - scores @ patterns.T) / noise, 0.0)
 
 
 def _novelty(scores, residual, alive, spread) -> np.ndarray:
@@ -328,20 +330,20 @@ def _novelty(scores, residual, alive, spread) -> np.ndarray:
 
 
 def choose_channels(
-    scaled: Float[np.ndarray, "N m"], answers: Float[np.ndarray, "N q"], number: int
+    scaled: Float[np.ndarray, "N m"], targets: Float[np.ndarray, "N q"], num_channels: int
 ) -> Int[np.ndarray, " n"]:
     """Select channels by simultaneous orthogonal matching pursuit (Tropp et al. 2006), the most informative first.
 
-    Each channel explains most of what the previous ones leave unexplained of the `answers`, by least squares. Products
+    Each channel explains most of what the previous ones leave unexplained of the `targets`, by least squares. Products
     of the answers are explained too, since places are not linear in voltages.
     """
-    products = [answers[:, i] * answers[:, j] for i in range(answers.shape[1]) for j in range(i + 1)]
-    left = np.column_stack([answers, *(one - one.mean() for one in products[:20])])
+    products = [targets[:, i] * targets[:, j] for i in range(targets.shape[1]) for j in range(i + 1)]
+    left = np.column_stack([targets, *(one - one.mean() for one in products[:20])])
     left = left - left.mean(axis=0)
     candidates = scaled - scaled.mean(axis=0)
     first = np.sum(candidates**2, axis=0)
     chosen: list[int] = []
-    for _ in range(min(number, scaled.shape[1])):
+    for _ in range(min(num_channels, scaled.shape[1])):
         size = np.sum(candidates**2, axis=0)
         gain = np.sum((candidates.T @ left) ** 2, axis=1) / np.where(size > 1e-8 * first, size, np.inf)
         gain[chosen] = -1

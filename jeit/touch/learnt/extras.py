@@ -25,19 +25,19 @@ def one_thread() -> AbstractContextManager:
     return threadpool_limits(1)
 
 
-def in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
+def apply_in_parts(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, at_once: int) -> np.ndarray:
     """Apply `function` to `at_once` rows at a time, which limits memory, and concatenate the results."""
-    return np.concatenate([function(rows[some]) for some in _parts(len(rows), at_once)])
+    return np.concatenate([function(rows[some]) for some in _slices(len(rows), at_once)])
 
 
-def over_threads(
+def apply_over_threads(
     function: Callable[..., dict[str, np.ndarray]], *arrays: np.ndarray, at_once: int
 ) -> dict[str, np.ndarray]:
     """Apply `function` to `at_once` rows of the `arrays` at a time, and concatenate the arrays that it returns.
 
     Many parts are computed in parallel.
     """
-    parts = _parts(len(arrays[0]), at_once)
+    parts = _slices(len(arrays[0]), at_once)
     if len(parts) < 4:
         found = [function(*(one[some] for one in arrays)) for some in parts]
     else:
@@ -46,19 +46,19 @@ def over_threads(
     return {key: np.concatenate([one[key] for one in found]) for key in found[0]}
 
 
-def over_folds(function: Callable[[int], Any], number: int) -> list[Any]:
-    """Apply `function` to 0 … `number` - 1 in parallel, each call with one thread.
+def apply_over_folds(function: Callable[[int], Any], num_folds: int) -> list[Any]:
+    """Apply `function` to 0 … `num_folds` - 1 in parallel, each call with one thread.
 
     The limit is set in every call, since OpenMP keeps a separate number of threads for each calling thread.
     """
 
-    def alone(fold: int) -> Any:
+    def apply_with_one_thread(fold: int) -> Any:
         with one_thread():
             return function(fold)
 
     with ThreadPoolExecutor(number_of_cores()) as pool:
-        return list(pool.map(alone, range(number)))
+        return list(pool.map(apply_with_one_thread, range(num_folds)))
 
 
-def _parts(number: int, at_once: int) -> list[slice]:
-    return [slice(first, first + at_once) for first in range(0, max(number, 1), at_once)]
+def _slices(num_rows: int, at_once: int) -> list[slice]:
+    return [slice(first, first + at_once) for first in range(0, max(num_rows, 1), at_once)]

@@ -8,20 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from jeit.touch.learnt.imaged import Contacts, Imaged, Images
+from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageReconstruction
 
-# Minimum number of frames with the same answers as another frame, to estimate their noise.
+# Minimum number of frames with the same targets as another frame, from which the noise of frames is estimated.
 _FEWEST = 20
 
 
 @dataclass(frozen=True)
-class Whitened:
-    """Features: changes times `root` (m, m), which gives unit covariance to the variation between repeated frames."""
+class WhitenedChanges:
+    """Features: changes times `root` (m, m). The variation between repeated frames then has unit covariance."""
 
     root: Float[np.ndarray, "m m"]
 
     @classmethod
-    def learn(cls, changes: Float[np.ndarray, "N m"], answers: Float[np.ndarray, "N d"]) -> "Whitened":
+    def learn(cls, changes: Float[np.ndarray, "N m"], answers: Float[np.ndarray, "N d"]) -> "WhitenedChanges":
         """Fit the whitening to frames, of which some have the same `answers`.
 
         The covariance of the variation between frames with the same answers is shrunk as in Ledoit and Wolf (2004).
@@ -29,7 +29,7 @@ class Whitened:
         from sklearn.covariance import ledoit_wolf
 
         scale = np.maximum(changes.std(axis=0), 1e-300)
-        group, count = _groups(answers)
+        group, count = _group_equal_rows(answers)
         means = np.zeros((len(count), changes.shape[1]))
         np.add.at(means, group, changes / count[group, None])
         left = ((changes - means[group]) / scale)[count[group] > 1]
@@ -51,12 +51,13 @@ class Whitened:
 
 def are_repeated(answers: Float[np.ndarray, "N d"]) -> bool:
     """Whether enough frames have the same answers as another frame to estimate their noise."""
-    return int(np.sum(_groups(answers)[1] - 1)) >= _FEWEST
+    return int(np.sum(_group_equal_rows(answers)[1] - 1)) >= _FEWEST
 
 
-def _groups(answers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Number the frames (N,) such that frames with the same answers have the same number; also count each group."""
-    group, count = np.unique(answers, axis=0, return_inverse=True, return_counts=True)[1:]
+def _group_equal_rows(targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number the frames (N,) such that frames with equal `targets` have the same number; also return the number of
+    frames with each number."""
+    group, count = np.unique(targets, axis=0, return_inverse=True, return_counts=True)[1:]
     return group.ravel(), count
 
 
@@ -65,25 +66,30 @@ _MOST, _PRESSES_EACH = 60, 3
 
 
 def _differences(changes, reference, unit):
+    """Features (n, m): changes divided by the `unit` of each channel."""
     return changes / unit
 
 
 def _ratios(changes, reference, unit):
+    """Features (n, m): changes relative to the reference."""
     size = np.maximum(np.abs(reference), 1e-3 * np.sqrt(np.mean(reference**2, axis=1, keepdims=True)))
     return changes / np.where(size > 0, size, 1.0)
 
 
 def _compressed(changes, reference, unit):
+    """Features (n, m): changes, divided by `unit`, on a scale that compresses large ones."""
     return np.sign(changes) * np.log1p(np.abs(changes) / unit)
 
 
 def _normalised(changes, reference, unit):
+    """Features (n, m + 1): changes divided by `unit` and by the frame's root mean square, and its logarithm."""
     size = np.sqrt(np.mean((changes / unit) ** 2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     return np.hstack([changes / unit / size, np.log(size)])
 
 
 def _shapes(changes, reference, unit):
+    """Features (n, m + 1): changes divided by the frame's root mean square, and its logarithm; no `unit` is used."""
     size = np.sqrt(np.mean(changes**2, axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     return np.hstack([changes / size, np.log(size)])
@@ -97,8 +103,8 @@ FORMS = {
     "normalised": _normalised,
     "shapes": _shapes,
 }
-# Functions that fit a learnt form to changes (N, m) and answers (N, d).
-Maker = Callable[[np.ndarray, np.ndarray], Whitened | Contacts | Images]
+# Functions that fit a learnt form of features to changes (N, m) and targets (N, d).
+Maker = Callable[[np.ndarray, np.ndarray], WhitenedChanges | ContactFeatures | ImageFeatures]
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,7 @@ class Features:
     mean: Float[np.ndarray, " p"]
     deviation: Float[np.ndarray, " p"]
     components: Float[np.ndarray, "p k"] | None
-    made: Whitened | Contacts | Images | None = None
+    made: WhitenedChanges | ContactFeatures | ImageFeatures | None = None
 
     @classmethod
     def learn(
@@ -124,7 +130,7 @@ class Features:
         changes: Float[np.ndarray, "N m"],
         reference: Float[np.ndarray, "N m"],
         *,
-        made: Whitened | Contacts | Images | None = None,
+        made: WhitenedChanges | ContactFeatures | ImageFeatures | None = None,
         rotated: bool = True,
     ) -> "Features":
         """Fit the features to changes of voltage and their reference.
@@ -135,8 +141,8 @@ class Features:
             unit, values, mean, deviation = standardisation(form, changes, reference)
         else:
             unit, values = np.ones(changes.shape[1]), made(changes)
-            mean, deviation = values.mean(axis=0), _or_infinite(made.deviation(values))
-        if not rotated or isinstance(made, Contacts):
+            mean, deviation = values.mean(axis=0), _infinite_where_zero(made.deviation(values))
+        if not rotated or isinstance(made, ContactFeatures):
             return cls(form, unit, mean, deviation, None, made)
         rows = np.linalg.svd((values - mean) / deviation, full_matrices=False)[2]
         components = rows[: max(2, min(_MOST, len(values) // _PRESSES_EACH))].T
@@ -159,10 +165,10 @@ def standardisation(form: str, changes: np.ndarray, reference: np.ndarray) -> tu
     unit = np.median(size, axis=0)
     unit = np.where(unit > 0, unit, np.mean(size, axis=0))
     values = FORMS[form](changes, reference, np.where(unit > 0, unit, 1.0))
-    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), _or_infinite(values.std(axis=0))
+    return np.where(unit > 0, unit, 1.0), values, values.mean(axis=0), _infinite_where_zero(values.std(axis=0))
 
 
-def _or_infinite(deviation: np.ndarray) -> np.ndarray:
+def _infinite_where_zero(deviation: np.ndarray) -> np.ndarray:
     known = deviation > 1e-9 * max(deviation.max(), 1e-300)
     return np.where(known, deviation, np.inf)
 
@@ -178,12 +184,14 @@ class Forms:
     makers: dict[str, Maker]
 
     @classmethod
-    def of(cls, answers: Float[np.ndarray, "N d"], imaged: Imaged | None, *, has_reference: bool) -> "Forms":
+    def available(
+        cls, answers: Float[np.ndarray, "N d"], imaged: ImageReconstruction | None, *, has_reference: bool
+    ) -> "Forms":
         """Select the forms that can be computed from the data."""
-        makers: dict[str, Maker] = {"whitened": Whitened.learn} if are_repeated(answers) else {}
+        makers: dict[str, Maker] = {"whitened": WhitenedChanges.learn} if are_repeated(answers) else {}
         if imaged is not None:
-            makers |= {"contacts": lambda changes, answers: Contacts(imaged)}
-            makers |= {"images": lambda changes, answers: Images(imaged)}
+            makers |= {"contacts": lambda changes, answers: ContactFeatures(imaged)}
+            makers |= {"images": lambda changes, answers: ImageFeatures(imaged)}
         plain = [form for form in FORMS if has_reference or form != "ratios"]
         return cls((*plain, *makers), makers)
 

@@ -21,15 +21,15 @@ from jeit.arguments.extras import need_extra
 from jeit.files import check_archive, reason, written_whole
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
-from jeit.touch.learnt.array_models import Forest, Machine, Nearest
+from jeit.touch.learnt.array_models import Forest, NearestNeighbours, SupportVectorMachine
 from jeit.touch.learnt.channels import Channels, Neighbourhood
-from jeit.touch.learnt.features import Features, Whitened
-from jeit.touch.learnt.imaged import Contacts, Imaged, Images
-from jeit.touch.learnt.labels import LearntKeys, LearntLabels, Standardised
+from jeit.touch.learnt.features import Features, WhitenedChanges
+from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageReconstruction
+from jeit.touch.learnt.labels import LearntKeys, LearntLabels, StandardisedFeatures
 from jeit.touch.learnt.learnt_skin import LearntSkin
 from jeit.touch.learnt.methods import GaussianProcess, LinearEnsemble, QuadraticDiscriminant
 from jeit.touch.learnt.network import Network
-from jeit.touch.learnt.numbers import LearntNumbers, Spread
+from jeit.touch.learnt.numbers import DeviationModel, LearntNumbers
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
 _SCHEMA = "schema.json"
@@ -45,10 +45,10 @@ def write_sealed(content: Any, file: BinaryIO) -> None:
         members = {name: archive.read(name) for name in archive.namelist()}
     numbers: dict[str, str] = {}
 
-    def numbered(found: re.Match[str]) -> str:
+    def renumber(found: re.Match[str]) -> str:
         return found[1] + numbers.setdefault(found[2], str(len(numbers)))
 
-    schema = _NUMBER.sub(numbered, members.pop(_SCHEMA).decode())
+    schema = _NUMBER.sub(renumber, members.pop(_SCHEMA).decode())
     named = {f"{numbers[Path(name).stem]}.npy": values for name, values in members.items()}
     named = {_SCHEMA: schema.encode(), **dict(sorted(named.items()))}
     with zipfile.ZipFile(file, "w") as archive:
@@ -66,6 +66,7 @@ def check_seal(path: Path) -> None:
 
 
 def _seal(members: dict[str, bytes]) -> bytes:
+    """Checksum of the names and contents of an archive's members."""
     digest = hashlib.sha256()
     for name in sorted(members):
         digest.update(f"{name} {len(members[name])}\n".encode() + members[name])
@@ -75,39 +76,38 @@ def _seal(members: dict[str, bytes]) -> bytes:
 _KIND, _VERSION = "a jeit learnt skin", 2
 # Names of fields in files of version 0.2, and their present names.
 _OLD_FIELDS = {"unforetold": "unpredicted"}
-_OURS = {
-    one.__name__: one
-    for one in (
-        Channels,
-        Contacts,
-        Features,
-        Forest,
-        GaussianProcess,
-        Imaged,
-        Images,
-        LearntKeys,
-        LearntLabels,
-        LearntNumbers,
-        LinearEnsemble,
-        Machine,
-        Nearest,
-        Neighbourhood,
-        Network,
-        PlacedMap,
-        QuadraticDiscriminant,
-        SelfOrganisingMap,
-        Spread,
-        Standardised,
-        TemporalNetwork,
-        Whitened,
-    )
+# Classes of stored objects, by the names that files have for them.
+_STORED_CLASSES: dict[str, type] = {
+    "Channels": Channels,
+    "Contacts": ContactFeatures,
+    "Features": Features,
+    "Forest": Forest,
+    "GaussianProcess": GaussianProcess,
+    "Imaged": ImageReconstruction,
+    "Images": ImageFeatures,
+    "LearntKeys": LearntKeys,
+    "LearntLabels": LearntLabels,
+    "LearntNumbers": LearntNumbers,
+    "LinearEnsemble": LinearEnsemble,
+    "Machine": SupportVectorMachine,
+    "Nearest": NearestNeighbours,
+    "Neighbourhood": Neighbourhood,
+    "Network": Network,
+    "PlacedMap": PlacedMap,
+    "QuadraticDiscriminant": QuadraticDiscriminant,
+    "SelfOrganisingMap": SelfOrganisingMap,
+    "Spread": DeviationModel,
+    "Standardised": StandardisedFeatures,
+    "TemporalNetwork": TemporalNetwork,
+    "Whitened": WhitenedChanges,
 }
+_STORED_NAMES = {stored: name for name, stored in _STORED_CLASSES.items()}
 
 
 def write_skin(skin: LearntSkin, path: str | Path) -> None:
     """Write a learnt skin to one file, without its `standing`. Raises `ValueError` for a folder."""
-    own = {one.name: getattr(skin, one.name) for one in fields(skin) if one.name != "standing"}
-    write_plain(path, _KIND, _VERSION, own, "skin.skops")
+    fields_by_name = {one.name: getattr(skin, one.name) for one in fields(skin) if one.name != "standing"}
+    write_plain(path, _KIND, _VERSION, fields_by_name, "skin.skops")
 
 
 def read_skin(path: str | Path) -> LearntSkin:
@@ -124,8 +124,9 @@ def read_skin(path: str | Path) -> LearntSkin:
     return read_plain(path, _KIND, _VERSION, "learnt skin", lambda own: LearntSkin(**own))
 
 
-def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], example: str) -> None:
-    """Write the fields `own` of an object, by name, to one file: arrays, estimators, and objects of jeit's classes.
+def write_plain(path: str | Path, kind: str, version: int, fields_by_name: dict[str, Any], example: str) -> None:
+    """Write the fields `fields_by_name` of an object, by name, to one file: arrays, estimators, and objects of jeit's
+    classes.
 
     `kind` and `version` identify the type of file; `example`: a file name that the error message suggests.
     Raises `ValueError` if `path` is a folder.
@@ -134,13 +135,13 @@ def write_plain(path: str | Path, kind: str, version: int, own: dict[str, Any], 
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give a file, such as {Path(path) / example}.")
     with written_whole(path) as file:
-        write_sealed({"kind": kind, "version": version, "skin": _to_plain(own)}, file)
+        write_sealed({"kind": kind, "version": version, "skin": _to_plain(fields_by_name)}, file)
 
 
-def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[dict[str, Any]], Any]) -> Any:
+def read_plain(path: Path, kind: str, version: int, description: str, make: Callable[[dict[str, Any]], Any]) -> Any:
     """Read a file that `write_plain` wrote, and return `make(fields)`, where `fields` are those written, by name.
 
-    Nothing in the file is executed. `said`: what the file should contain, as error messages name it.
+    Nothing in the file is executed. `description`: what the file should contain, as error messages name it.
     Raises `ValueError` for files of another kind, and if the file contains anything but arrays, estimators and objects
     of jeit's classes.
     """
@@ -151,24 +152,24 @@ def read_plain(path: Path, kind: str, version: int, said: str, make: Callable[[d
         check_archive(path)
         strange = sorted(get_untrusted_types(file=path))
         if strange:
-            raise ValueError(f"it holds {listed(strange, most=3)}, which no {said} does")
+            raise ValueError(f"it holds {listed(strange, most=3)}, which no {description} does")
         content = load(path, trusted=[])
         if not isinstance(content, dict) or content.get("kind") != kind:
             raise ValueError("it is of another kind")
         if content["version"] != version:
             raise ValueError(f"it is of version {describe(content['version'])}, and this jeit reads {version}")
         check_seal(path)
-        own: Any = _from_plain(content["skin"])
-        return make(own)
+        fields_by_name: Any = _from_plain(content["skin"])
+        return make(fields_by_name)
     except Exception as error:  # any exception: the file may create objects of many packages
-        raise ValueError(f"'{path}' is not a {said} that can be read ({reason(error)}); fit it again.") from None
+        raise ValueError(f"'{path}' is not a {description} that can be read ({reason(error)}); fit it again.") from None
 
 
 def _to_plain(value):
-    """Convert objects of jeit's classes (`_OURS`) to dictionaries of their fields, recursively."""
-    if type(value).__name__ in _OURS and type(value) is _OURS[type(value).__name__]:
+    """Convert objects of jeit's classes (`_STORED_CLASSES`) to dictionaries of their fields, recursively."""
+    if type(value) in _STORED_NAMES:
         return {
-            "jeit": type(value).__name__,
+            "jeit": _STORED_NAMES[type(value)],
             **{one.name: _to_plain(getattr(value, one.name)) for one in fields(value)},
         }
     if isinstance(value, dict):
@@ -182,5 +183,5 @@ def _from_plain(value):
     """Convert the dictionaries that `_to_plain` made back to objects of jeit's classes."""
     if isinstance(value, dict):
         held = {_OLD_FIELDS.get(key, key): _from_plain(one) for key, one in value.items() if key != "jeit"}
-        return _OURS[value["jeit"]](**held) if "jeit" in value else held
+        return _STORED_CLASSES[value["jeit"]](**held) if "jeit" in value else held
     return [_from_plain(one) for one in value] if isinstance(value, list) else value

@@ -12,7 +12,7 @@ from jeit.arguments import check_kind
 from jeit.forward import ForwardModel
 from jeit.inverse import calibrate, one_step
 from jeit.mesh import centroids, measures
-from jeit.touch.learnt.extras import in_parts
+from jeit.touch.learnt.extras import apply_in_parts
 from jeit_solvers.engines import as_array
 
 # A contact is the region above this fraction of its peak, among the cells nearest to the peak; the number of these
@@ -24,7 +24,7 @@ _AT_ONCE = 128
 
 
 @dataclass(frozen=True)
-class Imaged:
+class ImageReconstruction:
     """Linear reconstruction of images with c cells from changes of m channels; touches are positive.
 
     `matrix` (m, c): an image is changes times this matrix; `centres` (c, d): centroids of the cells, metres; `sizes`
@@ -39,7 +39,7 @@ class Imaged:
     @classmethod
     def create(
         cls, model: ForwardModel, changes: Float[np.ndarray, "N m"], used: Bool[np.ndarray, " M"], reference
-    ) -> tuple["Imaged", list[str]]:
+    ) -> tuple["ImageReconstruction", list[str]]:
         """Create a one-step reconstruction from the channels `used`.
 
         If a `reference` (M,) is given, the model is calibrated on it. The sign of touches is determined from the
@@ -74,14 +74,14 @@ class Imaged:
 
 
 @dataclass(frozen=True)
-class Contacts:
+class ContactFeatures:
     """Features of changes: the strongest contact in their image."""
 
-    imaged: Imaged
+    imaged: ImageReconstruction
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
         """Compute the features (n, p) of changes (n, m)."""
-        return in_parts(lambda some: self.imaged.contacts(some @ self.imaged.matrix), changes, _AT_ONCE)
+        return apply_in_parts(lambda some: self.imaged.contacts(some @ self.imaged.matrix), changes, _AT_ONCE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
         """Unit of each feature: its standard deviation."""
@@ -89,23 +89,23 @@ class Contacts:
 
 
 @dataclass(frozen=True)
-class Images:
+class ImageFeatures:
     """Features of changes: the strongest contact in their image, and the image itself.
 
     The image is divided by its root mean square, whose logarithm is another feature.
     """
 
-    imaged: Imaged
+    imaged: ImageReconstruction
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n p"]:
         """Compute the features (n, p) of changes (n, m)."""
 
-        def features(some: np.ndarray) -> np.ndarray:
-            image = some @ self.imaged.matrix
+        def features(rows: np.ndarray) -> np.ndarray:
+            image = rows @ self.imaged.matrix
             size = np.maximum(np.sqrt(np.mean(image**2, axis=1, keepdims=True)), 1e-300)
             return np.hstack([self.imaged.contacts(image), np.log(size), image / size])
 
-        return in_parts(features, changes, _AT_ONCE)
+        return apply_in_parts(features, changes, _AT_ONCE)
 
     def deviation(self, values: Float[np.ndarray, "N p"]) -> Float[np.ndarray, " p"]:
         """Unit of each feature.

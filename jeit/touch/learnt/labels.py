@@ -10,17 +10,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jeit.touch.learnt.array_models import Forest
-from jeit.touch.learnt.extras import over_folds
+from jeit.touch.learnt.extras import apply_over_folds
 from jeit.touch.learnt.features import FORMS, Features, Forms, standardisation
-from jeit.touch.learnt.imaged import Imaged
-from jeit.touch.learnt.methods import CLASSIFIERS, log_odds, probabilities, sharpness_of, shrinkage_of
+from jeit.touch.learnt.imaged import ImageReconstruction
+from jeit.touch.learnt.methods import CLASSIFIERS, covariance_shrinkage, fit_sharpness, log_odds, probabilities
 
 METHODS = ("auto", *CLASSIFIERS)
 _QUICK = "linear-discriminant"
 
 
 @dataclass(frozen=True)
-class TriedLabels:
+class LabelMethodResult:
     """Result of a `method` on a `form` of the features, for held-out presses.
 
     `held_out` (N,): indices of the predicted labels; `odds` (N, C): log-odds of the classes; `error`: share of errors.
@@ -60,9 +60,9 @@ def learn_labels(
     folds: np.ndarray,
     *,
     method: str = "auto",
-    imaged: Imaged | None = None,
+    imaged: ImageReconstruction | None = None,
     progress: Callable[[str], None] = lambda said: None,
-) -> tuple[LearntLabels, list[TriedLabels]]:
+) -> tuple[LearntLabels, list[LabelMethodResult]]:
     """Learn labels (N,) from changes (N, m), their reference, and images of the changes if `imaged` is given.
 
     `method`: one of the nine classifiers; "auto" chooses the one with the lowest error. Also returns the results of all
@@ -72,48 +72,48 @@ def learn_labels(
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
     classes, right = np.unique(label, return_inverse=True)
-    forms = Forms.of(right[:, None], imaged, has_reference=has_reference)
+    forms = Forms.available(right[:, None], imaged, has_reference=has_reference)
     tried = []
     for form in forms.names:
         progress(f"{_QUICK} on {form}")
         tried.append(_hold_out(_QUICK, form, forms, changes, reference, right, folds))
-    form = min(tried, key=_error).form
+    form = min(tried, key=_error_rate).form
     for name in [one for one in CLASSIFIERS if one != _QUICK and method in ("auto", one)]:
         progress(f"{name} on {form}")
         tried.append(_hold_out(name, form, forms, changes, reference, right, folds))
-    tried.sort(key=_error)
+    tried.sort(key=_error_rate)
     tried = [one for one in tried if method in ("auto", one.method)]
     best = tried[0]
     features = forms.learn(best.form, changes, reference, right[:, None])
     scores = features(changes, reference)
     notes = []
-    if best.method == "quadratic-discriminant" and shrinkage_of(scores, right):
+    if best.method == "quadratic-discriminant" and covariance_shrinkage(scores, right):
         fewest = np.bincount(right).min()
         notes.append(
             f"quadratic discriminant: a class has only {fewest} presses for {scores.shape[1]} features; covariances "
-            f"are shrunk by {shrinkage_of(scores, right):g}."
+            f"are shrunk by {covariance_shrinkage(scores, right):g}."
         )
     model = CLASSIFIERS[best.method](scores, right)
-    return LearntLabels(features, model, classes, sharpness_of(best.odds, right), notes), tried
+    return LearntLabels(features, model, classes, fit_sharpness(best.odds, right), notes), tried
 
 
-def _error(one: TriedLabels) -> float:
-    return one.error
+def _error_rate(result: LabelMethodResult) -> float:
+    return result.error
 
 
-def _hold_out(method, form, forms: Forms, changes, reference, right, folds) -> TriedLabels:
-    number = right.max() + 1
-    odds = np.full((len(right), number), -1e3)
+def _hold_out(method, form, forms: Forms, changes, reference, true_classes, folds) -> LabelMethodResult:
+    number = true_classes.max() + 1
+    odds = np.full((len(true_classes), number), -1e3)
 
     def predict(fold: int) -> None:
         out = folds == fold
-        features = forms.learn(form, changes[~out], reference[~out], right[~out, None])
-        model = CLASSIFIERS[method](features(changes[~out], reference[~out]), right[~out])
+        features = forms.learn(form, changes[~out], reference[~out], true_classes[~out, None])
+        model = CLASSIFIERS[method](features(changes[~out], reference[~out]), true_classes[~out])
         odds[np.ix_(out, model.classes_)] = log_odds(model, features(changes[out], reference[out]))
 
-    over_folds(predict, folds.max() + 1)
+    apply_over_folds(predict, folds.max() + 1)
     held_out = odds.argmax(axis=1)
-    return TriedLabels(method, form, held_out, odds, float(np.mean(held_out != right)))
+    return LabelMethodResult(method, form, held_out, odds, float(np.mean(held_out != true_classes)))
 
 
 _STRENGTHS = (1e-3, 1e-2, 1e-1, 1.0)
@@ -125,7 +125,7 @@ _TREE: dict[str, Any] = {"max_features": 0.3, "min_samples_leaf": 2, "random_sta
 
 
 @dataclass(frozen=True)
-class Standardised:
+class StandardisedFeatures:
     """Standardised features of one `form`: all features, or those with the indices `chosen`."""
 
     form: str
@@ -135,7 +135,7 @@ class Standardised:
     chosen: np.ndarray | None = None
 
     @classmethod
-    def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "Standardised":
+    def learn(cls, form: str, changes: np.ndarray, reference: np.ndarray) -> "StandardisedFeatures":
         """Fit the standardisation to changes (N, m) and their reference."""
         unit, _, mean, deviation = standardisation(form, changes, reference)
         return cls(form, unit, mean, deviation)
@@ -153,7 +153,7 @@ class LearntKeys:
     `members`: the features, the classifier, and the sharpness of the probability of each key.
     """
 
-    members: list[tuple[Standardised, Any, float]]
+    members: list[tuple[StandardisedFeatures, Any, float]]
 
     def predict(self, changes, reference) -> tuple[Bool[np.ndarray, "n K"], Float[np.ndarray, "n K"]]:
         """Predict which keys are pressed, and the probability of each."""
@@ -164,7 +164,7 @@ class LearntKeys:
 
 
 @dataclass(frozen=True)
-class TriedKeys:
+class KeyMethodResults:
     """Results of the chosen method of each key for held-out presses.
 
     `methods`: the chosen methods; `held_out` (N, K): predictions; `errors` (K,): shares of errors.
@@ -182,7 +182,7 @@ def learn_keys(
     folds: np.ndarray,
     *,
     progress: Callable[[str], None] = lambda said: None,
-) -> tuple[LearntKeys, TriedKeys]:
+) -> tuple[LearntKeys, KeyMethodResults]:
     """Learn to predict which of K keys are pressed from changes (N, m).
 
     Each key is classified by the method with the lowest loss in cross-validation on `folds`. Also returns the results
@@ -195,7 +195,7 @@ def learn_keys(
     def predict(fold: int) -> None:
         out = folds == fold
         for form in _FORMS:
-            features = Standardised.learn(form, changes[~out], reference[~out])
+            features = StandardisedFeatures.learn(form, changes[~out], reference[~out])
             learnt, asked = features(changes[~out], reference[~out]), features(changes[out], reference[out])
             rotation = np.linalg.svd(learnt, full_matrices=False)[2].T  # faster, and equivalent for linear methods
             linear = learnt @ rotation, asked @ rotation
@@ -209,7 +209,7 @@ def learn_keys(
                     if name.partition(" on ")[2] != form:
                         continue
                     if needs == "linear":
-                        model = _logistic(linear[0], answers, strength)
+                        model = _fit_logistic(linear[0], answers, strength)
                         odds[name][out, key] = model.decision_function(linear[1])
                     else:
                         few = _select_features(learnt, answers)
@@ -218,7 +218,7 @@ def learn_keys(
                         odds[name][out, key] = said[:, 1] - said[:, 0]
         progress(f"keys, fold {fold + 1} of {folds.max() + 1}")
 
-    over_folds(predict, folds.max() + 1)
+    apply_over_folds(predict, folds.max() + 1)
     members, methods, held_out = [], [], np.empty((number, keys), bool)
     for key in range(keys):
         right = touched[:, key]
@@ -226,9 +226,9 @@ def learn_keys(
         name = min(odds, key=lambda name: _loss(odds[name][:, key], right))
         methods.append(name)
         held_out[:, key] = odds[name][:, key] > 0
-        members.append(_member(name, changes, reference, right.astype(int), odds[name][:, key]))
+        members.append(_fit_key(name, changes, reference, right.astype(int), odds[name][:, key]))
         progress(f"key {key + 1} of {keys}")
-    return LearntKeys(members), TriedKeys(methods, held_out, np.mean(held_out != touched, axis=0))
+    return LearntKeys(members), KeyMethodResults(methods, held_out, np.mean(held_out != touched, axis=0))
 
 
 def _candidates() -> dict[str, tuple[str, float]]:
@@ -241,47 +241,48 @@ def _candidates() -> dict[str, tuple[str, float]]:
     return found
 
 
-def _member(name: str, changes, reference, answers, odds) -> tuple[Standardised, Any, float]:
+def _fit_key(name: str, changes, reference, answers, odds) -> tuple[StandardisedFeatures, Any, float]:
     needs, strength = _candidates()[name]
-    features = Standardised.learn(name.partition(" on ")[2], changes, reference)
+    features = StandardisedFeatures.learn(name.partition(" on ")[2], changes, reference)
     values = features(changes, reference)
-    sharp = sharpness_of(np.column_stack([np.zeros(len(odds)), odds]), answers)
+    sharp = fit_sharpness(np.column_stack([np.zeros(len(odds)), odds]), answers)
     if needs == "linear":
         return features, _fit_rotated(values, answers, strength), sharp
     few = _select_features(values, answers)
-    chosen = Standardised(features.form, features.unit, features.mean, features.deviation, few)
+    chosen = StandardisedFeatures(features.form, features.unit, features.mean, features.deviation, few)
     return chosen, _METHODS[needs](values[:, few], answers), sharp
 
 
 def _fit_rotated(values, answers, strength):
     """Fit logistic regression to rotated features, and convert its coefficients to the original features."""
     rotation = np.linalg.svd(values, full_matrices=False)[2].T
-    model = _logistic(values @ rotation, answers, strength)
+    model = _fit_logistic(values @ rotation, answers, strength)
     model.coef_ = model.coef_ @ rotation.T
     model.n_features_in_ = values.shape[1]
     return model
 
 
-def _logistic(values, answers, strength):
+def _fit_logistic(values, answers, strength):
     from sklearn.linear_model import LogisticRegression
 
     return LogisticRegression(C=strength, max_iter=500).fit(values, answers)
 
 
-def _discriminant(values, answers):
+def _fit_discriminant(values, answers):
+    """Fit a linear discriminant to features (N, p), for answers (N,) that are true where the key is pressed."""
     from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
     return LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(values, answers)
 
 
-def _trees(values, answers):
+def _fit_trees(values, answers):
     from sklearn.ensemble import ExtraTreesClassifier
 
     found = ExtraTreesClassifier(_TREES, **_TREE).fit(values, answers)
-    return Forest.of_trees(found.estimators_, np.full(_TREES, 1 / _TREES), found.classes_, votes=False)
+    return Forest.from_classification_trees(found.estimators_, np.full(_TREES, 1 / _TREES), found.classes_, votes=False)
 
 
-_METHODS = {"discriminant": _discriminant, "trees": _trees}
+_METHODS = {"discriminant": _fit_discriminant, "trees": _fit_trees}
 
 
 def _select_features(values: np.ndarray, answers: np.ndarray) -> np.ndarray:
@@ -291,10 +292,10 @@ def _select_features(values: np.ndarray, answers: np.ndarray) -> np.ndarray:
     return np.sort(np.argsort(-np.abs(one.mean(axis=0) - other.mean(axis=0)) / np.maximum(within, 1e-12))[:_FEW])
 
 
-def _loss(odds: np.ndarray, right: np.ndarray) -> float:
+def _loss(odds: np.ndarray, true_classes: np.ndarray) -> float:
     """Compute the error rate plus 0.1 times the mean negative log-likelihood of the true answers, at the best
     sharpness."""
     columns = np.column_stack([np.zeros(len(odds)), odds])
-    sharp = sharpness_of(columns, right.astype(int))
-    likely = probabilities(columns, sharp)[np.arange(len(right)), right.astype(int)]
-    return float(np.mean((odds > 0) != right) - 0.1 * np.mean(np.log(np.maximum(likely, 1e-9))))
+    sharp = fit_sharpness(columns, true_classes.astype(int))
+    likely = probabilities(columns, sharp)[np.arange(len(true_classes)), true_classes.astype(int)]
+    return float(np.mean((odds > 0) != true_classes) - 0.1 * np.mean(np.log(np.maximum(likely, 1e-9))))

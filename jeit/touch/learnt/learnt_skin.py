@@ -15,24 +15,24 @@ from jeit.arguments.extras import need_extra
 from jeit.forward import ForwardModel
 from jeit.touch.learnt import labels as label_methods
 from jeit.touch.learnt import numbers as number_methods
-from jeit.touch.learnt.answers import METHODS, Standing, learn_answers, places_and_folds
+from jeit.touch.learnt.answers import METHODS, Standing, learn_quantities, places_and_folds
 from jeit.touch.learnt.channels import Channels, choose_channels
-from jeit.touch.learnt.extras import one_thread, over_threads
-from jeit.touch.learnt.imaged import Imaged, check_imaged
+from jeit.touch.learnt.extras import apply_over_threads, one_thread
+from jeit.touch.learnt.imaged import ImageReconstruction, check_imaged
 from jeit.touch.learnt.labels import LearntKeys, LearntLabels
 from jeit.touch.learnt.numbers import LearntNumbers
 from jeit.touch.learnt.presses import (
     NO_TOUCH,
     Presses,
     Touches,
-    changes_of,
+    aligned_slices,
+    changes_from_reference,
     check_frames,
     check_reference,
-    lag_of,
+    estimate_lag,
     mean_reference,
     reference_used,
-    shifted,
-    standardised,
+    standardise_sessions,
 )
 
 # A frame is unlike the training set above this novelty, which is 1 for the farthest frame in it, or below this fraction
@@ -104,9 +104,9 @@ class LearntSkin:
         notes = list(presses.notes)
         presses, dropped = _usable_presses(presses)
         notes += dropped
-        changes = changes_of(presses.frames, presses.reference)
+        changes = changes_from_reference(presses.frames, presses.reference)
         if per_session:
-            changes = standardised(changes, presses.group)
+            changes = standardise_sessions(changes, presses.group)
         progress("channels")
         channels = Channels.learn(changes)
         if num_channels is not None:
@@ -115,12 +115,14 @@ class LearntSkin:
         elif not channels.used.all():
             silent = np.flatnonzero(~channels.used)
             notes.append(
-                f"{counted(len(silent), 'channel')} of {len(channels.used)} without changes, not used: {_few(silent)}."
+                f"{counted(len(silent), 'channel')} of {len(channels.used)} without changes, not used: "
+                f"{_list_briefly(silent)}."
             )
         whole, alive, *_ = channels.complete(changes)
         if not alive.all():
             notes.append(
-                f"{100 * (1 - alive.mean()):.2g} % of the readings were not borne out by the others: replaced."
+                f"{100 * (1 - alive.mean()):.2g} % of the readings disagree with the prediction from the other "
+                f"channels and were replaced by it."
             )
         whole, presses, lag, said = _align_frames(whole, presses)
         quiet = _quiet_threshold(whole / channels.scale, presses)
@@ -128,10 +130,10 @@ class LearntSkin:
         imaged = None
         if model is not None:
             progress("images")
-            imaged, remarks = Imaged.create(model, whole, channels.used, mean)
+            imaged, remarks = ImageReconstruction.create(model, whole, channels.used, mean)
             said += remarks
         ours = None if mean is None else reference_used(presses.reference, mean, channels.used, len(whole))
-        found, standing, remarks = learn_answers(whole, ours, presses, method, imaged, progress)
+        found, standing, remarks = learn_quantities(whole, ours, presses, method, imaged, progress)
         notes = list(dict.fromkeys([*notes, *said, *remarks]))
         return cls(
             channels,
@@ -153,13 +155,13 @@ class LearntSkin:
         replaced; frames unlike the training set are marked, and have no other prediction. Raises `ValueError` for
         frames with another number of channels, and for a reference that is missing, superfluous, or of another skin.
         """
-        frames = self._check(frames)
-        reference = self._reference(frames, reference)
-        changes = changes_of(frames, reference)
+        frames = self._check_frames(frames)
+        reference = self._check_reference(frames, reference)
+        changes = changes_from_reference(frames, reference)
         if self.per_session:
-            changes = standardised(changes, group)
+            changes = standardise_sessions(changes, group)
         changes = np.where(self._stuck_channels(frames, changes), np.nan, changes)
-        found = over_threads(
+        found = apply_over_threads(
             self._predict,
             changes,
             reference_used(reference, self.mean_reference, self.channels.used, len(changes)),
@@ -196,10 +198,10 @@ class LearntSkin:
             touching &= label != NO_TOUCH
         shown = (touching & ~unlike)[:, None]
         if self.place is not None:
-            said, std = self._numbers(self.place, whole, reference, alive, excess)
+            said, std = self._predict_targets(self.place, whole, reference, alive, excess)
             found |= {"position": np.where(shown, said, np.nan), "position_std": np.where(shown, std, np.nan)}
         if self.force is not None:
-            said, std = self._numbers(self.force, whole, reference, alive, excess)
+            said, std = self._predict_targets(self.force, whole, reference, alive, excess)
             still = ~touching & ~unlike
             pressed = np.where(shown, np.maximum(said, 0.0), np.nan)[:, 0]
             found |= {"force": np.where(still, 0.0, pressed), "force_std": np.where(shown, std, np.nan)[:, 0]}
@@ -209,54 +211,56 @@ class LearntSkin:
             found["key_probability"] = np.where(unlike[:, None], np.nan, np.where(touching[:, None], probability, 0.0))
         return found
 
-    def _numbers(self, learnt: LearntNumbers, whole, reference, alive, excess) -> tuple[np.ndarray, np.ndarray]:
+    def _predict_targets(
+        self, learnt: LearntNumbers, changes, reference, alive, excess
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Predict targets (n, d) and their standard deviations.
 
         The standard deviations include the uncertainty of the readings predicted for dead channels, and errors of all
         readings, where these deviate more from the patterns of the training set than its presses do.
         """
         noisy = np.flatnonzero(excess.any(axis=1))
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, 1, whole.shape[1]))
-        moved = (whole[noisy] + signs * excess[noisy]).reshape(-1, whole.shape[1])
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, 1, changes.shape[1]))
+        moved = (changes[noisy] + signs * excess[noisy]).reshape(-1, changes.shape[1])
         # One call for all: with few frames, calls take longer than predictions.
-        every = np.concatenate([whole, moved]), np.concatenate([reference, np.tile(reference[noisy], (_DRAWS, 1))])
-        said, off = np.split(learnt.predict(*every), [len(whole)])
-        std = learnt.spread(said, whole)
+        every = np.concatenate([changes, moved]), np.concatenate([reference, np.tile(reference[noisy], (_DRAWS, 1))])
+        said, off = np.split(learnt.predict(*every), [len(changes)])
+        std = learnt.spread(said, changes)
         off = off.reshape(_DRAWS, len(noisy), said.shape[1]) - said[noisy]
         std[noisy] = np.hypot(std[noisy], np.sqrt(np.mean(off**2, axis=0)))
         lacking = np.flatnonzero(~alive.all(axis=1))
         if not lacking.size:
             return said, std
-        for moved in self.channels.unsure(alive[lacking], _UNSURE):
-            off = learnt.predict(whole[lacking] + moved, reference[lacking]) - said[lacking]
+        for moved in self.channels.prediction_errors(alive[lacking], _UNSURE):
+            off = learnt.predict(changes[lacking] + moved, reference[lacking]) - said[lacking]
             std[lacking] = np.hypot(std[lacking], off)
         return said, std
 
-    def _check(self, frames) -> np.ndarray:
+    def _check_frames(self, frames) -> np.ndarray:
         frames = np.asarray(frames)
         frames = check_frames("frames", frames[None] if frames.ndim == 1 else frames)
         number = len(self.channels.used)
         if not len(frames):
-            raise ValueError("frames: there are none.")
+            raise ValueError("frames: the array is empty; give at least one frame.")
         if frames.shape[1] != number:
             raise ValueError(f"frames have {frames.shape[1]} channels, and the skin that was learnt has {number}.")
         return frames
 
-    def _reference(self, frames, given) -> np.ndarray | None:
+    def _check_reference(self, frames, given) -> np.ndarray | None:
         if self.mean_reference is None:
             if given is not None:
                 raise ValueError("reference: the skin was learnt from changes, without a reference; leave it out.")
             return None
         if given is None:
             raise ValueError(
-                "reference is missing: the skin was learnt from frames with one; give (channels,) or one each."
+                "reference is missing: the training presses had one; give a frame (channels,), or one for each frame."
             )
         reference = check_reference(given, frames)
         there = np.isfinite(reference).any(axis=0) & self.channels.used
         own, learnt = mean_reference(reference)[there], self.mean_reference[there]
         if not there.any():
             raise ValueError(
-                "reference has no finite reading of a channel that is used; give that of the untouched skin."
+                "reference has no finite reading in any channel that is used; give a frame of the untouched skin."
             )
         if not learnt.any():  # the frames of the training set were changes already
             return reference
@@ -264,8 +268,9 @@ class LearntSkin:
         size = np.sqrt((own @ own) / (learnt @ learnt))
         if alike < _ALIKE or not 1 / _SIZES < size < _SIZES:
             raise ValueError(
-                f"reference is unlike those that were learnt from (cosine {alike:.2f}, {size:.3g} times as large): is "
-                "it of this skin, its channels in the same order and units?"
+                f"reference is unlike that of the training set (cosine {alike:.2f}, {size:.3g} times as large): "
+                f"is it of "
+                "this skin, with its channels in the same order and units?"
             )
         return reference
 
@@ -276,13 +281,18 @@ class LearntSkin:
         lost = np.mean(~alive, axis=0)
         dead = numbers[lost > 0.5]
         if dead.size:
-            notes.append(f"channels that the others do not bear out, done without: {_few(dead)}.")
+            notes.append(
+                f"channels that disagree with the prediction from the others and are not used: {_list_briefly(dead)}."
+            )
         elif lost.any():
-            notes.append(f"{100 * np.mean(~alive):.2g} % of the readings were not borne out by the others: replaced.")
+            notes.append(
+                f"{100 * np.mean(~alive):.2g} % of the readings disagree with the prediction from the other "
+                f"channels and were replaced by it."
+            )
         if unlike.any():
             notes.append(
-                f"{int(unlike.sum())} of {len(unlike)} frames are unlike any that were learnt from: nothing is said of "
-                "them."
+                f"{int(unlike.sum())} of {len(unlike)} frames are unlike all frames of the training set: they have no "
+                "prediction."
             )
         return tuple(notes)
 
@@ -315,13 +325,13 @@ def _usable_presses(presses: Presses) -> tuple[Presses, list[str]]:
 
     Channels without a reading in any press do not count.
     """
-    changes = changes_of(presses.frames, presses.reference)
+    changes = changes_from_reference(presses.frames, presses.reference)
     there = np.isfinite(changes)
     ever = there.any(axis=0)
     notes = []
     if not ever.all():
         silent = np.flatnonzero(~ever)
-        notes.append(f"{counted(len(silent), 'channel')} without any reading: {_few(silent)}.")
+        notes.append(f"{counted(len(silent), 'channel')} without any reading: {_list_briefly(silent)}.")
     fair = there[:, ever].mean(axis=1) >= _FEWEST if ever.any() else np.zeros(len(there), bool)
     if fair.sum() < 10:
         raise ValueError(f"frames: only {int(fair.sum())} have readings of two thirds of the channels; 10 are needed.")
@@ -330,15 +340,19 @@ def _usable_presses(presses: Presses) -> tuple[Presses, list[str]]:
     return presses.rows(fair), notes
 
 
-def _reduce_channels(channels: Channels, changes: np.ndarray, presses: Presses, number: int) -> tuple[Channels, str]:
+def _reduce_channels(
+    channels: Channels, changes: np.ndarray, presses: Presses, num_channels: int
+) -> tuple[Channels, str]:
     scaled = np.where(np.isnan(changes), 0.0, changes)[:, channels.used] / channels.scale
-    chosen = np.flatnonzero(channels.used)[choose_channels(scaled, _answers(presses), number)]
+    chosen = np.flatnonzero(channels.used)[choose_channels(scaled, _standardised_targets(presses), num_channels)]
     kept = np.full(changes.shape, np.nan)
     kept[:, chosen] = changes[:, chosen]
-    return Channels.learn(kept), f"{len(chosen)} of {changes.shape[1]} channels are used: {_few(np.sort(chosen), 200)}."
+    return Channels.learn(
+        kept
+    ), f"{len(chosen)} of {changes.shape[1]} channels are used: {_list_briefly(np.sort(chosen), 200)}."
 
 
-def _answers(presses: Presses) -> np.ndarray:
+def _standardised_targets(presses: Presses) -> np.ndarray:
     """Return all quantities of the presses as standardised columns (N, q); 0 where unknown."""
     columns = []
     if presses.positions is not None:
@@ -375,27 +389,27 @@ def _quiet_threshold(scaled: np.ndarray, presses: Presses) -> float:
     return float(sizes[int(np.argmin(wrong))])
 
 
-def _align_frames(whole: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
+def _align_frames(changes: np.ndarray, presses: Presses) -> tuple[np.ndarray, Presses, int, list[str]]:
     """Align frames with their presses if the recording clearly has a lag.
 
     Returns changes, presses, the lag in rows, and notes.
     """
     if presses.positions is None:
-        return whole, presses, 0, []
+        return changes, presses, 0, []
     rows, folds, _ = places_and_folds(presses)
-    lag, straight, late = lag_of(whole[rows], presses.positions[rows], folds)
+    lag, straight, late = estimate_lag(changes[rows], presses.positions[rows], folds)
     if not lag:
-        return whole, presses, 0, []
-    frames, answers = shifted(len(whole), lag)
+        return changes, presses, 0, []
+    frames, answers = aligned_slices(len(changes), lag)
     reference = None if presses.reference is None else presses.reference[frames]
     moved = replace(presses.rows(answers), frames=presses.frames[frames], reference=reference)
     said = (
         f"frames seem to be of the press {counted(abs(lag), 'row')} {'before' if lag > 0 else 'after'} (places "
         f"estimated {1e3 * late:.3g} mm off, as recorded {1e3 * straight:.3g} mm): learnt so; check the recording."
     )
-    return whole[frames], moved, lag, [said]
+    return changes[frames], moved, lag, [said]
 
 
-def _few(numbers: np.ndarray, most: int = 12) -> str:
-    said = ", ".join(str(one) for one in numbers[:most])
-    return said if len(numbers) <= most else f"{said}, … ({len(numbers)} in all)"
+def _list_briefly(numbers: np.ndarray, max_listed: int = 12) -> str:
+    said = ", ".join(str(one) for one in numbers[:max_listed])
+    return said if len(numbers) <= max_listed else f"{said}, … ({len(numbers)} in all)"

@@ -19,8 +19,8 @@ from scipy.spatial.distance import cdist
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
 from jeit.touch.kohonen.training import Schedule
-from jeit.touch.learnt.array_models import Forest, Machine, Nearest
-from jeit.touch.learnt.extras import in_parts
+from jeit.touch.learnt.array_models import Forest, NearestNeighbours, SupportVectorMachine
+from jeit.touch.learnt.extras import apply_in_parts
 from jeit.touch.learnt.network import Network
 from jeit_solvers import number_of_cores
 
@@ -48,14 +48,14 @@ class GaussianProcess:
         """Fit standardised `targets` (N, d) to `features` (N, k)."""
         order = np.random.default_rng(0).permutation(len(features))
         some = order[:_TUNED_ON]
-        length, noise = _tuned(features[some], targets[some])
+        length, noise = _estimate_length_and_noise(features[some], targets[some])
         chosen = np.sort(order[:_CENTRES])
         centres = features[chosen]
-        among = _kernel(cdist(centres, centres) / length)
+        among = _matern_kernel(cdist(centres, centres) / length)
         if len(centres) == len(features):
             matrix, load = among + noise * np.eye(len(among)), targets[chosen]
         else:
-            across = _kernel(cdist(features, centres) / length)
+            across = _matern_kernel(cdist(features, centres) / length)
             matrix, load = across.T @ across + noise * among, across.T @ targets
             matrix += 1e-8 * np.trace(matrix) / len(matrix) * np.eye(len(matrix))
         return cls(centres, cho_solve(cho_factor(matrix), load), length)
@@ -65,20 +65,20 @@ class GaussianProcess:
         scaled = self.centres / self.length
         squares = np.sum(scaled**2, axis=1)
 
-        def means(some: np.ndarray) -> np.ndarray:
-            some = some / self.length
-            squared = np.sum(some**2, axis=1)[:, None] + squares - 2 * some @ scaled.T
-            return _kernel(np.sqrt(np.maximum(squared, 0.0))) @ self.weights
+        def predict_rows(rows: np.ndarray) -> np.ndarray:
+            rows = rows / self.length
+            squared = np.sum(rows**2, axis=1)[:, None] + squares - 2 * rows @ scaled.T
+            return _matern_kernel(np.sqrt(np.maximum(squared, 0.0))) @ self.weights
 
-        return in_parts(means, features, _AT_ONCE)
+        return apply_in_parts(predict_rows, features, _AT_ONCE)
 
 
-def _kernel(distance: np.ndarray) -> np.ndarray:
+def _matern_kernel(distance: np.ndarray) -> np.ndarray:
     scaled = np.sqrt(3.0) * distance
     return (1 + scaled) * np.exp(-scaled)
 
 
-def _tuned(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
+def _estimate_length_and_noise(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
     """Estimate the length, and the ratio of the variance of the noise to that of the function.
 
     The variance of the function follows from these two in closed form.
@@ -86,8 +86,8 @@ def _tuned(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
     apart = cdist(features, features)
     usual = float(np.sqrt(np.mean(apart**2))) or 1.0
 
-    def unlikelihood(logs: np.ndarray) -> float:
-        matrix = _kernel(apart / (usual * np.exp(logs[0]))) + np.exp(logs[1]) * np.eye(len(apart))
+    def negative_log_likelihood(logs: np.ndarray) -> float:
+        matrix = _matern_kernel(apart / (usual * np.exp(logs[0]))) + np.exp(logs[1]) * np.eye(len(apart))
         try:
             factor = cho_factor(matrix, lower=True)
         except np.linalg.LinAlgError:
@@ -99,7 +99,7 @@ def _tuned(features: np.ndarray, targets: np.ndarray) -> tuple[float, float]:
     starts = [(0.5, np.log(0.05)), (2.0, np.log(0.3))]
     tuned = min(
         (
-            minimize(unlikelihood, start, method="Nelder-Mead", bounds=bounds, options={"maxfev": 60})
+            minimize(negative_log_likelihood, start, method="Nelder-Mead", bounds=bounds, options={"maxfev": 60})
             for start in starts
         ),
         key=lambda found: found.fun,
@@ -126,7 +126,7 @@ def trees(features, targets) -> Any:
 
     options = {"max_iter": 100, "max_leaf_nodes": 15, "min_samples_leaf": 8, "l2_regularization": 1.0}
     models = [HistGradientBoostingRegressor(random_state=0, **options).fit(features, one) for one in targets.T]
-    return Forest.of_boosted(models)
+    return Forest.from_boosted_regressors(models)
 
 
 def forest(features, targets) -> Any:
@@ -135,7 +135,7 @@ def forest(features, targets) -> Any:
 
     targets = targets[:, 0] if targets.shape[1] == 1 else targets
     found = ExtraTreesRegressor(_TREES, max_features=0.3, min_samples_leaf=2, random_state=0).fit(features, targets)
-    return Forest.of_averaged(found.estimators_)
+    return Forest.from_averaged_trees(found.estimators_)
 
 
 def som(features, targets) -> Any:
@@ -149,7 +149,7 @@ def som(features, targets) -> Any:
 
 REGRESSORS: dict[str, Callable[..., Any]] = {
     "ridge": ridge,
-    "neighbours": Nearest.of_numbers,
+    "neighbours": NearestNeighbours.fit_regressor,
     "gaussian-process": GaussianProcess.fit,
     "trees": trees,
     "forest": forest,
@@ -174,7 +174,7 @@ def tree(features, label) -> Any:
     from sklearn.tree import DecisionTreeClassifier
 
     found = DecisionTreeClassifier(min_samples_leaf=2, random_state=0).fit(features, label)
-    return Forest.of_trees([_with_numbered_classes(found)], np.ones(1), np.unique(label), votes=False)
+    return Forest.from_classification_trees([_with_numbered_classes(found)], np.ones(1), np.unique(label), votes=False)
 
 
 def linear_discriminant(features, label) -> Any:
@@ -208,7 +208,7 @@ class QuadraticDiscriminant:
         If a class has too few presses for a covariance, all covariances are shrunk towards multiples of the identity.
         """
         classes, number = np.unique(label, return_inverse=True)
-        shrunk, size = shrinkage_of(features, label), features.shape[1]
+        shrunk, size = covariance_shrinkage(features, label), features.shape[1]
         everywhere = np.mean(np.var(features, axis=0))
         means, whiten, offset = [], [], []
         for one in range(len(classes)):
@@ -234,14 +234,14 @@ def linear_svm(features, label) -> Any:
     """Fit a support vector machine with a linear kernel."""
     from sklearn.svm import SVC
 
-    return Machine.of(SVC(kernel="linear").fit(features, label))
+    return SupportVectorMachine.from_scikit_learn(SVC(kernel="linear").fit(features, label))
 
 
 def quadratic_svm(features, label) -> Any:
     """Fit a support vector machine with a quadratic kernel."""
     from sklearn.svm import SVC
 
-    return Machine.of(SVC(kernel="poly", degree=2, coef0=1.0).fit(features, label))
+    return SupportVectorMachine.from_scikit_learn(SVC(kernel="poly", degree=2, coef0=1.0).fit(features, label))
 
 
 def boosted_trees(features, label) -> Any:
@@ -252,7 +252,7 @@ def boosted_trees(features, label) -> Any:
     one = DecisionTreeClassifier(max_leaf_nodes=_LEAVES, random_state=0)
     found = AdaBoostClassifier(one, n_estimators=_MEMBERS, random_state=0).fit(features, label)
     members, weights = found.estimators_, found.estimator_weights_[: len(found.estimators_)]
-    return Forest.of_trees(
+    return Forest.from_classification_trees(
         [_with_numbered_classes(one, found) for one in members], weights, np.unique(label), votes=True
     )
 
@@ -269,7 +269,7 @@ def bagged_trees(features, label) -> Any:
     with parallel_config("threading"):
         found = bagged.fit(features, label)
     weights = np.full(_MEMBERS, 1 / _MEMBERS)
-    return Forest.of_trees(
+    return Forest.from_classification_trees(
         [_with_numbered_classes(one) for one in found.estimators_], weights, np.unique(label), votes=False
     )
 
@@ -281,7 +281,7 @@ def subspace_discriminant(features, label) -> Any:
 
     one = LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto")
     found = BaggingClassifier(one, _MEMBERS, bootstrap=False, max_features=0.5, random_state=0).fit(features, label)
-    return LinearEnsemble.of(found, features.shape[1])
+    return LinearEnsemble.from_bagged(found, features.shape[1])
 
 
 @dataclass(frozen=True)
@@ -296,10 +296,10 @@ class LinearEnsemble:
     classes_: np.ndarray
 
     @classmethod
-    def of(cls, bagged, number: int) -> "LinearEnsemble":
-        """Convert a scikit-learn ensemble of linear discriminants, each fitted to some of `number` features."""
+    def from_bagged(cls, bagged, num_features: int) -> "LinearEnsemble":
+        """Convert a scikit-learn ensemble of linear discriminants, each fitted to some of `num_features` features."""
         members = bagged.estimators_
-        weights = np.zeros((len(members), len(bagged.classes_), number))
+        weights = np.zeros((len(members), len(bagged.classes_), num_features))
         intercepts = np.zeros(weights.shape[:2])
         for one, some, weight, intercept in zip(members, bagged.estimators_features_, weights, intercepts, strict=True):
             binary = len(one.coef_) == 1  # two classes: only the log-odds of the second are given
@@ -327,14 +327,14 @@ CLASSIFIERS: dict[str, Callable[..., Any]] = {
     "quadratic-discriminant": QuadraticDiscriminant.fit,
     "linear-svm": linear_svm,
     "quadratic-svm": quadratic_svm,
-    "nearest": Nearest.of_classes,
+    "nearest": NearestNeighbours.fit_classifier,
     "boosted-trees": boosted_trees,
     "bagged-trees": bagged_trees,
     "subspace-discriminant": subspace_discriminant,
 }
 
 
-def shrinkage_of(features, label) -> float:
+def covariance_shrinkage(features, label) -> float:
     """Shrinkage of the covariances of classes; 0 if every class has at least twice as many presses as features."""
     fewest = np.unique(label, return_counts=True)[1].min()
     return _SHRUNK if fewest < 2 * features.shape[1] else 0.0
@@ -361,9 +361,10 @@ def probabilities(odds: np.ndarray, sharpness: float) -> Float[np.ndarray, "n C"
     return powers / powers.sum(axis=1, keepdims=True)
 
 
-def sharpness_of(odds: np.ndarray, right: np.ndarray) -> float:
-    """Choose the sharpness that maximises the likelihood of the true classes `right` (N,) of held-out presses."""
+def fit_sharpness(odds: np.ndarray, true_classes: np.ndarray) -> float:
+    """Choose the sharpness that maximises the likelihood of the true classes `true_classes` (N,) of held-out
+    presses."""
     candidates = np.geomspace(0.02, 50, 60)
-    rows = np.arange(len(right))
-    likely = [np.mean(np.log(np.maximum(probabilities(odds, one)[rows, right], 1e-9))) for one in candidates]
+    rows = np.arange(len(true_classes))
+    likely = [np.mean(np.log(np.maximum(probabilities(odds, one)[rows, true_classes], 1e-9))) for one in candidates]
     return float(candidates[int(np.argmax(likely))])

@@ -48,7 +48,7 @@ class Network:
         # The number of rows is padded to a multiple of the batch size, so that folds of about the same size share the
         # compiled function; no batch uses the added rows.
         more = ((0, -len(features) % _BATCH), (0, 0))
-        layers = _training(steps)(
+        layers = _compiled_training(steps)(
             jnp.asarray(np.pad(features / scale, more), jnp.float32),
             jnp.asarray(np.pad(targets, more), jnp.float32),
             jnp.asarray(np.resize(order, (steps, _BATCH))),
@@ -59,8 +59,8 @@ class Network:
 
 
 @functools.cache
-def _training(steps: int) -> Callable[..., Any]:
-    """Return a function that trains a network in `steps` steps, compiled once for each shape.
+def _compiled_training(num_steps: int) -> Callable[..., Any]:
+    """Return a function that trains a network in `num_steps` steps, compiled once for each shape.
 
     The function returns the layers, from features, targets, the rows of each batch, and two keys.
     """
@@ -69,7 +69,7 @@ def _training(steps: int) -> Callable[..., Any]:
     import jax.numpy as jnp
     import optax
 
-    optimiser = optax.adamw(optax.cosine_decay_schedule(_RATE, steps), weight_decay=_DECAY)
+    optimiser = optax.adamw(optax.cosine_decay_schedule(_RATE, num_steps), weight_decay=_DECAY)
 
     @jax.jit
     def train(features, targets, batches, keys):
@@ -81,13 +81,13 @@ def _training(steps: int) -> Callable[..., Any]:
             given = features[index] + _NOISE * jax.random.normal(key, (_BATCH, features.shape[1]), features.dtype)
             return jnp.mean((jax.vmap(eqx.combine(moving, still))(given) - targets[index]) ** 2)
 
-        def step(carry, index):
+        def update(carry, index):
             moving, state, key = carry
             key, own = jax.random.split(key)
             updates, state = optimiser.update(jax.grad(loss)(moving, index, own), state, moving)
             return (eqx.apply_updates(moving, updates), state, key), None
 
-        moving = jax.lax.scan(step, (moving, optimiser.init(moving), keys[1]), batches)[0][0]
+        moving = jax.lax.scan(update, (moving, optimiser.init(moving), keys[1]), batches)[0][0]
         return moving.layers
 
     return train

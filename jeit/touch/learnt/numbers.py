@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from jeit.touch.learnt.extras import over_folds
+from jeit.touch.learnt.extras import apply_over_folds
 from jeit.touch.learnt.features import Features, Forms
-from jeit.touch.learnt.imaged import Imaged
+from jeit.touch.learnt.imaged import ImageReconstruction
 from jeit.touch.learnt.methods import OF_CHANNELS, QUICK, REGRESSORS
 
 _LIKE, _SHARES = 40, ((1.0, 0.6827), (1.96, 0.95))
@@ -27,7 +27,7 @@ _LEAST = 1e-4
 
 
 @dataclass(frozen=True)
-class Spread:
+class DeviationModel:
     """Model of the standard deviations of predictions, from the errors of similar held-out presses.
 
     `where` (N, d + 1): predicted values of the held-out presses and the logarithm of the size of their changes, minus
@@ -42,52 +42,57 @@ class Spread:
     factor: Float[np.ndarray, " d"]
 
     @classmethod
-    def learn(cls, said: np.ndarray, changes: np.ndarray, errors: np.ndarray, last: np.ndarray) -> "Spread":
-        """Fit to predictions `said` (N, d) for held-out presses, their changes (N, m), and their errors (N, d).
+    def learn(
+        cls, predictions: np.ndarray, changes: np.ndarray, errors: np.ndarray, last: np.ndarray
+    ) -> "DeviationModel":
+        """Fit to predictions `predictions` (N, d) for held-out presses, their changes (N, m), and their errors (N, d).
 
         `last` (N,): presses recorded before or after all presses that their predictions were learnt from. If there are
         enough of them, the standard deviations are calibrated on these alone, since future presses are predicted
         likewise.
         """
-        where = np.column_stack([said, _size(changes)])
+        where = np.column_stack([predictions, _log_size(changes)])
         low, unit = where.mean(axis=0), where.std(axis=0)
         unit = np.where(unit > 0, unit, 1.0)
         unit[-1] /= _SIZE
         most = np.quantile(np.abs(errors), 0.99, axis=0)  # one large error is not representative of its neighbours
         squares = np.minimum(np.abs(errors), most) ** 2
         found = cls((where - low) / unit, squares, low, unit, np.ones(errors.shape[1]))
-        local = found._local_deviations(found.where, own=True)
+        local = found._local_deviations(found.where, leave_one_out=True)
         last = last if last.sum() >= _ENOUGH else np.ones_like(last)
-        factor = [_factor(np.abs(error) / one) for error, one in zip(errors[last].T, local[last].T, strict=True)]
+        factor = [
+            _calibration_factor(np.abs(error) / one) for error, one in zip(errors[last].T, local[last].T, strict=True)
+        ]
         return cls(found.where, squares, low, unit, np.array(factor))
 
-    def __call__(self, said: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "n d"]:
-        """Compute the standard deviations (n, d) of predictions `said` (n, d) for frames with these changes (n, m)."""
-        where = (np.column_stack([said, _size(changes)]) - self.low) / self.unit
+    def __call__(self, predictions: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "n d"]:
+        """Compute the standard deviations (n, d) of predictions `predictions` (n, d) for frames with these changes (n,
+        m)."""
+        where = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
         return self.factor * self._local_deviations(where)
 
-    def held_out(self, said: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "N d"]:
+    def held_out(self, predictions: np.ndarray, changes: np.ndarray) -> Float[np.ndarray, "N d"]:
         """Compute the standard deviations (N, d) of the held-out presses, each without its own error."""
-        where = (np.column_stack([said, _size(changes)]) - self.low) / self.unit
-        return self.factor * self._local_deviations(where, own=True)
+        where = (np.column_stack([predictions, _log_size(changes)]) - self.low) / self.unit
+        return self.factor * self._local_deviations(where, leave_one_out=True)
 
-    def _local_deviations(self, where: np.ndarray, *, own: bool = False) -> np.ndarray:
+    def _local_deviations(self, where: np.ndarray, *, leave_one_out: bool = False) -> np.ndarray:
         number = min(_LIKE, len(self.where) - 1)
-        near = np.asarray(self._tree.query(where, number + own)[1])[:, int(own) :]
+        near = np.asarray(self._search_tree.query(where, number + leave_one_out)[1])[:, int(leave_one_out) :]
         like = self.squares[near].mean(axis=1)
         everywhere = self.squares.mean(axis=0)
         return np.maximum(np.sqrt((1 - _ALL) * like + _ALL * everywhere), _LEAST * self.unit[: like.shape[1]])
 
     @cached_property
-    def _tree(self) -> KDTree:
+    def _search_tree(self) -> KDTree:
         return KDTree(self.where)
 
 
-def _size(changes: np.ndarray) -> np.ndarray:
+def _log_size(changes: np.ndarray) -> np.ndarray:
     return np.log(np.sqrt(np.mean(changes**2, axis=1)) + 1e-300)
 
 
-def _factor(ratios: np.ndarray) -> float:
+def _calibration_factor(ratios: np.ndarray) -> float:
     """Compute the calibration factor of standard deviations from the ratios of errors to standard deviations.
 
     With this factor, the shares of errors within 1 and 1.96 standard deviations are nearest to those of a normal
@@ -107,7 +112,7 @@ _BLENDED, _BETTER = 3, 0.98
 
 
 @dataclass(frozen=True)
-class Tried:
+class MethodResult:
     """Result of a `method` on a `form` of the features.
 
     `held_out` (N, d): predictions for held-out presses; `error`: their mean error.
@@ -135,7 +140,7 @@ class LearntNumbers:
     members: list[tuple[Features, Any]]
     mean: Float[np.ndarray, " d"]
     scale: float
-    spread: Spread
+    spread: DeviationModel
 
     def predict(
         self, changes: Float[np.ndarray, "n m"], reference: Float[np.ndarray, "n m"]
@@ -154,9 +159,9 @@ def learn_numbers(
     folds: np.ndarray,
     *,
     method: str = "auto",
-    imaged: Imaged | None = None,
+    imaged: ImageReconstruction | None = None,
     progress: Callable[[str], None] = lambda said: None,
-) -> tuple[LearntNumbers, list[Tried]]:
+) -> tuple[LearntNumbers, list[MethodResult]]:
     """Learn `targets` (N, d) from changes (N, m), their reference, and images of the changes if `imaged` is given.
 
     `method`: one of `METHODS`; "auto" chooses the best method, or a blend if it is better. Also returns the results of
@@ -165,26 +170,28 @@ def learn_numbers(
     """
     has_reference = reference is not None
     reference = np.zeros_like(changes) if reference is None else reference
-    forms = Forms.of(targets, imaged, has_reference=has_reference)
+    forms = Forms.available(targets, imaged, has_reference=has_reference)
     cut = _CrossValidation(changes, reference, targets, folds, forms)
     tried = []
     for form in forms.names:
         for quick in QUICK:
             progress(f"{quick} on {form}")
             tried.append(cut.hold_out(quick, form))
-    best = list(dict.fromkeys(one.form for one in sorted(tried, key=_error)))[:2]
+    best = list(dict.fromkeys(one.form for one in sorted(tried, key=_mean_error)))[:2]
     wanted = [one for one in REGRESSORS if one not in QUICK and method in ("auto", BLEND, one)]
     for name in wanted:
         for form in best if name in ("gaussian-process", "forest") else best[:1]:
             progress(f"{name} on {form}")
             tried.append(cut.hold_out(name, form))
-    tried.sort(key=_error)
+    tried.sort(key=_mean_error)
     if method not in ("auto", BLEND):
         tried = [one for one in tried if one.method == method]
-    chosen = _chosen(tried, targets, blend=method == BLEND) if method in ("auto", BLEND) else tried[:1]
+    chosen = _choose_methods(tried, targets, blend=method == BLEND) if method in ("auto", BLEND) else tried[:1]
     said = np.mean([one.held_out for one in chosen], axis=0)
     if len(chosen) > 1:
-        tried.insert(0, Tried(BLEND, " + ".join(one.name for one in chosen), said, _mean_distance(said, targets)))
+        tried.insert(
+            0, MethodResult(BLEND, " + ".join(one.name for one in chosen), said, _mean_distance(said, targets))
+        )
     members = []
     for one in chosen:
         progress(f"{one.method}, all presses")
@@ -192,27 +199,27 @@ def learn_numbers(
         model = REGRESSORS[one.method](features(changes, reference), (targets - cut.mean) / cut.scale)
         members.append((features, model))
     ends = (folds == 0) | (folds == folds.max())
-    spread = Spread.learn(said, changes, said - targets, ends)
+    spread = DeviationModel.learn(said, changes, said - targets, ends)
     return LearntNumbers(members, cut.mean, cut.scale, spread), tried
 
 
-def _chosen(tried: list[Tried], targets: np.ndarray, *, blend: bool) -> list[Tried]:
+def _choose_methods(tried: list[MethodResult], targets: np.ndarray, *, blend: bool) -> list[MethodResult]:
     """Choose the best method alone, or a blend of several methods if it is better or `blend` requires it."""
     own = list({one.method: one for one in reversed(tried)}.values())
-    own = sorted(own, key=_error)[:_BLENDED]
+    own = sorted(own, key=_mean_error)[:_BLENDED]
     together = [own[:number] for number in range(2, len(own) + 1)]
     best = min(together, key=lambda some: _mean_distance(np.mean([one.held_out for one in some], axis=0), targets))
     error = _mean_distance(np.mean([one.held_out for one in best], axis=0), targets)
     return best if blend or error < _BETTER * own[0].error else own[:1]
 
 
-def _error(one: Tried) -> float:
-    return one.error
+def _mean_error(result: MethodResult) -> float:
+    return result.error
 
 
-def _mean_distance(said: np.ndarray, targets: np.ndarray) -> float:
+def _mean_distance(predictions: np.ndarray, targets: np.ndarray) -> float:
     """Compute the mean distance of predictions from targets."""
-    return float(np.linalg.norm(said - targets, axis=1).mean())
+    return float(np.linalg.norm(predictions - targets, axis=1).mean())
 
 
 class _CrossValidation:
@@ -225,19 +232,19 @@ class _CrossValidation:
         self.scale = float(np.sqrt(np.mean((targets - self.mean) ** 2)))
         self.features = {}
 
-    def hold_out(self, method: str, form: str) -> Tried:
+    def hold_out(self, method: str, form: str) -> MethodResult:
         said = np.empty_like(self.targets)
 
         def predict(fold: int) -> None:
             out = self.folds == fold
-            learnt, asked = self._scores(form, fold, out, rotated=method not in OF_CHANNELS)
+            learnt, asked = self._fold_features(form, fold, out, rotated=method not in OF_CHANNELS)
             model = REGRESSORS[method](learnt, (self.targets[~out] - self.mean) / self.scale)
             said[out] = self.mean + self.scale * np.asarray(model.predict(asked)).reshape(int(out.sum()), -1)
 
-        over_folds(predict, self.folds.max() + 1)
-        return Tried(method, form, said, _mean_distance(said, self.targets))
+        apply_over_folds(predict, self.folds.max() + 1)
+        return MethodResult(method, form, said, _mean_distance(said, self.targets))
 
-    def _scores(self, form: str, fold: int, out: np.ndarray, *, rotated: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _fold_features(self, form: str, fold: int, out: np.ndarray, *, rotated: bool) -> tuple[np.ndarray, np.ndarray]:
         if (form, fold, rotated) not in self.features:
             learnt = self.changes[~out], self.reference[~out], self.targets[~out]
             features = self.forms.learn(form, *learnt, rotated=rotated)

@@ -20,12 +20,12 @@ from jeit.touch.learnt.features import Features
 _SESSION = 20
 
 
-def changes_of(frames: Float[np.ndarray, "n M"], reference: np.ndarray | None) -> Float[np.ndarray, "n M"]:
+def changes_from_reference(frames: Float[np.ndarray, "n M"], reference: np.ndarray | None) -> Float[np.ndarray, "n M"]:
     """Subtract the reference from the frames; without a reference, return the frames."""
     return frames if reference is None else frames - reference
 
 
-def standardised(changes: np.ndarray, group) -> np.ndarray:
+def standardise_sessions(changes: np.ndarray, group) -> np.ndarray:
     """Standardise changes (n, M): subtract the median of their session, and divide by its standard deviation.
 
     `group` (n,): the session of each frame; without it, all frames are of one session. Raises `ValueError` for sessions
@@ -53,14 +53,14 @@ def mean_reference(reference: np.ndarray) -> np.ndarray:
 
 
 def reference_used(
-    reference: np.ndarray | None, mean: np.ndarray | None, used: Bool[np.ndarray, " M"], number: int
+    reference: np.ndarray | None, mean: np.ndarray | None, used: Bool[np.ndarray, " M"], num_frames: int
 ) -> Float[np.ndarray, "n m"]:
     """Return the reference (n, m) of the channels `used`; zeros if there is no reference.
 
     Missing readings are replaced by the `mean` (M,) reference of the training set.
     """
     if reference is None or mean is None:
-        return np.zeros((number, int(used.sum())))
+        return np.zeros((num_frames, int(used.sum())))
     return np.where(np.isnan(reference), mean, reference)[:, used]
 
 
@@ -153,8 +153,8 @@ def read_presses(path: str | Path) -> Presses:
 
     Raises `FileNotFoundError`, and `ValueError` for any other file and as `Presses.create` does.
     """
-    with _naming(path):
-        return Presses.create(**_arrays(path, "frames", "reference", *_ROWS), name=Path(path).name)
+    with _with_file_name(path):
+        return Presses.create(**_read_arrays(path, "frames", "reference", *_ROWS), name=Path(path).name)
 
 
 def read_frames(path: str | Path) -> dict[str, np.ndarray]:
@@ -162,12 +162,12 @@ def read_frames(path: str | Path) -> dict[str, np.ndarray]:
 
     Raises `FileNotFoundError`, and `ValueError` for any other file.
     """
-    with _naming(path):
-        arrays = _arrays(path, "frames", "reference", "group")
+    with _with_file_name(path):
+        arrays = _read_arrays(path, "frames", "reference", "group")
         return arrays | {"frames": check_frames("frames", arrays["frames"])}
 
 
-def _arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
+def _read_arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
     """Read the named arrays from a file: `frames`, which is required, and the others if the file contains them."""
     if Path(path).is_dir():
         raise ValueError("it is a folder; give an NPZ file.")
@@ -179,7 +179,7 @@ def _arrays(path: str | Path, *keys: str) -> dict[str, np.ndarray]:
 
 
 @contextmanager
-def _naming(path: str | Path) -> Iterator[None]:
+def _with_file_name(path: str | Path) -> Iterator[None]:
     """Add the name of the file to any `ValueError` raised in this context."""
     try:
         yield
@@ -187,13 +187,13 @@ def _naming(path: str | Path) -> Iterator[None]:
         raise ValueError(f"'{path}': {error}") from None
 
 
-def check_frames(name: str, given) -> Float[np.ndarray, "N M"]:
+def check_frames(name: str, values) -> Float[np.ndarray, "N M"]:
     """Convert frames (N, M) to floating-point numbers; readings that are infinite or impossibly large become NaN.
 
     Raises `ValueError` for anything but a two-dimensional array of real numbers.
     """
     try:
-        frames = np.asarray(given)
+        frames = np.asarray(values)
     except ValueError:
         raise ValueError(f"{name}: rows differ in length; give one array (frames, channels).") from None
     if frames.dtype.kind not in "fiu" or frames.ndim != 2 or not frames.shape[1]:
@@ -204,12 +204,12 @@ def check_frames(name: str, given) -> Float[np.ndarray, "N M"]:
     return readings(frames.astype(float))
 
 
-def check_reference(given, frames) -> Float[np.ndarray, "N M"]:
+def check_reference(values, frames) -> Float[np.ndarray, "N M"]:
     """Return a reference (N, M) with a row for each of the `frames`; infinite readings become NaN.
 
     Raises `ValueError` for other shapes and types.
     """
-    reference = np.asarray(given)
+    reference = np.asarray(values)
     if reference.dtype.kind not in "fiu" or reference.shape not in (frames.shape, frames.shape[1:]):
         raise ValueError(
             f"reference is {reference.dtype} of shape {reference.shape}; give ({frames.shape[1]},) for all frames, or "
@@ -326,7 +326,7 @@ _MOST, _NEIGHBOURS, _COMPONENTS = 2, 8, 12
 _GUESS, _STANDARD_ERRORS = 0.95, 4.0
 
 
-def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tuple[int, float, float]:
+def estimate_lag(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tuple[int, float, float]:
     """Estimate by how many rows frames lag behind their presses; 0 without clear evidence of a lag.
 
     Also returns two mean errors, metres, of places estimated from the most similar frames: without the lag, and with
@@ -334,7 +334,7 @@ def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tup
     """
     features = Features.learn("normalised", changes, np.zeros_like(changes))
     scores = features(changes, np.zeros_like(changes))[:, :_COMPONENTS]
-    errors = {lag: _errors(scores, positions, folds, lag) for lag in range(-_MOST, _MOST + 1)}
+    errors = {lag: _place_errors(scores, positions, folds, lag) for lag in range(-_MOST, _MOST + 1)}
     guess = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
     means = {lag: float(off.mean()) for lag, off in errors.items()}
     best, second = sorted(means, key=lambda lag: means[lag])[:2]
@@ -344,13 +344,13 @@ def lag_of(changes: np.ndarray, positions: np.ndarray, folds: np.ndarray) -> tup
     return best, means[0], means[best]
 
 
-def shifted(number: int, lag: int) -> tuple[slice, slice]:
-    """Return slices of frames and of the presses they belong to, for a recording of `number` rows with this `lag`."""
-    return slice(max(lag, 0), number + min(lag, 0)), slice(max(-lag, 0), number - max(lag, 0))
+def aligned_slices(num_rows: int, lag: int) -> tuple[slice, slice]:
+    """Return slices of frames and of the presses they belong to, for a recording of `num_rows` rows with this `lag`."""
+    return slice(max(lag, 0), num_rows + min(lag, 0)), slice(max(-lag, 0), num_rows - max(lag, 0))
 
 
-def _errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: int) -> np.ndarray:
-    frames, presses = shifted(len(scores), lag)
+def _place_errors(scores: np.ndarray, positions: np.ndarray, folds: np.ndarray, lag: int) -> np.ndarray:
+    frames, presses = aligned_slices(len(scores), lag)
     scores, positions, folds = scores[frames], positions[presses], folds[presses]
     off = np.empty(len(scores))
     for fold in np.unique(folds):

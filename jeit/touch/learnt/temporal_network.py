@@ -49,8 +49,8 @@ class TemporalNetwork:
         course = features[:, self.whole :].reshape(len(features), -1, self.first.shape[2] // _WIDE)
         said = np.zeros((len(features), len(self.classes_)))
         for one in range(len(self.first)):
-            hidden = _relu(_windows(course, np) @ self.first[one].T + self.first_bias[one])
-            hidden = _relu(_windows(hidden, np) @ self.second[one].T + self.second_bias[one])
+            hidden = _relu(_neighbouring_steps(course, np) @ self.first[one].T + self.first_bias[one])
+            hidden = _relu(_neighbouring_steps(hidden, np) @ self.second[one].T + self.second_bias[one])
             pooled = np.concatenate([features[:, : self.whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1)
             dense = _relu(pooled @ self.dense[one].T + self.dense_bias[one])
             odds = dense @ self.last[one].T + self.last_bias[one]
@@ -76,7 +76,7 @@ class TemporalNetwork:
         # The number of rows is padded to a multiple of the batch size, so that folds of about the same size share the
         # compiled function; no batch uses the added rows.
         more = -len(features) % _BATCH
-        trained = _training(steps, whole, values, len(classes))(
+        trained = _compiled_training(steps, whole, values, len(classes))(
             jnp.asarray(np.pad(features, ((0, more), (0, 0))), jnp.float32),
             jnp.asarray(np.pad(number, (0, more))),
             jnp.asarray(np.resize(order, (steps, _BATCH))),
@@ -89,7 +89,7 @@ def _relu(values):
     return np.maximum(values, 0.0)
 
 
-def _windows(course, engine):
+def _neighbouring_steps(course, engine):
     """Concatenate each time step with the two before and the two after it (n, T, 5 c); zeros beyond the ends."""
     half, length = _WIDE // 2, course.shape[-2]
     padded = engine.pad(course, ((0, 0), (half, half), (0, 0)))
@@ -97,8 +97,8 @@ def _windows(course, engine):
 
 
 @functools.cache
-def _training(steps: int, whole: int, values: int, classes: int) -> Callable[..., Any]:
-    """Return a function that trains networks in `steps` steps, compiled once for each shape.
+def _compiled_training(num_steps: int, whole: int, values: int, classes: int) -> Callable[..., Any]:
+    """Return a function that trains networks in `num_steps` steps, compiled once for each shape.
 
     The function returns weights and biases, layer by layer, from features, indices of the classes, the rows of each
     batch, and a key for each network.
@@ -107,14 +107,14 @@ def _training(steps: int, whole: int, values: int, classes: int) -> Callable[...
     import jax.numpy as jnp
     import optax
 
-    optimiser = optax.adamw(optax.cosine_decay_schedule(_RATE, steps), weight_decay=_DECAY)
+    optimiser = optax.adamw(optax.cosine_decay_schedule(_RATE, num_steps), weight_decay=_DECAY)
     sizes = [(_HIDDEN, _WIDE * values), (_HIDDEN, _WIDE * _HIDDEN), (_DENSE, whole + 2 * _HIDDEN), (classes, _DENSE)]
 
-    def odds(weights, features, key):
+    def log_odds(weights, features, key):
         first, first_bias, second, second_bias, dense, dense_bias, last, last_bias = weights
         course = features[:, whole:].reshape(len(features), -1, values)
-        hidden = jax.nn.relu(_windows(course, jnp) @ first.T + first_bias)
-        hidden = jax.nn.relu(_windows(hidden, jnp) @ second.T + second_bias)
+        hidden = jax.nn.relu(_neighbouring_steps(course, jnp) @ first.T + first_bias)
+        hidden = jax.nn.relu(_neighbouring_steps(hidden, jnp) @ second.T + second_bias)
         pooled = jnp.concatenate([features[:, :whole], hidden.mean(axis=1), hidden.max(axis=1)], axis=1)
         pooled = pooled * jax.random.bernoulli(key, 1 - _DROPPED, pooled.shape) / (1 - _DROPPED)
         return jax.nn.relu(pooled @ dense.T + dense_bias) @ last.T + last_bias
@@ -123,9 +123,9 @@ def _training(steps: int, whole: int, values: int, classes: int) -> Callable[...
         for_noise, for_dropping = jax.random.split(key)
         noisy = features + _NOISE * jax.random.normal(for_noise, features.shape, features.dtype)
         wanted = (1 - _SMOOTHED) * jax.nn.one_hot(number, classes) + _SMOOTHED / classes
-        return -jnp.mean(jnp.sum(wanted * jax.nn.log_softmax(odds(weights, noisy, for_dropping)), axis=1))
+        return -jnp.mean(jnp.sum(wanted * jax.nn.log_softmax(log_odds(weights, noisy, for_dropping)), axis=1))
 
-    def start(key):
+    def draw_weights(key):
         weights = []
         for own, size in zip(jax.random.split(key, len(sizes)), sizes, strict=True):
             weights += [jnp.sqrt(2 / size[1]) * jax.random.normal(own, size, jnp.float32)]
@@ -134,18 +134,18 @@ def _training(steps: int, whole: int, values: int, classes: int) -> Callable[...
 
     @jax.jit
     def train(features, number, batches, keys):
-        def step(carry, index):
+        def update(carry, index):
             weights, state, key = carry
             key, own = jax.random.split(key)
             slope = jax.grad(loss)(weights, features[index], number[index], own)
             updates, state = optimiser.update(slope, state, weights)
             return (optax.apply_updates(weights, updates), state, key), None
 
-        def one(key):
+        def train_one(key):
             for_start, for_steps = jax.random.split(key)
-            weights = start(for_start)
-            return jax.lax.scan(step, (weights, optimiser.init(weights), for_steps), batches)[0][0]
+            weights = draw_weights(for_start)
+            return jax.lax.scan(update, (weights, optimiser.init(weights), for_steps), batches)[0][0]
 
-        return jax.vmap(one)(keys)
+        return jax.vmap(train_one)(keys)
 
     return train

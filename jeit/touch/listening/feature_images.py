@@ -123,10 +123,10 @@ def image_blocks(recording: Recording, highest: float = EVEN) -> Iterator[SoundI
             f"{recording.name}: at {recording.rate:g} samples a second there is no sound above "
             f"{recording.rate / 2:g} Hz; record {2 * LOWEST:g} a second or more."
         )
-    return _blocks(recording, highest)
+    return _image_blocks(recording, highest)
 
 
-def _blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
+def _image_blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
     rate, samples = recording.rate, recording.samples
     length, hop = round(FRAME * rate), round(HOP * rate)
     whole = length + (FRAMES - 1) * hop
@@ -139,7 +139,7 @@ def _blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
     number = 1 + int((frames - FRAMES + 0.5) * hop / (EVERY * rate))
     # Each window begins with the frame nearest to its time.
     starts = np.minimum(np.round(EVERY * rate * np.arange(number) / hop).astype(int), frames - FRAMES)
-    weights = _weights(length, rate, highest)
+    weights = _band_weights(length, rate, highest)
     taper = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(length) / length)
     scale = 2 / (length * (taper**2).sum())
     wide = np.maximum(weights.sum(axis=0), 1.0)
@@ -147,8 +147,10 @@ def _blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
         own = starts[first : first + _AT_ONCE]
         part = samples[:, own[0] * hop : (own[-1] + FRAMES - 1) * hop + length]
         finite = np.isfinite(part)
-        lost = 0.0 if finite.all() else 1 - _per_frame(finite, length, hop).mean(axis=0)
-        power = np.stack([_powers(channel, taper, hop, weights) for channel in np.where(finite, part, 0.0)]) * scale
+        lost = 0.0 if finite.all() else 1 - _finite_share(finite, length, hop).mean(axis=0)
+        power = (
+            np.stack([_band_powers(channel, taper, hop, weights) for channel in np.where(finite, part, 0.0)]) * scale
+        )
         within = own[:, None] - own[0] + np.arange(FRAMES)
         intensity = power.sum(axis=-1)[:, within].transpose(1, 0, 2)
         strongest = intensity.sum(axis=2).argmax(axis=1)
@@ -158,7 +160,7 @@ def _blocks(recording: Recording, highest: float) -> Iterator[SoundImages]:
         yield SoundImages(times, intensity.astype(np.float32), spectrum.astype(np.float32), strongest, known)
 
 
-def _powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarray) -> Float[np.ndarray, "F 64"]:
+def _band_powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarray) -> Float[np.ndarray, "F 64"]:
     """Compute the power in each frame and band (F, 64), before scaling."""
     frames = sliding_window_view(channel, len(taper))[::hop]
     # The mean is subtracted, since a constant offset would leak into the lowest band.
@@ -166,12 +168,12 @@ def _powers(channel: np.ndarray, taper: np.ndarray, hop: int, weights: np.ndarra
     return (np.real(spectrum) ** 2 + np.imag(spectrum) ** 2) @ weights
 
 
-def _per_frame(finite: np.ndarray, length: int, hop: int) -> np.ndarray:
+def _finite_share(finite: np.ndarray, length: int, hop: int) -> np.ndarray:
     """Compute the share of each frame's samples that are finite (M, F)."""
     return sliding_window_view(finite, length, axis=1)[:, ::hop].mean(axis=-1)
 
 
-def _weights(length: int, rate: float, highest: float) -> Float[np.ndarray, "K 64"]:
+def _band_weights(length: int, rate: float, highest: float) -> Float[np.ndarray, "K 64"]:
     """Compute the share of each bin's frequency interval, (k ± 1/2) rate / length, that lies in each band.
 
     The share is 0 for bin 0, and for frequencies above half the rate or above `highest`.

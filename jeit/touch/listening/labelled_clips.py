@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +53,7 @@ class LabelledClips:
     name: str = "clips"
 
     @classmethod
-    def of(
+    def from_recordings(
         cls,
         recordings: Sequence[Recording],
         labels: ArrayLike,
@@ -99,9 +100,16 @@ class LabelledClips:
         width = several[0] if len(several) == 1 else 1
         return cls(recordings, named.astype(str), own, width, low / 2, tuple(said), name)
 
+    @classmethod
+    def of(cls, *arguments: Any, **keywords: Any) -> "LabelledClips":
+        """Former name of `from_recordings`, which goes with the next version."""
+        text = "LabelledClips.of is now LabelledClips.from_recordings; the old name goes with the next version."
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        return cls.from_recordings(*arguments, **keywords)
+
     def clip(self, number: int) -> Recording:
         """Return the clip with this index, mixed to one channel if all clips are."""
-        return self.recordings[number] if self.channels > 1 else mixed(self.recordings[number])
+        return self.recordings[number] if self.channels > 1 else mix_channels(self.recordings[number])
 
     def __len__(self) -> int:
         """Number of clips."""
@@ -127,7 +135,7 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
     beside = [one.name for one in folder.iterdir() if one.is_file() and not one.name.startswith(".")]
     read, labels, groups, failed = [], [], [], []
     for one in classes:
-        files = sorted(path for path in one.rglob("*") if path.is_file() and not _hidden(path.relative_to(folder)))
+        files = sorted(path for path in one.rglob("*") if path.is_file() and not _is_hidden(path.relative_to(folder)))
         before = len(read)
         for path in files:
             try:
@@ -147,7 +155,7 @@ def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = N
     notes = [_describe_unread(failed)] if failed else []
     if beside:
         notes.append(f"{counted(len(beside), 'file')} of no class, beside their folders, left out ('{min(beside)}').")
-    return LabelledClips.of(_Files(read), labels, groups, notes=notes, name=folder.name or str(folder))
+    return LabelledClips.from_recordings(_Files(read), labels, groups, notes=notes, name=folder.name or str(folder))
 
 
 def _describe_unread(failed: list[tuple[str, str]]) -> str:
@@ -175,7 +183,7 @@ def _check_clip(clip: Recording | Intensities, name: str) -> None:
         raise ValueError(f"{name}: it is silent, all of its samples are {known[0]:g}.")
 
 
-def mixed(recording: Recording) -> Recording:
+def mix_channels(recording: Recording) -> Recording:
     """Mix all channels of a recording to one channel, their mean."""
     if len(recording.samples) == 1:
         return recording
@@ -183,5 +191,5 @@ def mixed(recording: Recording) -> Recording:
     return Recording(mean, recording.rate, full_scale=recording.full_scale, name=recording.name)
 
 
-def _hidden(path: Path) -> bool:
+def _is_hidden(path: Path) -> bool:
     return any(part.startswith(".") for part in path.parts)

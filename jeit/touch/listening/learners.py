@@ -19,7 +19,13 @@ from jeit.touch.learnt.array_models import Forest
 from jeit.touch.learnt.extras import one_thread
 from jeit.touch.learnt.methods import CLASSIFIERS
 from jeit.touch.listening.feature_images import SoundImages
-from jeit.touch.listening.modality_network import ModalityNetwork, NetworkAnswers, paper_plan, plan_of, train_network
+from jeit.touch.listening.modality_network import (
+    ModalityNetwork,
+    NetworkAnswers,
+    library_plan,
+    paper_plan,
+    train_network,
+)
 from jeit.touch.listening.window_features import Levels, sound_features, spectrum_features
 from jeit.touch.training import Plan
 
@@ -29,16 +35,16 @@ BATCHES = 1500
 """Default of the maximum number of training batches."""
 # Limits for small sets: maximum number of passes through the windows, and the number of batches that are allowed even
 # if they make more passes than that.
-_THROUGH, _FEWEST = 40, 100
+_MOST_PASSES, _FEWEST = 40, 100
 # One in this number of groups of each class is held out for early stopping of the network's training.
 _STOPPING = 6
 
 
-class Lesson(NamedTuple):
+class TrainingSet(NamedTuple):
     """A training set of windows, and the settings of a training.
 
-    `images`: the windows; `right` (W,): their classes, 0 … C − 1; `classes`: the number of classes C; `groups` (W,):
-    numbers that are equal for windows recorded together; `key`: draws the initial weights of networks; `batches`:
+    `images`: the windows; `right` (W,): their true classes, 0 … C − 1; `classes`: the number of classes C; `groups`
+    (W,): numbers that are equal for windows recorded together; `key`: draws the initial weights of networks; `batches`:
     maximum number of training batches; `checkpoint`: file in which an unfinished training is stored; `progress`: is
     called with a description of the progress.
     """
@@ -62,7 +68,7 @@ class NetworkListener:
     answers: NetworkAnswers
 
     @classmethod
-    def of(cls, network: ModalityNetwork, levels: Levels) -> "NetworkListener":
+    def from_network(cls, network: ModalityNetwork, levels: Levels) -> "NetworkListener":
         """Create a listener from a trained network."""
         return cls(network, levels, NetworkAnswers(network))
 
@@ -70,7 +76,7 @@ class NetworkListener:
         """Compute the log-odds (W, C) of the classes."""
         return self.answers.log_odds(self.levels(images))
 
-    def kept(self) -> tuple[dict[str, Any], Any]:
+    def to_stored(self) -> tuple[dict[str, Any], Any]:
         """Return the header and the arrays to store in a file."""
         levels = {name: getattr(self.levels, name).tolist() for name in Levels.__dataclass_fields__}
         return {"levels": levels}, self.network
@@ -82,18 +88,18 @@ class NetworkLearner:
 
     plan: Callable[..., Plan]
 
-    def learn(self, lesson: Lesson) -> NetworkListener:
+    def learn(self, lesson: TrainingSet) -> NetworkListener:
         """Train a network with early stopping, by the loss on held-out groups.
 
         One in six groups of each class is held out, if it has enough groups.
         """
         held = stopping_rows(lesson.right, lesson.groups)
-        levels = Levels.of(lesson.images[~held])
+        levels = Levels.from_images(lesson.images[~held])
         shown = levels(lesson.images)
         if lesson.checkpoint is not None:
             lesson.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         number = int((~held).sum())
-        enough = max(_FEWEST, _THROUGH * number // 64)
+        enough = max(_FEWEST, _MOST_PASSES * number // 64)
         plan = self.plan(number, batches=min(lesson.batches, enough))
         trained = train_network(
             shown[~held],
@@ -105,17 +111,19 @@ class NetworkLearner:
             checkpoint=lesson.checkpoint,
             progress=lesson.progress,
         )
-        return NetworkListener.of(trained.network, levels)
+        return NetworkListener.from_network(trained.network, levels)
 
     @staticmethod
-    def like(head: dict[str, Any], classes: int, rows: int) -> Any:
+    def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
         """Create arrays with the shapes of the stored ones."""
         return ModalityNetwork.draw(jax.random.key(0), rows, 41, classes)
 
     @staticmethod
-    def made(head: dict[str, Any], arrays: Any) -> NetworkListener:
-        """Restore a classifier from the header and arrays of `NetworkListener.kept`."""
-        return NetworkListener.of(arrays, Levels(**{name: np.array(value) for name, value in head["levels"].items()}))
+    def from_stored(head: dict[str, Any], arrays: Any) -> NetworkListener:
+        """Restore a classifier from the header and arrays of `NetworkListener.to_stored`."""
+        return NetworkListener.from_network(
+            arrays, Levels(**{name: np.array(value) for name, value in head["levels"].items()})
+        )
 
 
 @dataclass(frozen=True)
@@ -125,7 +133,7 @@ class TreesListener:
     forest: Forest
 
     @classmethod
-    def learn(cls, lesson: Lesson) -> "TreesListener":
+    def learn(cls, lesson: TrainingSet) -> "TreesListener":
         """Fit the trees; the minimum number of windows in a leaf is lower in small sets."""
         from sklearn.ensemble import HistGradientBoostingClassifier
 
@@ -141,13 +149,13 @@ class TreesListener:
         )
         with one_thread():
             model.fit(sound_features(lesson.images), lesson.right)
-        return cls(Forest.of_boosted_classes(model))
+        return cls(Forest.from_boosted_classifier(model))
 
     def log_odds(self, images: SoundImages) -> Float[np.ndarray, "W C"]:
         """Compute the log-odds (W, C) of the classes."""
         return self.forest.decision_function(sound_features(images))
 
-    def kept(self) -> tuple[dict[str, Any], Any]:
+    def to_stored(self) -> tuple[dict[str, Any], Any]:
         """Return the header and the arrays to store in a file."""
         own = self.forest
         head = {"trees": own.value.shape[0], "nodes": own.value.shape[1], "depth": own.depth}
@@ -155,7 +163,7 @@ class TreesListener:
         return head, [np.asarray(one, np.int32 if place < 3 else np.float32) for place, one in enumerate(arrays)]
 
     @staticmethod
-    def like(head: dict[str, Any], classes: int, rows: int) -> Any:
+    def stored_shapes(head: dict[str, Any], classes: int, rows: int) -> Any:
         """Create arrays with the shapes of the stored ones."""
         shape = (int(head["trees"]), int(head["nodes"]))
         shapes = [(shape, np.int32)] * 3 + [
@@ -166,8 +174,8 @@ class TreesListener:
         return [jax.numpy.zeros(one, kind) for one, kind in shapes]
 
     @classmethod
-    def made(cls, head: dict[str, Any], arrays: Any) -> "TreesListener":
-        """Restore a classifier from the header and arrays of `kept`.
+    def from_stored(cls, head: dict[str, Any], arrays: Any) -> "TreesListener":
+        """Restore a classifier from the header and arrays of `to_stored`.
 
         Raises `ValueError` for trees with features or nodes that do not exist.
         """
@@ -175,7 +183,7 @@ class TreesListener:
         nodes = value.shape[1]
         sound = (feature >= 0).all() and (feature < num_features()).all() and 0 < int(head["depth"]) < 1000
         if not (sound and all(((one >= 0) & (one < nodes)).all() for one in (left, right))):
-            raise ValueError("its trees lead nowhere")
+            raise ValueError("its trees refer to features or nodes that do not exist")
         return cls(
             Forest(
                 feature,
@@ -207,7 +215,7 @@ class LinearListener:
         """Compute the log-odds (W, C) of the classes."""
         return (self.features(images) - self.mean) / self.deviation @ self.weights + self.offset
 
-    def kept(self) -> tuple[dict[str, Any], Any]:
+    def to_stored(self) -> tuple[dict[str, Any], Any]:
         """Return the header and the arrays to store in a file."""
         return {}, [np.asarray(one, np.float32) for one in (self.mean, self.deviation, self.weights, self.offset)]
 
@@ -218,7 +226,7 @@ class LinearLearner:
 
     features: Callable[[SoundImages], Float[np.ndarray, "W k"]]
 
-    def learn(self, lesson: Lesson) -> LinearListener:
+    def learn(self, lesson: TrainingSet) -> LinearListener:
         """Fit the discriminant; all classes have the same prior probability, whatever their number of windows."""
         features = self.features(lesson.images)
         mean, deviation = features.mean(axis=0), features.std(axis=0)
@@ -235,19 +243,19 @@ class LinearLearner:
             weights, offset = np.hstack([-weights, weights]) / 2, np.concatenate([-offset, offset]) / 2
         return LinearListener(self.features, mean, deviation, weights, offset)
 
-    def like(self, head: dict[str, Any], classes: int, rows: int) -> Any:
+    def stored_shapes(self, head: dict[str, Any], classes: int, rows: int) -> Any:
         """Create arrays with the shapes of the stored ones."""
         number = self.features(_NOTHING).shape[1]
         return [jax.numpy.zeros(one, np.float32) for one in ((number,), (number,), (number, classes), (classes,))]
 
-    def made(self, head: dict[str, Any], arrays: Any) -> LinearListener:
-        """Restore a classifier from the header and arrays of `LinearListener.kept`."""
+    def from_stored(self, head: dict[str, Any], arrays: Any) -> LinearListener:
+        """Restore a classifier from the header and arrays of `LinearListener.to_stored`."""
         return LinearListener(self.features, *(np.asarray(one, float) for one in arrays))
 
 
 LEARNERS: dict[str, Any] = {
     "paper-network": NetworkLearner(paper_plan),
-    "network": NetworkLearner(plan_of),
+    "network": NetworkLearner(library_plan),
     "trees": TreesListener,
     "spectrum": LinearLearner(spectrum_features),
     "linear": LinearLearner(sound_features),
@@ -264,15 +272,15 @@ def num_features() -> int:
 _NOTHING = SoundImages(np.zeros(0), np.zeros((0, 1, 41)), np.zeros((0, 64, 41)), np.zeros(0, int), np.zeros(0, bool))
 
 
-def stopping_rows(right: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -> np.ndarray:
+def stopping_rows(window_classes: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -> np.ndarray:
     """Choose the windows (W,) that are held out for early stopping: whole groups, spread over the classes.
 
     No group is held out of a class that has fewer than three.
     """
-    held = np.zeros(len(right), bool)
+    held = np.zeros(len(window_classes), bool)
     chosen: set[int] = set()
-    for one in np.unique(right):
-        own = np.unique(groups[right == one])
+    for one in np.unique(window_classes):
+        own = np.unique(groups[window_classes == one])
         wanted = len(own) // _STOPPING if len(own) >= _STOPPING else int(len(own) >= 3)
         already = chosen & set(own.tolist())
         rest = [group for group in own.tolist() if group not in chosen]
@@ -280,4 +288,8 @@ def stopping_rows(right: Int[np.ndarray, " W"], groups: Int[np.ndarray, " W"]) -
         chosen |= {rest[place] for place in order[: max(0, wanted - len(already))]}
     held = np.isin(groups, sorted(chosen))
     # Every class must remain in the training set, otherwise nothing is held out.
-    return held if set(right[~held].tolist()) == set(right.tolist()) else np.zeros(len(right), bool)
+    return (
+        held
+        if set(window_classes[~held].tolist()) == set(window_classes.tolist())
+        else np.zeros(len(window_classes), bool)
+    )

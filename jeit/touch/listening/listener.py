@@ -16,9 +16,9 @@ from jeit.arguments import check_key, check_kind, check_name, counted
 from jeit.arguments.extras import need_extra
 from jeit.files import reason
 from jeit.touch.learnt.answers import Standing
-from jeit.touch.learnt.methods import probabilities, sharpness_of
+from jeit.touch.learnt.methods import fit_sharpness, probabilities
 from jeit.touch.listening.feature_images import BANDS, EVERY, image_blocks
-from jeit.touch.listening.labelled_clips import LabelledClips, mixed
+from jeit.touch.listening.labelled_clips import LabelledClips, mix_channels
 from jeit.touch.listening.learners import BATCHES, LEARNERS
 from jeit.touch.listening.sound_labels import SoundLabels
 from jeit.touch.listening.windows import LOUD, Windows, held_out_folds
@@ -97,7 +97,7 @@ class Listener:
         key = jax.random.key(0) if key is None else key
         check_key(key)
         report = progress or (lambda said: None)
-        windows = Windows.of(clips, report)
+        windows = Windows.from_clips(clips, report)
         fold = held_out_folds(windows.right_of_clip, windows.group_of_clip, _FOLDS)
         notes = [*clips.notes, *windows.notes]
         alone = np.array(windows.names)[np.unique(windows.right_of_clip[fold < 0])]
@@ -114,25 +114,25 @@ class Listener:
         loud = windows.images.loudness
         of_clips = np.maximum.reduceat(loud, np.flatnonzero(np.diff(windows.clip, prepend=-1)))
         if loudness is None:
-            loudness = _loudness_counts(windows, fold, key, report)
+            loudness = _is_loudness_useful(windows, fold, key, report)
         if not loudness:
             windows = windows.levelled
         found = []
         for name in names:
-            found.append((name, _held_out(name, windows, fold, key, batches, folder, report)))
+            found.append((name, _held_out_odds(name, windows, fold, key, batches, folder, report)))
         kept = [(windows.errors(odds), place, name, odds) for place, (name, odds) in enumerate(found)]
         # Methods are listed with the simplest last, which is chosen among methods with equal errors.
         kept.sort(key=lambda one: (*one[0], -one[1]))
         (_, _, chosen, odds) = kept[0]
         report(f"{chosen}, all clips")
-        everything = windows.lesson(
+        everything = windows.training_set(
             np.ones(len(windows.clip), bool), key, batches, _checkpoint_path(folder, chosen), report
         )
         model = LEARNERS[chosen].learn(everything)
         out = np.isfinite(odds).all(axis=1)
         standing = None
         if out.any():
-            said, right = windows.named(odds)
+            said, right = windows.predict_clips(odds)
             tried = [(name, errors[0]) for errors, _, name, _ in kept]
             standing = Standing(chosen, tried, np.array(windows.names)[said], np.array(windows.names)[right])
         else:
@@ -141,7 +141,7 @@ class Listener:
             )
         # If all of a few held-out clips are classified correctly, the likelihood alone does not limit the confidence;
         # `doubt`, from the rule of succession, does.
-        sharpness = min(1.0, sharpness_of(odds[out], windows.right[out])) if out.any() else 1.0
+        sharpness = min(1.0, fit_sharpness(odds[out], windows.right[out])) if out.any() else 1.0
         asked = 0 if standing is None else len(standing.right)
         return cls(
             windows.names,
@@ -171,18 +171,18 @@ class Listener:
         notes = []
         whole = recording
         if self.channels == 1 and len(recording.samples) > 1:
-            recording = mixed(recording)
+            recording = mix_channels(recording)
             notes.append(f"{len(whole.samples)} channels were mixed to one, as the listener has it.")
         if len(recording.samples) != self.channels:
             raise ValueError(
                 f"{recording.name} has {counted(len(recording.samples), 'microphone')}, and the listener was learnt "
-                f"from clips of {self.channels}; record with these, or fit one to clips of those."
+                f"from clips of {self.channels}; record with as many, or train a listener on clips of this array."
             )
         if recording.rate < 2 * self.highest * (1 - 1e-3):
             raise ValueError(
                 f"{recording.name} has {recording.rate:g} samples a second, sound up to {recording.rate / 2:g} Hz, and "
                 f"the listener uses sound up to {self.highest:g} Hz; record {2 * self.highest:g} a second or more, "
-                "or fit one to clips of this rate."
+                "or train a listener on clips of this rate."
             )
         bad = int((~np.isfinite(recording.samples)).sum())
         if bad:
@@ -204,7 +204,7 @@ class Listener:
         quiet = loudness < self._quiet_threshold(float(loudness.max()))
         if quiet.all() and loudness.max() > 0:
             notes.append("all of it is quieter than anything learnt from: is the gain another?")
-        place, std = (None, None) if calibration is None else _places(whole, calibration, times)
+        place, std = (None, None) if calibration is None else _estimate_places(whole, calibration, times)
         share = probabilities(odds, self.sharpness)
         return SoundLabels(
             times,
@@ -235,7 +235,7 @@ class Listener:
 
         Raises `ValueError` if `path` is a folder.
         """
-        own, arrays = self.model.kept()
+        own, arrays = self.model.to_stored()
         head = {
             "names": list(self.names),
             "method": self.method,
@@ -266,11 +266,11 @@ class Listener:
 
         def make(head: dict[str, Any]) -> Any:
             check_name("its method", head["method"], tuple(LEARNERS))
-            return LEARNERS[head["method"]].like(head["model"], len(head["names"]), head["channels"] + BANDS)
+            return LEARNERS[head["method"]].stored_shapes(head["model"], len(head["names"]), head["channels"] + BANDS)
 
         head, arrays = read_model(path, _KIND, _VERSION, make)
         try:
-            model = LEARNERS[head["method"]].made(head["model"], arrays)
+            model = LEARNERS[head["method"]].from_stored(head["model"], arrays)
             numbers = (float(head[name]) for name in ("highest_Hz", "quietest", "sharpness", "doubt"))
             highest, quietest, sharpness, doubt = numbers
             softest, greatest = map(float, head["clips_loudness"])
@@ -294,7 +294,9 @@ class Listener:
         )
 
 
-def _held_out(name: str, windows: Windows, fold: np.ndarray, key: Array, batches: int, folder, report) -> np.ndarray:
+def _held_out_odds(
+    name: str, windows: Windows, fold: np.ndarray, key: Array, batches: int, folder, report
+) -> np.ndarray:
     """Compute the log-odds (W, C) of windows by models that are fitted without the fold of their clip.
 
     They are NaN for windows that are never held out.
@@ -303,12 +305,12 @@ def _held_out(name: str, windows: Windows, fold: np.ndarray, key: Array, batches
     for number in range(int(fold.max()) + 1):
         report(f"{name}, fold {number + 1} of {int(fold.max()) + 1}")
         out = (fold == number)[windows.clip]
-        lesson = windows.lesson(~out, key, batches, _checkpoint_path(folder, f"{name}-{number}"), report)
+        lesson = windows.training_set(~out, key, batches, _checkpoint_path(folder, f"{name}-{number}"), report)
         odds[out] = LEARNERS[name].learn(lesson).log_odds(windows.images[out])
     return odds
 
 
-def _loudness_counts(windows: Windows, fold: np.ndarray, key: Array, report) -> bool:
+def _is_loudness_useful(windows: Windows, fold: np.ndarray, key: Array, report) -> bool:
     """Determine whether loudness improves a linear discriminant by more than one standard deviation of chance.
 
     If no clip can be held out, loudness is used if there are several microphones, which share one gain.
@@ -317,7 +319,7 @@ def _loudness_counts(windows: Windows, fold: np.ndarray, key: Array, report) -> 
         return windows.images.intensity.shape[1] > 1
     right = []
     for own in (windows, windows.levelled):
-        said, truth = own.named(_held_out("linear", own, fold, key, 1, None, report))
+        said, truth = own.predict_clips(_held_out_odds("linear", own, fold, key, 1, None, report))
         right.append(said == truth)
     more, fewer = (right[0] & ~right[1]).sum(), (right[1] & ~right[0]).sum()
     return bool(more - fewer > np.sqrt(more + fewer))
@@ -327,7 +329,9 @@ def _checkpoint_path(folder: str | Path | None, name: str) -> Path | None:
     return None if folder is None else Path(folder) / f"{name}.training"
 
 
-def _places(recording: Recording, calibration: Calibration, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _estimate_places(
+    recording: Recording, calibration: Calibration, times: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the touched places (W, d) and their standard deviations, metres, around the middle of each window.
 
     They are means over the frames of the smoothed track, NaN if there are none.

@@ -22,12 +22,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 
-from jeit.touch.training import Objective, Plan, Trained, fit
+from jeit.touch.training import Objective, Plan, TrainingResult, fit
 
 # For the two layers: sizes of kernels and of pools, in pixels, and numbers of channels.
 _KERNELS, _POOLS, _CHANNELS = (5, 3), (3, 2), (32, 64)
 # Weight of a batch's mean and variance in the running ones; constant added to variances.
-_TAKEN, _LITTLE = 0.05, 1e-5
+_RUNNING_WEIGHT, _VARIANCE_FLOOR = 0.05, 1e-5
 NOISE, COPIES = 0.2, 5
 """Standard deviation of the normal noise added to images, whose own standard deviation is 1; number of noisy copies of
 each image in an epoch, as in the paper."""
@@ -71,18 +71,20 @@ class ModalityNetwork(eqx.Module):
         dense, bias = 0.1 * dense, jnp.zeros(classes, jnp.float32)
         return cls(first, second, ones, zeros, zeros, ones, dense, bias)
 
-    def answer(self, images: Float[Array, "b rows columns"]) -> Float[Array, "b C"]:
+    def log_odds(self, images: Float[Array, "b rows columns"]) -> Float[Array, "b C"]:
         """Compute the log-odds (b, C) of the classes, normalised by the running means and variances."""
         return self._forward(images, self.mean, self.variance)[0]
 
-    def learn(self, images: Float[Array, "b rows columns"]) -> tuple[Float[Array, "b C"], "ModalityNetwork"]:
+    def log_odds_in_training(
+        self, images: Float[Array, "b rows columns"]
+    ) -> tuple[Float[Array, "b C"], "ModalityNetwork"]:
         """Compute the log-odds (b, C) of the classes, normalised by the batch's own means and variances.
 
         Also returns the network with updated running means and variances.
         """
         said, means, variances = self._forward(images, None, None)
         kept = jax.tree.map(
-            lambda old, new: (1 - _TAKEN) * old + _TAKEN * jax.lax.stop_gradient(new),
+            lambda old, new: (1 - _RUNNING_WEIGHT) * old + _RUNNING_WEIGHT * jax.lax.stop_gradient(new),
             (self.mean, self.variance),
             (means, variances),
         )
@@ -101,18 +103,19 @@ class ModalityNetwork(eqx.Module):
                 own = mean[layer], variance[layer]
             means.append(own[0])
             variances.append(own[1])
-            factor = self.gain[layer] / jnp.sqrt(own[1] + _LITTLE)
+            factor = self.gain[layer] / jnp.sqrt(own[1] + _VARIANCE_FLOOR)
             values = values * factor + (self.shift[layer] - own[0] * factor)
             values = _max_pool(jnp.maximum(values, 0), _POOLS[layer], jnp)
         return values.reshape(len(images), -1) @ self.dense + self.bias, tuple(means), tuple(variances)
 
 
-def _max_pool(values, size: int, namespace):
-    """Maximum of every `size` × `size` block (b, h, w, c); rows and columns that do not fill a block are left out."""
-    height, width = (side // size * size for side in values.shape[1:3])
+def _max_pool(values, pool_size: int, namespace):
+    """Maximum of every `pool_size` × `pool_size` block (b, h, w, c); rows and columns that do not fill a block are left
+    out."""
+    height, width = (side // pool_size * pool_size for side in values.shape[1:3])
     values = values[:, :height, :width]
-    taller = reduce(namespace.maximum, [values[:, row::size] for row in range(size)])
-    return reduce(namespace.maximum, [taller[:, :, column::size] for column in range(size)])
+    taller = reduce(namespace.maximum, [values[:, row::pool_size] for row in range(pool_size)])
+    return reduce(namespace.maximum, [taller[:, :, column::pool_size] for column in range(pool_size)])
 
 
 class NetworkAnswers:
@@ -121,7 +124,7 @@ class NetworkAnswers:
     def __init__(self, network: ModalityNetwork):
         whole = jax.tree.map(np.asarray, network)
         # The normalisation is a factor and an offset for each channel; the factor is merged into the kernels.
-        factors = [gain / np.sqrt(own + _LITTLE) for gain, own in zip(whole.gain, whole.variance, strict=True)]
+        factors = [gain / np.sqrt(own + _VARIANCE_FLOOR) for gain, own in zip(whole.gain, whole.variance, strict=True)]
         self.kernels = [
             np.ascontiguousarray((kernel * factor).transpose(2, 0, 1, 3).reshape(-1, kernel.shape[-1]))
             for kernel, factor in zip((whole.first, whole.second), factors, strict=True)
@@ -133,10 +136,10 @@ class NetworkAnswers:
 
     def log_odds(self, images: Float[np.ndarray, "W rows columns"]) -> Float[np.ndarray, "W C"]:
         """Compute the log-odds (W, C) of the classes."""
-        parts = [self._evaluate_some(images[first : first + _AT_ONCE]) for first in range(0, len(images), _AT_ONCE)]
+        parts = [self._evaluate_block(images[first : first + _AT_ONCE]) for first in range(0, len(images), _AT_ONCE)]
         return np.concatenate([np.zeros((0, len(self.bias)), np.float32), *parts]).astype(float)
 
-    def _evaluate_some(self, images: np.ndarray) -> np.ndarray:
+    def _evaluate_block(self, images: np.ndarray) -> np.ndarray:
         values = images[..., None]
         for kernel, offset, size, pool in zip(self.kernels, self.offsets, _KERNELS, _POOLS, strict=True):
             patches = sliding_window_view(values, (size, size), axis=(1, 2))
@@ -164,7 +167,7 @@ def paper_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
     )
 
 
-def plan_of(windows: int, *, batches: int, batch: int = 64) -> Plan:
+def library_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
     """Training schedule of this library, which needs fewer batches for the same accuracy on small sets.
 
     The rate is 1e-3, and a tenth of it in the last third of the training.
@@ -184,12 +187,12 @@ def train_network(
     noise: float = NOISE,
     checkpoint: str | Path | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Trained:
+) -> TrainingResult:
     """Train a network on images of the classes `right`, until its loss on held-out images no longer decreases.
 
-    `held`: the held-out images and their classes; `plan`: as from `plan_of`; `noise`: standard deviation of the noise
-    added to images; `checkpoint` and `progress` as in `jeit.touch.training.fit`, whose errors are raised. The same
-    `key` gives identical results.
+    `held`: the held-out images and their classes; `plan`: as from `library_plan`; `noise`: standard deviation of the
+    noise added to images; `checkpoint` and `progress` as in `jeit.touch.training.fit`, whose errors are raised. The
+    same `key` gives identical results.
     """
     drawn, trained = jax.random.split(key)
     network = ModalityNetwork.draw(drawn, images.shape[1], images.shape[2], classes)
@@ -199,11 +202,11 @@ def train_network(
 
     def loss(network: ModalityNetwork, batch: Any, key: Array):
         shown, label = batch
-        said, after = network.learn(shown + noise * jax.random.normal(key, shown.shape, jnp.float32))
+        said, after = network.log_odds_in_training(shown + noise * jax.random.normal(key, shown.shape, jnp.float32))
         return _cross_entropy(said, label).mean(), after
 
     def held_out(network: ModalityNetwork, batch: Any):
-        return _cross_entropy(network.answer(batch[0]), batch[1])
+        return _cross_entropy(network.log_odds(batch[0]), batch[1])
 
     data = (np.asarray(images, np.float32), np.asarray(right, np.int32))
     validation = (np.asarray(held[0], np.float32), np.asarray(held[1], np.int32))
@@ -219,5 +222,5 @@ def train_network(
     )
 
 
-def _cross_entropy(said: Float[Array, "b C"], label: Int[Array, " b"]) -> Float[Array, " b"]:
-    return -jnp.take_along_axis(jax.nn.log_softmax(said), label[:, None], axis=1)[:, 0]
+def _cross_entropy(log_odds: Float[Array, "b C"], label: Int[Array, " b"]) -> Float[Array, " b"]:
+    return -jnp.take_along_axis(jax.nn.log_softmax(log_odds), label[:, None], axis=1)[:, 0]

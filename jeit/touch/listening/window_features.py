@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +27,7 @@ class Levels:
     deviation: Float[np.ndarray, " 2"]
 
     @classmethod
-    def of(cls, images: SoundImages) -> "Levels":
+    def from_images(cls, images: SoundImages) -> "Levels":
         """Compute the conversion from windows of the training set."""
         loudest, mean, deviation = [], [], []
         for power in (images.intensity, images.spectrum):
@@ -36,6 +37,13 @@ class Levels:
             mean.append(float(levels.mean(dtype=float)))
             deviation.append(float(levels.std(dtype=float)) or 1.0)
         return cls(np.array(loudest), np.array(mean), np.array(deviation))
+
+    @classmethod
+    def of(cls, images: SoundImages) -> "Levels":
+        """Former name of `from_images`, which goes with the next version."""
+        text = "Levels.of is now Levels.from_images; the old name goes with the next version."
+        warnings.warn(text, DeprecationWarning, stacklevel=2)
+        return cls.from_images(images)
 
     def __call__(self, images: SoundImages) -> Float[np.ndarray, "W rows 41"]:
         """Compute feature images (W, M + 64, 41), in single precision: M rows of intensity, then 64 of the spectrogram.
@@ -75,7 +83,7 @@ def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
     """
     if not len(images):
         return np.zeros((0, len(_loudness_features(np.zeros((1, FRAMES)))[0]) + _COLOURS + 2 * _FEW + 8 + 8))
-    loud = _level(images.intensity.sum(axis=1))
+    loud = _relative_decibels(images.intensity.sum(axis=1))
     parts = [
         _loudness_features(loud),
         _spectral_features(images.spectrum.astype(float), loud),
@@ -90,7 +98,7 @@ def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
     The statistics of the level, in decibels relative to the loudest of the window, are its mean, maximum and spread
     over the window, and its means over the loudest frame and the two after it, and over the next five.
     """
-    level = _level(images.spectrum.astype(float))
+    level = _relative_decibels(images.spectrum.astype(float))
     level -= level.max(axis=(1, 2), keepdims=True, initial=-np.inf)
     at = images.intensity.sum(axis=1).argmax(axis=1)
     rows = np.arange(len(level))
@@ -99,7 +107,7 @@ def spectrum_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
     return np.hstack([sound_features(images), *bands])
 
 
-def _level(power: np.ndarray) -> np.ndarray:
+def _relative_decibels(power: np.ndarray) -> np.ndarray:
     """Convert powers to levels in decibels (W, …), clipped at 60 dB below the maximum of each window."""
     level = 10 * np.log10(np.maximum(power, 1e-30))
     return np.maximum(level, level.max(axis=tuple(range(1, level.ndim)), keepdims=True) - _RANGE)
@@ -110,7 +118,7 @@ def _loudness_features(loud: Float[np.ndarray, "W 41"]) -> np.ndarray:
     below = top[:, None] - loud
     at = loud.argmax(axis=1)
     rows = np.arange(len(loud))
-    peaks = _peaks(loud)
+    peaks = _loudness_peaks(loud)
     count = peaks.sum(axis=1)
     which = np.arange(FRAMES)
     first = np.where(count > 0, np.argmax(peaks, axis=1), 0)
@@ -144,7 +152,7 @@ def _loudness_features(loud: Float[np.ndarray, "W 41"]) -> np.ndarray:
     )
 
 
-def _peaks(loud: np.ndarray) -> np.ndarray:
+def _loudness_peaks(loud: np.ndarray) -> np.ndarray:
     """Find the frames (W, 41) that are peaks.
 
     A peak is the loudest of five frames, and at least 6 dB above the minimum of the ten frames before it, and of the
@@ -163,7 +171,7 @@ def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], loud: np.ndarray)
     power = spectrum.mean(axis=2) + 1e-30
     share = power / power.sum(axis=1, keepdims=True)
     band = np.arange(BANDS)
-    colours = _level(power.reshape(len(power), _COLOURS, -1).mean(axis=2))
+    colours = _relative_decibels(power.reshape(len(power), _COLOURS, -1).mean(axis=2))
     colours = colours - colours.max(axis=1, keepdims=True)
     middle = share @ band
     width = np.sqrt(np.maximum(share @ band**2 - middle**2, 0))
@@ -173,10 +181,10 @@ def _spectral_features(spectrum: Float[np.ndarray, "W 64 41"], loud: np.ndarray)
     weight = each / each.sum(axis=1, keepdims=True)
     mean = (moving * weight).sum(axis=1)
     wanders = np.sqrt(np.maximum((moving**2 * weight).sum(axis=1) - mean**2, 0))
-    few = _level(spectrum.reshape(len(power), _FEW, -1, FRAMES).mean(axis=2))
+    few = _relative_decibels(spectrum.reshape(len(power), _FEW, -1, FRAMES).mean(axis=2))
     at = loud.argmax(axis=1)
     top, later = few[rows, :, at], few[rows, :, np.minimum(at + _AFTER, FRAMES - 1)]
-    flux = np.abs(np.diff(_level(spectrum.reshape(len(power), _COLOURS, -1, FRAMES).mean(axis=2)), axis=2))
+    flux = np.abs(np.diff(_relative_decibels(spectrum.reshape(len(power), _COLOURS, -1, FRAMES).mean(axis=2)), axis=2))
     steep = np.polyfit(np.log(np.arange(1, _COLOURS + 1)), colours.T, 1)[0]
     numbers = [middle, width, flat, mean, wanders, flux.mean(axis=(1, 2)), flux.max(axis=2).mean(axis=1), steep]
     return np.column_stack([colours, *numbers, later - top, few.std(axis=2)])
@@ -187,7 +195,7 @@ def _microphone_features(intensity: Float[np.ndarray, "W M 41"]) -> np.ndarray:
     share = mean / mean.sum(axis=1, keepdims=True)
     ordered = np.sort(share, axis=1)[:, ::-1]
     even = -(share * np.log(share)).sum(axis=1) / np.log(max(share.shape[1], 2))
-    level = _level(intensity)
+    level = _relative_decibels(intensity)
     own = level - level.mean(axis=2, keepdims=True)
     # Correlation of each microphone's level over time with that of the loudest one.
     loudest = own[np.arange(len(own)), share.argmax(axis=1)]

@@ -16,33 +16,35 @@ from jaxtyping import Array, Float, Int
 from jeit.arguments import counted
 from jeit.touch.listening.feature_images import LENGTH, SoundImages, sound_images
 from jeit.touch.listening.labelled_clips import LabelledClips
-from jeit.touch.listening.learners import Lesson
+from jeit.touch.listening.learners import TrainingSet
 
 
-def held_out_folds(right: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], most: int) -> Int[np.ndarray, " N"]:
+def held_out_folds(
+    clip_classes: Int[np.ndarray, " N"], groups: Int[np.ndarray, " N"], max_folds: int
+) -> Int[np.ndarray, " N"]:
     """Assign each of N clips to the fold (N,) in which it is held out, together with all clips of its group.
 
-    `right`, `groups`: class and group of each clip. The fold is -1 for clips that are always in the training set, since
-    their class has no other group. Groups are assigned to at most `most` folds in turn, class by class, the largest
-    first, so that every training set contains all classes.
+    `clip_classes`, `groups`: class and group of each clip. The fold is -1 for clips that are always in the training
+    set, since their class has no other group. Groups are assigned to at most `max_folds` folds in turn, class by class,
+    the largest first, so that every training set contains all classes.
     """
-    fold = np.full(len(right), -1)
+    fold = np.full(len(clip_classes), -1)
     of_group: dict[int, int] = {}
-    counts = np.zeros(most, int)
-    classes = [np.unique(groups[right == one]) for one in np.unique(right)]
+    counts = np.zeros(max_folds, int)
+    classes = [np.unique(groups[clip_classes == one]) for one in np.unique(clip_classes)]
     for own in sorted(classes, key=len):
         if len(own) < 2:
             continue
         for group in sorted(own.tolist(), key=lambda one: -int((groups == one).sum())):
             if group not in of_group:
-                taken = [sum(of_group.get(other) == number for other in own.tolist()) for number in range(most)]
-                of_group[group] = min(range(most), key=lambda number: (taken[number], counts[number], number))
+                taken = [sum(of_group.get(other) == number for other in own.tolist()) for number in range(max_folds)]
+                of_group[group] = min(range(max_folds), key=lambda number: (taken[number], counts[number], number))
                 counts[of_group[group]] += int((groups == group).sum())
     for group, number in of_group.items():
         fold[groups == group] = number
     # If all groups of a class were in one fold, the class would be tested without having been learnt.
-    for one in np.unique(right):
-        own = right == one
+    for one in np.unique(clip_classes):
+        own = clip_classes == one
         if len(np.unique(fold[own])) < 2:
             fold[own] = -1
     used = np.unique(fold[fold >= 0])
@@ -78,7 +80,7 @@ class Windows:
     notes: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, clips: LabelledClips, report: Callable[[str], None]) -> "Windows":
+    def from_clips(cls, clips: LabelledClips, report: Callable[[str], None]) -> "Windows":
         """Select the loud windows of each clip. Raises `ValueError` for clips without finite samples."""
         names, right = np.unique(clips.labels, return_inverse=True)
         group = np.unique(clips.groups, return_inverse=True)[1]
@@ -91,7 +93,7 @@ class Windows:
                 raise ValueError(f"recordings[{number}], {clips.recordings[number].name}: it holds no numbers.")
             only = right[number] in alone
             long = images.times[-1] - images.times[0] > _LONG
-            pieces = _pieces(images.times[loud]) if long or only else [np.arange(len(loud))]
+            pieces = _split_pieces(images.times[loud]) if long or only else [np.arange(len(loud))]
             for place, piece in enumerate(pieces):
                 some = piece[np.linspace(0, len(piece) - 1, min(len(piece), _OF_A_PIECE)).round().astype(int)]
                 parts.append(images[loud[some]])
@@ -122,12 +124,12 @@ class Windows:
         """The number of classes, C."""
         return len(self.names)
 
-    def lesson(self, rows: np.ndarray, key: Array, batches: int, checkpoint: Path | None, report) -> Lesson:
+    def training_set(self, rows: np.ndarray, key: Array, batches: int, checkpoint: Path | None, report) -> TrainingSet:
         """Create a training set from the selected windows, `rows` (W,)."""
         groups = self.group_of_clip[self.clip[rows]]
-        return Lesson(self.images[rows], self.right[rows], groups, self.classes, key, batches, checkpoint, report)
+        return TrainingSet(self.images[rows], self.right[rows], groups, self.classes, key, batches, checkpoint, report)
 
-    def named(self, odds: Float[np.ndarray, "W C"]) -> tuple[np.ndarray, np.ndarray]:
+    def predict_clips(self, odds: Float[np.ndarray, "W C"]) -> tuple[np.ndarray, np.ndarray]:
         """Predict the class of every held-out clip from the log-odds of its windows; also returns its true class."""
         out = np.isfinite(odds).all(axis=1)
         share = odds[out] - np.logaddexp.reduce(odds[out], axis=1, keepdims=True)
@@ -141,11 +143,11 @@ class Windows:
         out = np.isfinite(odds).all(axis=1)
         if not out.any():
             return 0.0, 0.0
-        said, right = self.named(odds)
+        said, right = self.predict_clips(odds)
         return float(np.mean(said != right)), float(np.mean(odds[out].argmax(axis=1) != self.right[out]))
 
 
-def _pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
+def _split_pieces(times: Float[np.ndarray, " n"]) -> list[np.ndarray]:
     """Split the loud windows, at `times`, into pieces that share no samples.
 
     Windows belong to one sound if no gap between them exceeds the length of a window. A longer sound is cut every 2 s;

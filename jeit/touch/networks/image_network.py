@@ -67,12 +67,12 @@ class ImageNetwork:
     made_for: dict[str, Any]
 
     @classmethod
-    def of_skin(cls, network: ThreeStages | Unrolled, skin: Skin, noise: float, shape: tuple[int, int]):
+    def from_skin(cls, network: ThreeStages | Unrolled, skin: Skin, noise: float, shape: tuple[int, int]):
         """Create an `ImageNetwork` from a network that was trained for this skin."""
         design = "unrolled" if isinstance(network, Unrolled) else "three-stages"
         low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
         extent = low_x, high_x, low_y, high_y
-        made_for = described(skin.model.protocol, skin.layout.centres, extent)
+        made_for = describe_skin(skin.model.protocol, skin.layout.centres, extent)
         return cls(network, design, float(skin.thickness), shape, extent, float(noise), made_for)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -119,7 +119,7 @@ class ImageNetwork:
         change = np.where(lost, np.nan, relative_to(np.nan_to_num(rest), np.nan_to_num(frames)))
         if (most_changed := np.nanmax(np.abs(change), initial=0)) > _GREATEST:
             raise ValueError(f"voltages are {most_changed:.3g} times those of the reference; are units the same?")
-        return filled(change, self._covariance, self.noise) if lost.any() else change
+        return fill_missing(change, self._covariance, self.noise) if lost.any() else change
 
     def doubts(self, change: Float[np.ndarray, "n M"], share: Float[np.ndarray, "n rows columns"]) -> list[str]:
         """State why each map of `share(change)` is unreliable; an empty string if there is no evidence against the map.
@@ -133,24 +133,26 @@ class ImageNetwork:
         loud = size > _LOUD * self.noise * np.sqrt(change.shape[1])
         missed, bulge = np.zeros(len(share)), _BULGE * self.floor / self.thickness
         if isinstance(self.network, Unrolled) and loud.any():
-            response = np.asarray(self._response(np.maximum(share, 0)))
+            response = np.asarray(self._predict_changes(np.maximum(share, 0)))
             missed[loud] = (np.linalg.norm(change - response, axis=1)[loud] / size[loud]) ** 2
         for number, one in enumerate(share):
             if missed[number] > _UNEXPLAINED and -one.min() > max(one.max(), bulge):
                 found[number] = (
-                    "what changed is of no touch, it is as of a skin that is pushed outwards; are signs those of the "
-                    "reference, was the skin touched in that?"
+                    "the change is not that of a touch, but of a skin pushed outwards; do frame and reference "
+                    "have the same "
+                    "signs, and was the skin untouched in the reference?"
                 )
             elif one.max() > _TOO_DEEP:
                 found[number] = (
                     f"{1e3 * self.thickness * float(one.max()):.3g} mm deep, and the skin is "
-                    f"{1e3 * self.thickness:.3g} mm thick; are units those of the reference?"
+                    f"{1e3 * self.thickness:.3g} mm thick; are the units those of the reference?"
                 )
         return found
 
     @functools.cached_property
     def floor(self) -> float:
-        """Noise floor of depth, metres: maximum of 64 maps of an untouched skin with the noise of the training."""
+        """Noise floor of depth, metres: the maximum depth in 64 simulated maps of an untouched skin, whose channels
+        have the noise of the training."""
         random = np.random.default_rng(0)
         return self.thickness * float(
             self.share(self.noise * random.normal(size=(64, self.made_for["channels"]))).max()
@@ -158,11 +160,13 @@ class ImageNetwork:
 
     @functools.cached_property
     def _covariance(self) -> Float[np.ndarray, "M M"]:
+        """Covariance of the relative changes of the channels that touches cause."""
         assert isinstance(self.network, Unrolled)
         return self.network.covariance(pixel_places(self.extent, self.shape))
 
     @functools.cached_property
-    def _response(self) -> Callable[..., Any]:
+    def _predict_changes(self) -> Callable[..., Any]:
+        """Compiled function from relative depth maps to the changes of the channels, by the forward model."""
         network = self.network
         assert isinstance(network, Unrolled)
         return jax.jit(lambda maps: network.predicted_changes(jnp.asarray(maps, jnp.float32)))
@@ -188,6 +192,7 @@ class ImageNetwork:
 
     @functools.cached_property
     def _compiled(self) -> Callable[..., Any]:
+        """Compiled function from relative changes to relative depth maps."""
         arrays, still = eqx.partition(self.network, eqx.is_array)
         called = jax.jit(lambda arrays, change: eqx.combine(arrays, still)(change))
         return lambda change: called(arrays, jnp.asarray(change))
@@ -198,7 +203,7 @@ class ImageNetwork:
         check_same(name, self.made_for, _channels_of(protocol))
 
 
-def described(protocol: Protocol, centres: ArrayLike, extent: tuple[float, ...]) -> dict[str, Any]:
+def describe_skin(protocol: Protocol, centres: ArrayLike, extent: tuple[float, ...]) -> dict[str, Any]:
     """Describe the skin that a network is made for, as plain values that JSON can store.
 
     `protocol`: its protocol; `centres` (L, 2): centres of its electrodes, metres; `extent`: (x_min, x_max, y_min,
@@ -237,7 +242,7 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
     """
     path = Path(path)
     path = path / FILE if path.is_dir() else path
-    head, network = read_model(path, _KIND, _VERSION, _untrained)
+    head, network = read_model(path, _KIND, _VERSION, _untrained_network)
     low_x, high_x, low_y, high_y = map(float, head["extent_m"])
     found = ImageNetwork(
         network,
@@ -249,23 +254,24 @@ def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
         head["made_for"],
     )
     if skin is not None:
-        here = described(skin.model.protocol, skin.layout.centres, (*map(float, skin.flat_outline.extent),))
+        here = describe_skin(skin.model.protocol, skin.layout.centres, (*map(float, skin.flat_outline.extent),))
         check_same(path, found.made_for, here)
     return found
 
 
-def _untrained(head: dict[str, Any]) -> ThreeStages | Unrolled:
+def _untrained_network(head: dict[str, Any]) -> ThreeStages | Unrolled:
+    """Create an untrained network of the architecture that the header `head` of a file describes."""
     check_name("design", head["design"], DESIGNS)
     rows, columns = head["shape"]
     channels, key = head["made_for"]["channels"], jax.random.key(0)
     for number in (rows, columns, channels):
         if not (isinstance(number, int) and 1 <= number <= 10_000):
-            raise ValueError(f"its head gives {describe(number)} rows, columns or channels")
+            raise ValueError(f"its header gives {describe(number)} rows, columns or channels")
     numbers = [head["thickness_m"], head["noise"], *head["extent_m"]]
     if len(numbers) != 6 or not all(is_number(one) for one in numbers):
-        raise ValueError("its head gives no thickness, noise and extent")
+        raise ValueError("its header gives no thickness, noise and extent")
     if not (isinstance(head["steps"], int) and 0 <= head["steps"] <= _MOST_STEPS):
-        raise ValueError(f"its head gives {describe(head['steps'])} steps")
+        raise ValueError(f"its header gives {describe(head['steps'])} steps")
     if head["design"] == "three-stages":
         return ThreeStages(channels, (rows, columns), key=key)
     return Unrolled(channels, (rows, columns), head["steps"], key=key)
@@ -283,7 +289,7 @@ def _channels_of(protocol: Protocol) -> dict[str, Any]:
     }
 
 
-def filled(
+def fill_missing(
     changes: Float[np.ndarray, "n M"], covariance: Float[np.ndarray, "M M"], noise: float
 ) -> Float[np.ndarray, "n M"]:
     """Replace missing channels, NaN, by their expected values given the others, C₂₁ (C₁₁ + noise² 1)⁻¹ y₁.

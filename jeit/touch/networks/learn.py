@@ -22,18 +22,24 @@ from jeit.design import Skin, touches_away_from_the_edge
 from jeit.design.study.store import OtherContents, Store
 from jeit.layout import Layout
 from jeit.touch.networks.image_network import DESIGNS, FILE, ImageNetwork, write_network
-from jeit.touch.networks.sensed import Sensed, centroids_of, detection_noise, errors, touch_draws
+from jeit.touch.networks.linear_channels import (
+    LinearChannels,
+    depth_centroids,
+    detection_noise,
+    error_statistics,
+    touch_draws,
+)
 from jeit.touch.networks.three_stages import DepthAutoencoder, ThreeStages, VoltageAutoencoder
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
 from jeit.touch.simulate.contact.indent_sets import image_places
-from jeit.touch.training import ArrayRows, MappedRows, Objective, Plan, Rows, Trained, fit
+from jeit.touch.training import ArrayRows, MappedRows, Objective, Plan, Rows, TrainingResult, fit
 
 # Maximum number of touches that are in memory, and shuffled, at once: 120 MB for 94 channels and 48 × 48 maps.
 _AT_ONCE = 12_000
 
 
-class Touches(Protocol):
+class SimulatedTouches(Protocol):
     """Simulated touches: relative changes "change" (n, M) without noise, and depth maps "depth" (n, rows, columns).
 
     Depths are divided by the thickness of the skin.
@@ -44,7 +50,7 @@ class Touches(Protocol):
         ...
 
 
-class Examples(NamedTuple):
+class TouchExamples(NamedTuple):
     """Touches in memory.
 
     **Fields**: `change` (n, M): relative changes without noise; `depth` (n, rows, columns): depth maps, divided by the
@@ -82,16 +88,16 @@ class StoredTouches:
         self.spans = [range(chunks[part[0]].start, chunks[part[-1]].stop) for part in parts]
 
     def rows(self, *names: str) -> "StoredRows":
-        """Return the arrays of these names, which are read chunk by chunk; see `Touches`."""
+        """Return the arrays of these names, which are read chunk by chunk; see `SimulatedTouches`."""
         return StoredRows(self, names)
 
-    def in_memory(self) -> Examples:
+    def in_memory(self) -> TouchExamples:
         """Read all touches into memory."""
-        return Examples(self._arrays["change"].to_numpy(), self._arrays["depth"].to_numpy())
+        return TouchExamples(self._arrays["change"].to_numpy(), self._arrays["depth"].to_numpy())
 
-    def read(self, name: str, number: int) -> Float[np.ndarray, "n *shape"]:
+    def read(self, name: str, chunk: int) -> Float[np.ndarray, "n *shape"]:
         """Read the array `name` of one chunk, float32."""
-        span = self.spans[number]
+        span = self.spans[chunk]
         return self._arrays[name][span.start : span.stop].to_numpy().astype(np.float32, copy=False)
 
 
@@ -111,9 +117,9 @@ class StoredRows:
         """Fingerprint of the touches, the names of the arrays, and the sizes of the chunks."""
         return f"{self._touches.fingerprint} {' '.join(self._names)} {self.sizes}"
 
-    def chunk(self, number: int):
+    def chunk(self, index: int):
         """Read the arrays of one chunk; for a single name, the array itself."""
-        arrays = tuple(self._touches.read(name, number) for name in self._names)
+        arrays = tuple(self._touches.read(name, index) for name in self._names)
         return arrays[0] if len(arrays) == 1 else arrays
 
 
@@ -125,17 +131,17 @@ _EARLY, _MISFIT, _MODEL_ERROR, _DRIFT, _LOUDER = 0.3, 0.05, 0.1, 0.1, 6.0
 _SCALE = 0.002
 
 
-class Learnt(NamedTuple):
+class TrainedNetwork(NamedTuple):
     """A trained network.
 
     **Fields**: `network`: the network; `courses`: results of its trainings, with their histories, by name.
     """
 
     network: ThreeStages | Unrolled
-    courses: dict[str, Trained]
+    courses: dict[str, TrainingResult]
 
 
-class Runs(NamedTuple):
+class TrainingRuns(NamedTuple):
     """Settings of consecutive trainings.
 
     **Fields**: `plan`: plan of every training; `key`: random key; `folder`: folder of the checkpoints, or None;
@@ -147,7 +153,7 @@ class Runs(NamedTuple):
     folder: Path | None = None
     progress: Callable[[str], None] | None = None
 
-    def run(self, name: str, network, objective: Objective, training, validation) -> Trained:
+    def run(self, name: str, network, objective: Objective, training, validation) -> TrainingResult:
         """Run one training, with a random key that depends on its name."""
         key = jax.random.fold_in(self.key, int.from_bytes(name.encode()[:4], "little"))
         kept = None if self.folder is None else self.folder / f"{name}.training"
@@ -156,108 +162,118 @@ class Runs(NamedTuple):
         return fit(network, objective, training, validation, self.plan, key=key, checkpoint=kept, progress=said)
 
 
-def train_three_stages(training: Touches, validation: Examples, noise: float, runs: Runs) -> Learnt:
+def train_three_stages(
+    training: SimulatedTouches, validation: TouchExamples, noise: float, runs: TrainingRuns
+) -> TrainedNetwork:
     """Train the design of Park et al. 2022: autoencoders of the changes and of the maps, and a projection between them.
 
     Both autoencoders are fixed while the projection is trained. `noise`: standard deviation of relative changes.
     """
     shape = validation.depth.shape[1:]
-    start = ThreeStages(validation.change.shape[1], shape, key=runs.key)
+    network_start = ThreeStages(validation.change.shape[1], shape, key=runs.key)
     mean, deviation = mean_and_deviation(training.rows("change"))
     noisy = np.hypot(deviation, noise)
-    start = eqx.tree_at(
+    network_start = eqx.tree_at(
         lambda one: (one.mean, one.deviation),
-        start,
+        network_start,
         (jnp.asarray(mean, jnp.float32), jnp.asarray(noisy, jnp.float32)),
     )
-    own = jnp.asarray(noise / noisy, jnp.float32)
-    changes = MappedRows(training.rows("change"), start.standard, f"standardised under noise of {noise}")
+    noise_scale = jnp.asarray(noise / noisy, jnp.float32)
+    changes = MappedRows(training.rows("change"), network_start.standardise, f"standardised under noise of {noise}")
     voltages, depth = (jax.random.fold_in(runs.key, one) for one in (1, 2))
 
-    def denoised(network, batch, key):
+    def denoising_loss(network, batch, key):
         first, second = jax.random.split(key)
-        noisy = batch + own * jax.random.normal(first, batch.shape, batch.dtype)
+        noisy = batch + noise_scale * jax.random.normal(first, batch.shape, batch.dtype)
         return jnp.mean((network(noisy, second) - batch) ** 2), network
 
-    def redrawn(network, batch, key):
+    def map_loss(network, batch, key):
         return jnp.mean((network(batch, key) - batch) ** 2) / _SCALE, network
 
-    found = {
+    trainings = {
         "voltages": runs.run(
             "voltages",
             VoltageAutoencoder(validation.change.shape[1], key=voltages),
-            Objective(denoised, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=1)),
+            Objective(denoising_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=1)),
             changes,
-            start.standard(jnp.asarray(validation.change, jnp.float32)),
+            network_start.standardise(jnp.asarray(validation.change, jnp.float32)),
         ),
         "maps": runs.run(
             "maps",
             DepthAutoencoder(shape, key=depth),
-            Objective(redrawn, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=(1, 2)) / _SCALE),
+            Objective(map_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=(1, 2)) / _SCALE),
             training.rows("depth"),
             validation.depth,
         ),
     }
-    ends = (found["voltages"].network.encoder, found["maps"].network.decoder)
-    start = eqx.tree_at(lambda one: (one.encoder, one.decoder), start, ends)
+    ends = (trainings["voltages"].network.encoder, trainings["maps"].network.decoder)
+    network_start = eqx.tree_at(lambda one: (one.encoder, one.decoder), network_start, ends)
     trained = eqx.tree_at(
         lambda one: one.projection,
-        jax.tree.map(lambda _: False, start),
-        jax.tree.map(eqx.is_inexact_array, start.projection),
+        jax.tree.map(lambda _: False, network_start),
+        jax.tree.map(eqx.is_inexact_array, network_start.projection),
     )
 
-    def projected(network, batch, key):
+    def projection_loss(network, batch, key):
         change, wanted = batch
         noisy = change + noise * jax.random.normal(key, change.shape, change.dtype)
         return jnp.mean((network(noisy) - wanted) ** 2) / _SCALE, network
 
     rows = training.rows("change", "depth"), _add_noise(validation, noise)
-    found["projection"] = runs.run("projection", start, Objective(projected, _map_errors, trained), *rows)
-    return Learnt(found["projection"].network, found)
+    trainings["projection"] = runs.run(
+        "projection", network_start, Objective(projection_loss, _map_errors, trained), *rows
+    )
+    return TrainedNetwork(trainings["projection"].network, trainings)
 
 
 def train_unrolled(
-    start: Unrolled, sensed: Sensed, training: Touches, validation: Examples, noise: float, runs: Runs
-) -> Learnt:
-    """Train the network `start`, which is already adapted to a skin, on the errors of its maps and of their voltages.
+    untrained: Unrolled,
+    channels: LinearChannels,
+    training: SimulatedTouches,
+    validation: TouchExamples,
+    noise: float,
+    runs: TrainingRuns,
+) -> TrainedNetwork:
+    """Train the network `untrained`, which is already adapted to a skin, on the errors of its maps and of their
+    voltages.
 
     The voltages of maps are computed by the skin's forward model. Changes are trained with the relative `noise` and
     with drifting contact impedances.
     """
-    contacts = jnp.asarray(sensed.contacts, jnp.float32)
+    contacts = jnp.asarray(channels.contacts, jnp.float32)
 
     def loss(network, batch, key):
-        change, wanted = batch
+        change, depth = batch
         keys = jax.random.split(key, 4)
         # Squares of uniform random numbers: most amounts of drift and noise are near the usual ones.
-        much, loud = (jax.random.uniform(one, (len(change), 1), change.dtype) ** 2 for one in keys[2:])
-        drift = _DRIFT * much * jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
-        own = noise * _LOUDER**loud
+        drift_size, noise_size = (jax.random.uniform(one, (len(change), 1), change.dtype) ** 2 for one in keys[2:])
+        drift = _DRIFT * drift_size * jax.random.normal(keys[1], (len(change), len(contacts)), change.dtype)
+        own = noise * _LOUDER**noise_size
         noisy = change + own * jax.random.normal(keys[0], change.shape, change.dtype) + drift @ contacts
-        *early, last = network.each(noisy)
-        value = jnp.mean((last - wanted) ** 2)
+        *early, last = network.maps_after_steps(noisy)
+        value = jnp.mean((last - depth) ** 2)
         for one in early:
-            value = value + _EARLY * jnp.mean((one - wanted) ** 2)
-        off = own[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
-        missed = jnp.mean((network.predicted_changes(last) - change) ** 2, axis=1) / off
+            value = value + _EARLY * jnp.mean((one - depth) ** 2)
+        expected_misfit = own[:, 0] ** 2 + _MODEL_ERROR**2 * jnp.mean(change**2, axis=1)
+        relative_misfit = jnp.mean((network.predicted_changes(last) - change) ** 2, axis=1) / expected_misfit
         # The logarithm of the misfit is used, since touches on electrodes, which the model explains least, would
         # otherwise dominate.
-        return value / _SCALE + _MISFIT * jnp.mean(jnp.log1p(missed)), network
+        return value / _SCALE + _MISFIT * jnp.mean(jnp.log1p(relative_misfit)), network
 
     rows = training.rows("change", "depth"), _add_noise(validation, noise)
-    found = runs.run("unrolled", start, Objective(loss, _map_errors, start.trained), *rows)
-    return Learnt(found.network, {"unrolled": found})
+    found = runs.run("unrolled", untrained, Objective(loss, _map_errors, untrained.trained), *rows)
+    return TrainedNetwork(found.network, {"unrolled": found})
 
 
-def shuffled(examples: Examples, seed: int = 0) -> Examples:
+def shuffle_pairs(examples: TouchExamples, seed: int = 0) -> TouchExamples:
     """Pair the changes and maps at random: only the distribution of maps can be learnt from the result."""
     order = np.random.default_rng(seed).permutation(len(examples.change))
     return examples._replace(depth=examples.depth[order])
 
 
 def _map_errors(network, batch):
-    change, wanted = batch
-    return jnp.mean((network(change) - wanted) ** 2, axis=(1, 2)) / _SCALE
+    change, depth = batch
+    return jnp.mean((network(change) - depth) ** 2, axis=(1, 2)) / _SCALE
 
 
 def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, " M"]]:
@@ -273,7 +289,7 @@ def mean_and_deviation(rows: Rows) -> tuple[Float[np.ndarray, " M"], Float[np.nd
     return mean, np.sqrt(squares / number)
 
 
-def _add_noise(examples: Examples, noise: float) -> tuple[Float[np.ndarray, "n M"], Float[np.ndarray, "n r c"]]:
+def _add_noise(examples: TouchExamples, noise: float) -> tuple[Float[np.ndarray, "n M"], Float[np.ndarray, "n r c"]]:
     """Return changes with noise, and maps; the noise is fixed, so that held-out data are the same in every
     evaluation."""
     random = np.random.default_rng(0).normal(size=examples.change.shape)
@@ -343,7 +359,7 @@ class LearntImages:
     """
 
     network: ImageNetwork
-    courses: dict[str, Trained]
+    courses: dict[str, TrainingResult]
     standing: ImageStanding
     seconds: dict[str, float]
 
@@ -412,37 +428,37 @@ def learn_images(
     held, judged = (sets[name].in_memory() for name in ("held-out", "standing"))
     seconds["touches"] = time.monotonic() - start
     key = jax.random.key(seed)
-    runs = Runs(preset.plan_of(design), key, work, progress)
+    runs = TrainingRuns(preset.plan_of(design), key, work, progress)
     if design == "unrolled":
-        sensed = Sensed.of(skin, SHAPE)
+        channels = LinearChannels.from_skin(skin, SHAPE)
         start_network = Unrolled(held.change.shape[1], SHAPE, key=jax.random.fold_in(key, 3))
         places = image_places(skin, SHAPE[1], SHAPE[0])
-        start_network = start_network.of_skin(sensed, places, skin.layout.centres, noise)
-        learnt = train_unrolled(start_network, sensed, sets["learnt"], held, noise, runs)
+        start_network = start_network.adapted_to_skin(channels, places, skin.layout.centres, noise)
+        learnt = train_unrolled(start_network, channels, sets["learnt"], held, noise, runs)
     else:
         learnt = train_three_stages(sets["learnt"], held, noise, runs)
     seconds["training"] = time.monotonic() - start - seconds["touches"]
-    network = ImageNetwork.of_skin(learnt.network, skin, noise, SHAPE)
+    network = ImageNetwork.from_skin(learnt.network, skin, noise, SHAPE)
     report("standing")
-    standing = stand(network, skin, judged)
+    standing = evaluate_network(network, skin, judged)
     seconds["all"] = time.monotonic() - start
     write_network(network, Path(folder) / FILE)
     return LearntImages(network, learnt.courses, standing, seconds)
 
 
-def stand(network: ImageNetwork, skin: Skin, examples: Examples, seed: int = 0) -> ImageStanding:
+def evaluate_network(network: ImageNetwork, skin: Skin, examples: TouchExamples, seed: int = 0) -> ImageStanding:
     """Evaluate a network on touches, with the noise of its training."""
     random = np.random.default_rng(seed)
 
-    def answered(change):
+    def estimate_maps(change):
         return network.share(change + network.noise * random.normal(size=change.shape))
 
-    maps = answered(examples.change)
+    maps = estimate_maps(examples.change)
     explained = 1 - float(np.mean((maps - examples.depth) ** 2) / np.mean(examples.depth**2))
     grid = touches_away_from_the_edge(skin.outline, _BALL / 2, _PLACES, _PLACES)
     tip, depth = ball(_BALL), min(_DEPTH * float(skin.thickness), _BALL / 2)
-    found = answered(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
+    ball_maps = estimate_maps(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
     rows, columns = network.shape
-    place = errors(centroids_of(found, image_places(skin, columns, rows)), grid.places)
-    deepest = float(np.median(found.max(axis=(1, 2)))) * float(skin.thickness) / depth
+    place = error_statistics(depth_centroids(ball_maps, image_places(skin, columns, rows)), grid.places)
+    deepest = float(np.median(ball_maps.max(axis=(1, 2)))) * float(skin.thickness) / depth
     return ImageStanding(explained, place, deepest, examples.depth[:6], maps[:6])

@@ -14,7 +14,7 @@ from jeit.data import Measurement
 from jeit.touch.networks.image_network import MOST_MISSING, ImageNetwork
 
 # Maximum difference, metres, of electrode positions and of the skin's size from those that a network was trained for.
-_OFF = 1e-3
+_POSITION_TOLERANCE = 1e-3
 
 
 class FrameDepth(NamedTuple):
@@ -59,7 +59,7 @@ def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
         return
     own = 1e-3 * np.asarray(network.made_for["electrodes_mm"])
     off = np.linalg.norm(np.asarray(places)[:, :2] - own, axis=1)
-    if off.max() > _OFF:
+    if off.max() > _POSITION_TOLERANCE:
         raise ValueError(
             f"'{measurement.name}': electrode {off.argmax() + 1} is {1e3 * off.max():.3g} mm from where the network's "
             "is; train one for this skin."
@@ -67,12 +67,14 @@ def check_measured(network: ImageNetwork, measurement: Measurement) -> None:
 
 
 def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
+    """Raise `ValueError` if the skin of a measurement differs in size from that of the network by more than a
+    millimetre."""
     domain = measurement.domain
     here = getattr(domain, "extent", None)
     if here is None or np.shape(here) != (4,):
         return
     own, given = (np.subtract(one[1::2], one[::2]) for one in (network.extent, np.asarray(here, float)))
-    if np.abs(own - given).max() > _OFF:
+    if np.abs(own - given).max() > _POSITION_TOLERANCE:
         raise ValueError(
             f"'{measurement.name}': its skin is {1e3 * given[0]:.4g} × {1e3 * given[1]:.4g} mm, and the network's "
             f"{1e3 * own[0]:.4g} × {1e3 * own[1]:.4g} mm; train one for this skin."

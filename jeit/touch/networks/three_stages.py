@@ -24,7 +24,7 @@ class Dense(eqx.Module):
 
     def __init__(self, inputs: int, outputs: int, *, key: Array):
         """Create the layer with random weights after He et al. 2015, as in all layers here, and a bias of zero."""
-        self.weight = _start(key, (inputs, outputs), inputs)
+        self.weight = _draw_weights(key, (inputs, outputs), inputs)
         self.bias = jnp.zeros(outputs, jnp.float32)
 
     def __call__(self, values: Float[Array, "b i"]) -> Float[Array, "b o"]:
@@ -41,7 +41,7 @@ class Convolution(eqx.Module):
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, *, key: Array):
         """Create the layer for images with `inputs` channels."""
-        self.weight = _start(key, (3, 3, inputs, outputs), 9 * inputs)
+        self.weight = _draw_weights(key, (3, 3, inputs, outputs), 9 * inputs)
         self.bias = jnp.zeros(outputs, jnp.float32)
         self.stride = stride
 
@@ -51,11 +51,11 @@ class Convolution(eqx.Module):
         steps = (self.stride, self.stride)
         return jax.lax.conv_general_dilated(image, self.weight, steps, "SAME", dimension_numbers=layout) + self.bias
 
-    def of_doubled(self, image: Float[Array, "b r c i"]) -> Float[Array, "b s d o"]:
-        """Apply the layer to the image enlarged by `doubled`, with four ninths of the multiplications.
+    def apply_to_repeated(self, image: Float[Array, "b r c i"]) -> Float[Array, "b s d o"]:
+        """Return the layer's output for `repeat_pixels(image)`, with four ninths of the multiplications.
 
-        Of the three rows, and columns, that contribute to a pixel, two are equal, so that their weights are added
-        first.
+        Of the three rows of the enlarged image that contribute to a pixel, two are equal, so the weights of both are
+        added before the multiplication; likewise for columns.
         """
         number, rows, columns, _ = image.shape
         tall = jnp.stack([self.weight.at[1].add(self.weight[2])[:2], self.weight.at[1].add(self.weight[0])[1:]])
@@ -99,21 +99,22 @@ class Chain(eqx.Module):
         return values
 
 
-def doubled(image: Float[Array, "b r c i"]) -> Float[Array, "b s d i"]:
-    """Repeat every pixel as 2 × 2 pixels."""
+def repeat_pixels(image: Float[Array, "b r c i"]) -> Float[Array, "b s d i"]:
+    """Enlarge images to twice the rows and columns: each pixel becomes 2 × 2 equal pixels."""
     number, rows, columns, channels = image.shape
     wide = jnp.broadcast_to(image[:, :, None, :, None], (number, rows, 2, columns, 2, channels))
     return wide.reshape(number, 2 * rows, 2 * columns, channels)
 
 
-def unfolded(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:
+def channels_to_pixels(image: Float[Array, "b r c 4"]) -> Float[Array, "b s d"]:
     """Arrange the four channels of each pixel as 2 × 2 pixels of one channel."""
     number, rows, columns, _ = image.shape
     parts = image.reshape(number, rows, columns, 2, 2)
     return jnp.moveaxis(parts, 3, 2).reshape(number, 2 * rows, 2 * columns)
 
 
-def _start(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
+def _draw_weights(key: Array, shape: tuple[int, ...], inputs: int) -> Array:
+    """Draw initial weights of a layer whose outputs depend on `inputs` values each (He et al. 2015)."""
     return jax.random.normal(key, shape, jnp.float32) * np.float32(np.sqrt(2 / inputs))
 
 
@@ -181,7 +182,7 @@ class DepthDecoder(eqx.Module):
         """Decode a batch."""
         image = self.first(code).reshape(len(code), *self.shape, -1)
         for layer in self.layers:
-            image = layer.of_doubled(jax.nn.elu(image))
+            image = layer.apply_to_repeated(jax.nn.elu(image))
         return image[..., 0]
 
 
@@ -224,11 +225,11 @@ class ThreeStages(eqx.Module):
         self.projection = Chain.dense((_LATENT, _HIDDEN, _HIDDEN, _CODE), key=between)
         self.decoder = DepthAutoencoder(shape, key=depth).decoder
 
-    def standard(self, changes: Float[Array, "b M"]) -> Float[Array, "b M"]:
+    def standardise(self, changes: Float[Array, "b M"]) -> Float[Array, "b M"]:
         """Standardise changes by the `mean` and `deviation` of the training set."""
         return (changes - self.mean) / self.deviation
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
         """Compute depth maps, divided by the thickness of the skin."""
-        latent = jax.nn.elu(self.encoder(self.standard(changes)))
+        latent = jax.nn.elu(self.encoder(self.standardise(changes)))
         return self.decoder(jax.nn.elu(self.projection(latent)))

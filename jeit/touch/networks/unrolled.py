@@ -1,9 +1,9 @@
 """An unrolled network with the skin's forward model: linear images of the residual, refined by convolutions.
 
 Every step computes linear images of the residual changes by matrices of the forward model: one Gauss-Newton step with a
-Gaussian prior, for the noise alone and also for drifting contacts. A small convolutional network, the same all over the
-skin, then computes a correction of the map. Training includes the misfit of the voltages that the forward model
-predicts for the maps.
+Gaussian prior. One image allows for noise alone, another also for drift of the contact impedances. A small
+convolutional network, the same all over the skin, then computes a correction of the map. Training includes the misfit
+of the voltages that the forward model predicts for the maps.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.touch.networks.sensed import Sensed, depth_of, rounded, strength
-from jeit.touch.networks.three_stages import Convolution, doubled, unfolded
+from jeit.touch.networks.linear_channels import LinearChannels, depth_from_strength, round_relative, strength
+from jeit.touch.networks.three_stages import Convolution, channels_to_pixels, repeat_pixels
 
 _WIDE, _NARROW = 24, 16
 # Prior: standard deviation of a pixel's strength; its correlation length, divided by the skin's longer side. Linear
@@ -57,9 +57,9 @@ class Refinement(eqx.Module):
         first = elu(self.inwards[0](images))
         second = elu(self.inwards[2](elu(self.inwards[1](first))))
         third = elu(self.inwards[4](elu(self.inwards[3](second))))
-        wide = elu(self.outwards[0](second + doubled(third)))
-        fine = elu(self.outwards[2](first + doubled(elu(self.outwards[1](wide)))))
-        return unfolded(self.last(fine))
+        wide = elu(self.outwards[0](second + repeat_pixels(third)))
+        fine = elu(self.outwards[2](first + repeat_pixels(elu(self.outwards[1](wide)))))
+        return channels_to_pixels(self.last(fine))
 
 
 class Unrolled(eqx.Module):
@@ -88,47 +88,49 @@ class Unrolled(eqx.Module):
         self.steps = tuple(Refinement(images + 2 + (4 if number else 0), key=one) for number, one in enumerate(keys))
         self.shape = shape
 
-    def of_skin(self, sensed: Sensed, places: Float[np.ndarray, "r c 2"], centres, noise: float) -> "Unrolled":
+    def adapted_to_skin(
+        self, channels: LinearChannels, pixel_positions: Float[np.ndarray, "r c 2"], electrode_positions, noise: float
+    ) -> "Unrolled":
         """Return the network adapted to a skin.
 
-        `sensed`: linear model of the skin's channels; `places` (r, c, 2): positions of its pixels, metres; `centres`
-        (L, 2): positions of its electrodes, metres; `noise`: relative noise of its channels.
+        `channels`: linear model of the skin's channels; `pixel_positions` (r, c, 2): positions of its pixels, metres;
+        `electrode_positions` (L, 2): positions of its electrodes, metres; `noise`: relative noise of its channels.
         """
-        operator = sensed.halved()
-        covariance = _covariance(places[::2, ::2].reshape(-1, 2))
+        operator = channels.coarser_operator()
+        covariance = _covariance(pixel_positions[::2, ::2].reshape(-1, 2))
         across = operator @ covariance
         own = across @ operator.T
-        drift = _DRIFT**2 * sensed.contacts.T @ sensed.contacts
+        drift = _DRIFT**2 * channels.contacts.T @ channels.contacts
         white = noise**2 * np.eye(len(own))
         rests = [*(times**2 * white for times in _TIMES), white + drift]
         imagers = np.stack([np.linalg.solve(own + rest, across) for rest in rests], axis=-1)
-        middles = places.reshape(self.shape[0] // 2, 2, self.shape[1] // 2, 2, 2).mean(axis=(1, 3))
-        distance = np.linalg.norm(middles[..., None, :] - np.asarray(centres), axis=-1).min(axis=-1)
+        middles = pixel_positions.reshape(self.shape[0] // 2, 2, self.shape[1] // 2, 2, 2).mean(axis=(1, 3))
+        distance = np.linalg.norm(middles[..., None, :] - np.asarray(electrode_positions), axis=-1).min(axis=-1)
         response = np.log(np.linalg.norm(operator, axis=0).reshape(distance.shape) + 1e-9)
         still = np.stack([distance / distance.max(), (response - response.mean()) / response.std()], axis=-1)
-        arrays = [jnp.asarray(rounded(one), jnp.float32) for one in (sensed.operator, imagers, still)]
+        arrays = [jnp.asarray(round_relative(one), jnp.float32) for one in (channels.operator, imagers, still)]
         return eqx.tree_at(lambda one: (one.operator, one.imagers, one.still), self, arrays)
 
     @property
     def trained(self) -> "Unrolled":
-        """Tree of booleans: whether each leaf is trained."""
+        """Tree of booleans like the network: true for the arrays that are trained."""
         nothing = jax.tree.map(lambda _: False, self)
         return eqx.tree_at(lambda one: one.steps, nothing, jax.tree.map(eqx.is_inexact_array, self.steps))
 
-    def covariance(self, places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
-        """Covariance (M, M) of the changes of channels for strengths of the prior, with pixels at `places` (r, c, 2),
-        metres."""
+    def covariance(self, pixel_positions: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "M M"]:
+        """Covariance (M, M) of the changes of channels for strengths of the prior, with pixels at `pixel_positions` (r,
+        c, 2), metres."""
         rows, columns = self.shape[0] // 2, self.shape[1] // 2
         operator = np.asarray(self.operator, float).reshape(-1, rows, 2, columns, 2).sum(axis=(2, 4))
         operator = operator.reshape(len(operator), -1)
-        return operator @ _covariance(places[::2, ::2].reshape(-1, 2)) @ operator.T
+        return operator @ _covariance(pixel_positions[::2, ::2].reshape(-1, 2)) @ operator.T
 
     def predicted_changes(self, maps: Float[Array, "b r c"]) -> Float[Array, "b M"]:
         """Relative changes (b, M) that the forward model predicts for maps."""
         return strength(maps).reshape(len(maps), -1) @ self.operator.T
 
-    def each(self, changes: Float[Array, "b M"]) -> list[Float[Array, "b r c"]]:
-        """Compute the maps after each step."""
+    def maps_after_steps(self, changes: Float[Array, "b M"]) -> list[Float[Array, "b r c"]]:
+        """Compute the depth maps (b, rows, columns) after each step of the network."""
         number, (rows, columns) = len(changes), (self.shape[0] // 2, self.shape[1] // 2)
         still = jnp.broadcast_to(self.still, (number, *self.still.shape))
         found = []
@@ -141,17 +143,17 @@ class Unrolled(eqx.Module):
                 folded = maps.reshape(number, rows, 2, columns, 2)
                 parts.append(jnp.moveaxis(folded, 2, 3).reshape(number, rows, columns, 4))
             else:
-                maps = doubled(depth_of(images[..., :1]))[..., 0]
+                maps = repeat_pixels(depth_from_strength(images[..., :1]))[..., 0]
             found.append(maps + step(jnp.concatenate(parts, axis=-1)))
         return found
 
     def __call__(self, changes: Float[Array, "b M"]) -> Float[Array, "b r c"]:
-        """Compute the maps after the last step."""
-        return self.each(changes)[-1]
+        """Compute the depth maps (b, rows, columns) after the last step."""
+        return self.maps_after_steps(changes)[-1]
 
 
-def _covariance(places: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
-    """Gaussian covariance of the strengths of pixels at `places`, as a function of their distance."""
-    length = _LENGTH * np.ptp(places, axis=0).max()
-    squared = ((places[:, None] - places) ** 2).sum(axis=-1)
+def _covariance(pixel_positions: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p p"]:
+    """Gaussian covariance of the strengths of pixels at `pixel_positions`, as a function of their distance."""
+    length = _LENGTH * np.ptp(pixel_positions, axis=0).max()
+    squared = ((pixel_positions[:, None] - pixel_positions) ** 2).sum(axis=-1)
     return _DEVIATION**2 * np.exp(-squared / (2 * length**2))

@@ -80,7 +80,7 @@ def check_contacts(contacts) -> None:
         check_kind(f"contacts[{number}]", contact, Contact, "a Contact")
 
 
-def largest(values: np.ndarray) -> float:
+def largest_magnitude(values: np.ndarray) -> float:
     """Maximum magnitude of the finite values; 0 if there are none."""
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
@@ -96,25 +96,25 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     those of a new figure. Raises `ValueError` for stages of another type and another number of axes.
     """
     check_kind("stages", stages, RasterStages, "what finder.stages(image, noise) of a RasterFinder gives")
-    axes = _six() if axes is None else np.asarray(axes, object).ravel()
+    axes = _new_axes() if axes is None else np.asarray(axes, object).ravel()
     if axes.size != len(_TITLES):
         raise ValueError(f"axes: give six, one for each stage; there are {axes.size}.")
     inside = np.isfinite(stages.region)
-    factor, with_prefix = with_si_prefix(largest(stages.region), unit)
-    strongest = factor * largest(stages.region) or 1.0
+    factor, with_prefix = with_si_prefix(largest_magnitude(stages.region), unit)
+    strongest = factor * largest_magnitude(stages.region) or 1.0
     keywords = {"cmap": "RdBu_r", "vmin": -strongest, "vmax": strongest}
-    region = _drawn(axes[0], factor * stages.region, stages, keywords)
+    region = _draw_pixels(axes[0], factor * stages.region, stages, keywords)
     # The colour bar is as tall as its image, whatever the height of the axes.
     bar = axes[0].inset_axes((1.02, 0.1, 0.035, 0.8))
     draw_colour_bar(axes[0], region, f"Change ({with_prefix})", signed=True, position=bar)
     black = {"cmap": "gray", "vmin": 0, "vmax": 255}
     greys = (stages.grey, 255.0 * stages.threshold, 255.0 * stages.opened, stages.grey)
     for ax, pixels in zip(axes[1:5], greys, strict=True):
-        _drawn(ax, np.where(inside, pixels, np.nan), stages, black)
+        _draw_pixels(ax, np.where(inside, pixels, np.nan), stages, black)
     for contact in stages.contacts:
         closed = np.vstack([contact.contour, contact.contour[:1]])
         axes[4].plot(*closed.T, color="#d1495b", linewidth=1.4)
-    _drawn(axes[5], factor * stages.region, stages, keywords)
+    _draw_pixels(axes[5], factor * stages.region, stages, keywords)
     draw_contacts(stages.contacts, ax=axes[5])
     for ax, title in zip(axes, _TITLES, strict=True):
         hide_axes(ax, stages.extent, numbered=False)
@@ -123,11 +123,11 @@ def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarr
     return axes
 
 
-def _drawn(ax: Axes, pixels: np.ndarray, stages: RasterStages, keywords: dict):
+def _draw_pixels(ax: Axes, pixels: np.ndarray, stages: RasterStages, keywords: dict):
     return ax.imshow(pixels, extent=stages.extent, interpolation="nearest", **keywords)
 
 
-def _six() -> np.ndarray:
+def _new_axes() -> np.ndarray:
     from matplotlib import pyplot
 
     return pyplot.subplots(2, 3, figsize=(11, 7.4), layout="constrained")[1].ravel()

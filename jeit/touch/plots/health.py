@@ -23,7 +23,7 @@ from jeit.plot.axes import (
 from jeit.plot.imaging.electrodes import draw_electrodes
 from jeit.plot.imaging.image import draw_outline, plot_image
 from jeit.touch.health import EventKind, EventStatus, HealthEvent, SkinHealth
-from jeit.touch.health.event import size_of
+from jeit.touch.health.event import change_size
 
 _HALO = [withStroke(linewidth=4, foreground="white")]
 _CUT, _MENDED = SERIES_COLOURS[1], SERIES_COLOURS[2]
@@ -97,7 +97,7 @@ def _draw_cut(ax: Axes, event: HealthEvent) -> None:
 
 
 # Maximum number of events with labels; minimum upper end of the y axis, as a multiple of the limit.
-_WRITTEN, _LEAST = 12, 1.5
+_MOST_LABELS, _LEAST = 12, 1.5
 
 
 def plot_health_course(
@@ -116,7 +116,7 @@ def plot_health_course(
     healthy = health.healthy
     there = healthy.used & np.isfinite(read)
     off = np.where(there, (read - healthy.reference) / np.where(healthy.used, healthy.scale, np.inf), np.nan)
-    size = np.where(there.any(axis=1), size_of(off) / healthy.limit, np.nan)
+    size = np.where(there.any(axis=1), change_size(off) / healthy.limit, np.nan)
     ax = axes_or_new(ax, (9.0, 3.2))
     ax.plot(when, size, color=INK, linewidth=0.8)
     ax.axhline(1.0, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
@@ -124,7 +124,7 @@ def plot_health_course(
     for event in health.events:
         colour = SERIES_COLOURS[2] if event.kind == EventKind.REPAIRED else SERIES_COLOURS[1]
         ax.axvline(event.time, color=colour, linewidth=1.4)
-        if len(health.events) <= _WRITTEN:
+        if len(health.events) <= _MOST_LABELS:
             own = "" if event.electrode is None else f" {event.electrode + 1}"
             ax.annotate(
                 f"{event.kind}{own}",

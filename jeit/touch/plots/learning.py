@@ -20,7 +20,7 @@ from jeit.plot.axes import (
 from jeit.touch import Standing
 
 # Maximum number of labels for which a confusion matrix has tick labels.
-_MOST_WRITTEN = 24
+_MOST_TICK_LABELS = 24
 
 
 def plot_place_errors(place: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
@@ -65,7 +65,7 @@ def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None
     shares = 100 * counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     drawn = ax.imshow(shares, cmap="Blues", vmin=0, vmax=100)
     draw_colour_bar(ax, drawn, "Share of the kind (%)")
-    if len(kinds) <= _MOST_WRITTEN:
+    if len(kinds) <= _MOST_TICK_LABELS:
         turned = 90 if max(len(one) for one in kinds) > 3 else 0
         ax.set_xticks(range(len(kinds)), kinds, rotation=turned)
         ax.set_yticks(range(len(kinds)), kinds)

@@ -32,7 +32,7 @@ from jeit.touch.listening.feature_images import EVERY
 
 # Gap between frames, as a multiple of the median interval, at which a curve is interrupted; maximum number of points of
 # a curve; minimum length of a bar, as a share of the whole time; maximum number of touches with numbers.
-_UNSEEN, _POINTS, _SHORTEST, _NUMBERED = 10.0, 3000, 0.003, 60
+_LONG_GAP, _POINTS, _SHORTEST, _NUMBERED = 10.0, 3000, 0.003, 60
 _UNLIKE = "#b9bdc4"
 
 
@@ -55,7 +55,7 @@ def plot_changes(
         raise ValueError(f"peaks have shape {values.shape} and seconds {when.shape}; give one of each for every frame.")
     ax = axes_or_new(ax, (9.0, 2.6))
     factor, name = with_si_prefix(float(np.nanmax(values, initial=level)), unit)
-    ax.plot(*_thinned(*_broken(when, factor * values)), color=INK, linewidth=0.8)
+    ax.plot(*_reduce_points(*_interrupt_at_gaps(when, factor * values)), color=INK, linewidth=0.8)
     ax.axhline(factor * level, color=SOFT, linewidth=1, linestyle=(0, (4, 3)))
     ax.text(1, factor * level, " level", color=SOFT, fontsize=8, va="center", transform=ax.get_yaxis_transform())
     ax.set_ylabel(f"Greatest change ({name})", color=INK)
@@ -74,7 +74,7 @@ def plot_timeline(
     Bars are fainter for less probable gestures; touches unlike any in the training set have their own lane. `names`:
     (C,), names of the gestures. Raises `ValueError` for elements that are not named touches.
     """
-    check_named(touches)
+    check_named_touches(touches)
     ax = axes_or_new(ax, (9.0, 2.6))
     lanes = [*names, *(["unlike any"] if any(one.unlike for one in touches) else [])]
     ends = [one.touch.offset for one in touches]
@@ -87,7 +87,7 @@ def plot_timeline(
             length,
             0.72,
             color=gesture_colour(one, names),
-            alpha=_alpha(one),
+            alpha=_opacity(one),
             linewidth=0,
         )
         ax.add_patch(bar)
@@ -121,7 +121,7 @@ def plot_touch_paths(
 
     The number of each touch is written beside it. Raises `ValueError` for elements that are not named touches.
     """
-    check_named(touches)
+    check_named_touches(touches)
     ax = axes_or_new(ax)
     extent = extent_of(np.asarray(mesh.points))
     draw_outline(mesh, ax)
@@ -132,8 +132,10 @@ def plot_touch_paths(
         place = place[np.isfinite(place).all(axis=1)]
         if len(place):
             colour = gesture_colour(one, names)
-            ax.plot(*place.T, color=colour, linewidth=1.4, alpha=_alpha(one), zorder=3)
-            ax.plot(*place[0], marker="o", markersize=4.5, color=colour, alpha=_alpha(one), markeredgewidth=0, zorder=4)
+            ax.plot(*place.T, color=colour, linewidth=1.4, alpha=_opacity(one), zorder=3)
+            ax.plot(
+                *place[0], marker="o", markersize=4.5, color=colour, alpha=_opacity(one), markeredgewidth=0, zorder=4
+            )
             if len(touches) <= _NUMBERED:
                 ax.annotate(
                     f"{one.number}", place[0], (4, 2), textcoords="offset points", color=INK, fontsize=7, zorder=5
@@ -145,37 +147,37 @@ def plot_touch_paths(
     return ax
 
 
-def gesture_colour(one: NamedTouch, names: Sequence[str]) -> str:
+def gesture_colour(touch: NamedTouch, names: Sequence[str]) -> str:
     """Colour of a touch's gesture; grey for touches unlike any in the training set."""
-    return _UNLIKE if one.unlike else SERIES_COLOURS[list(names).index(one.gesture) % len(SERIES_COLOURS)]
+    return _UNLIKE if touch.unlike else SERIES_COLOURS[list(names).index(touch.gesture) % len(SERIES_COLOURS)]
 
 
-def check_named(touches) -> None:
+def check_named_touches(touches) -> None:
     """Check that `touches` is a list of named touches. Raises `ValueError` otherwise."""
     check_kind("touches", touches, (list, tuple), "a list of named touches, as TouchWatch.follow gives them")
     for number, one in enumerate(touches):
         check_kind(f"touches[{number}]", one, NamedTouch, "a NamedTouch")
 
 
-def _alpha(one: NamedTouch) -> float:
-    return 1.0 if one.unlike else 0.35 + 0.65 * one.probability
+def _opacity(touch: NamedTouch) -> float:
+    return 1.0 if touch.unlike else 0.35 + 0.65 * touch.probability
 
 
-def _broken(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _interrupt_at_gaps(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Insert NaN into a curve at long gaps between frames, so that it is interrupted."""
-    passed = np.diff(when)
-    gaps = 1 + np.flatnonzero(passed > _UNSEEN * np.median(passed)) if passed.size else np.zeros(0, int)
-    return np.insert(when, gaps, when[gaps]), np.insert(values, gaps, np.nan)
+    passed = np.diff(times)
+    gaps = 1 + np.flatnonzero(passed > _LONG_GAP * np.median(passed)) if passed.size else np.zeros(0, int)
+    return np.insert(times, gaps, times[gaps]), np.insert(values, gaps, np.nan)
 
 
-def _thinned(when: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _reduce_points(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Reduce a curve to about `_POINTS` points, keeping its extremes."""
-    if len(when) <= _POINTS:
-        return when, values
-    parts = np.array_split(np.arange(len(when)), _POINTS // 2)
+    if len(times) <= _POINTS:
+        return times, values
+    parts = np.array_split(np.arange(len(times)), _POINTS // 2)
     filled = np.where(np.isfinite(values), values, 0.0)
     rows = np.unique([part[at] for part in parts for at in (filled[part].argmin(), filled[part].argmax())])
-    return when[rows], values[rows]
+    return times[rows], values[rows]
 
 
 def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes | None = None) -> Axes:

@@ -23,10 +23,10 @@ from jeit.plot.axes import (
     soften_axes,
 )
 from jeit.touch import Touches
-from jeit.touch.training import Trained
+from jeit.touch.training import TrainingResult
 
 # Maximum number of ellipses, so that they do not hide each other.
-_MOST = 400
+_MOST_ELLIPSES = 400
 
 
 def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None = None) -> Axes:
@@ -46,7 +46,7 @@ def plot_places(touches: Touches, *, title: str | None = None, ax: Axes | None =
     place, std = touches.position[there, :2], touches.position_std[there, :2]  # pyright: ignore[reportOptionalSubscript]
     extent = extent_of(np.vstack([place - std, place + std]))
     hide_axes(ax, extent, numbered=False)
-    some = np.linspace(0, len(there) - 1, min(len(there), _MOST)).astype(int)
+    some = np.linspace(0, len(there) - 1, min(len(there), _MOST_ELLIPSES)).astype(int)
     size = 2 * std[some]
     ax.add_collection(
         EllipseCollection(
@@ -132,7 +132,7 @@ def plot_depth_map(
     return ax
 
 
-def plot_losses(courses: Mapping[str, Trained], *, title: str | None = None, ax: Axes | None = None) -> Axes:
+def plot_losses(courses: Mapping[str, TrainingResult], *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the loss on held-out touches during each training, relative to the first evaluation, and mark its minimum.
 
     `courses`: results of `jeit.touch.training.fit` by name. Raises `ValueError` for anything else.
@@ -140,7 +140,7 @@ def plot_losses(courses: Mapping[str, Trained], *, title: str | None = None, ax:
     check_kind("courses", courses, Mapping, "trainings by name, such as learnt.courses")
     ax = axes_or_new(ax)
     for (name, trained), colour in zip(courses.items(), SERIES_COLOURS * len(courses), strict=False):
-        check_kind(f"courses[{name!r}]", trained, Trained, "a Trained, as of fit")
+        check_kind(f"courses[{name!r}]", trained, TrainingResult, "a TrainingResult, as of fit")
         own = trained.course
         shares = np.array(own.validation) / own.validation[0]
         ax.plot(own.steps, shares, color=colour, linewidth=1.6, label=name)

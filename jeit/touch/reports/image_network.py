@@ -16,8 +16,8 @@ from jeit.report.folder import as_plain_values, results, results_folder, version
 from jeit.report.growing import GrowingRows, GrowingTable, Sample, reporting_partial_results
 from jeit.report.stream import PICTURES
 from jeit.touch.networks import ImageNetwork, LearntImages
+from jeit.touch.networks.linear_channels import depth_centroids
 from jeit.touch.networks.measured import FrameDepth
-from jeit.touch.networks.sensed import centroids_of
 from jeit.touch.simulate.contact.indent_sets import pixel_places
 
 LEARNT_FILES = ("network.jeit", "report.json", "learning.png")
@@ -148,7 +148,7 @@ def write_depths(
         imaged = _FrameStatistics(network)
         with GrowingTable(where / "frames.csv", ("frame", "x_m", "y_m", "depth_m")) as table:
             for one in found:
-                line, depth = imaged.take(one)
+                line, depth = imaged.add_frame(one)
                 with reporting_partial_results(rows):
                     table.write(line)
                     rows.append(depth)
@@ -185,33 +185,33 @@ class _FrameStatistics:
         self.row, self.number, self.latency = Sample(), Sample(), Sample()
         self.deepest = DeepestFrame(-1, -np.inf, np.full(2, np.nan))
 
-    def take(self, one: FrameDepth) -> tuple[list[object], Float[np.ndarray, "rows columns"]]:
-        """Return the line of the table, and the map, for a frame."""
-        if one.depth is None:
+    def add_frame(self, frame: FrameDepth) -> tuple[list[object], Float[np.ndarray, "rows columns"]]:
+        """Add a frame to the statistics; return its row of the table and its depth map."""
+        if frame.depth is None:
             self.number_refused += 1
-            self.first_reason = self.first_reason or one.reason
-            self.refused += [one.number] if len(self.refused) < _LISTED else []
-            return [one.number, "", "", ""], self._nothing
-        for sample, value in ((self.row, self.imaged + self.number_refused), (self.number, one.number)):
+            self.first_reason = self.first_reason or frame.reason
+            self.refused += [frame.number] if len(self.refused) < _LISTED else []
+            return [frame.number, "", "", ""], self._nothing
+        for sample, value in ((self.row, self.imaged + self.number_refused), (self.number, frame.number)):
             sample.append(value)
-        self.latency.append(one.latency)
+        self.latency.append(frame.latency)
         self.imaged += 1
-        depth = float(one.depth.max())
-        middle = centroids_of(one.depth[None], self._places)[0]
+        depth = float(frame.depth.max())
+        middle = depth_centroids(frame.depth[None], self._places)[0]
         if not depth > self.network.floor:
             middle = np.full(2, np.nan)
         if depth > self.deepest.depth:
-            self.deepest = DeepestFrame(one.number, depth, middle)
+            self.deepest = DeepestFrame(frame.number, depth, middle)
         said = [f"{value:.6g}" if np.isfinite(value) else "" for value in (*middle, depth)]
-        return [one.number, *said], one.depth
+        return [frame.number, *said], frame.depth
 
-    def report(self, name: str, number: int) -> dict[str, Any]:
+    def report(self, name: str, num_frames: int) -> dict[str, Any]:
         """Report the statistics as plain numbers, strings, lists and dictionaries."""
         network = self.network
         return as_plain_values(
             {
                 "frames": name,
-                "number": number,
+                "number": num_frames,
                 "refused": self.refused,
                 "number_refused": self.number_refused,
                 "design": network.design,

@@ -34,7 +34,7 @@ def write_touches(touches: Touches, folder: str | Path, *, skin: str, name: str)
     where pressed) with `probability_0` …. The column `unlike` is 1 for frames unlike all frames of the training set,
     for which nothing is predicted. Raises `ValueError` if `folder` cannot be a folder.
     """
-    columns = _columns(touches)
+    columns = _table_columns(touches)
     dead = np.flatnonzero(~touches.alive.any(axis=0))
     report = {
         "frames": name,
@@ -63,7 +63,7 @@ def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
             "channels": len(skin.channels.used),
             "channels_used": np.flatnonzero(skin.channels.used),
             "rows_frames_come_late": skin.lag,
-            "held_out": {name: _report(name, one) for name, one in skin.standing.items()},
+            "held_out": {name: _error_statistics(name, one) for name, one in skin.standing.items()},
             "notes": skin.notes,
             "units": {"length": "m", "force": "N"},
             "versions": {package: version_of(package) for package in _PACKAGES},
@@ -73,7 +73,7 @@ def report_learnt_skin(skin: LearntSkin) -> dict[str, Any]:
 
 def summary(name: str, standing: Standing) -> str:
     """Summarise in one line how well one quantity was learnt."""
-    said = _report(name, standing)
+    said = _error_statistics(name, standing)
     if name == "place":
         mean, median, most, guess = (
             f"{1e3 * said[key]:.3g} mm"
@@ -119,7 +119,7 @@ def draw_touches(touches: Touches):
     return figure
 
 
-def _report(name: str, standing: Standing) -> dict[str, Any]:
+def _error_statistics(name: str, standing: Standing) -> dict[str, Any]:
     """Compute error statistics of held-out presses."""
     said: dict[str, Any] = {"method": standing.method, "presses": len(standing.right)}
     if name in ("place", "force"):
@@ -145,23 +145,26 @@ def _report(name: str, standing: Standing) -> dict[str, Any]:
     return said | {"keys": [{"method": one, "right": 1 - error} for one, error in standing.tried]}
 
 
-def _columns(touches: Touches) -> dict[str, list]:
+def _table_columns(touches: Touches) -> dict[str, list]:
+    """Columns of `touches.csv`, by name."""
     columns: dict[str, list] = {"frame": list(range(len(touches)))}
     if touches.position is not None and touches.position_std is not None:
         axes = "xyz"[: touches.position.shape[1]]
-        columns |= {f"{axis}_m": _texts(one) for axis, one in zip(axes, touches.position.T, strict=True)}
-        columns |= {f"std_{axis}_m": _texts(one) for axis, one in zip(axes, touches.position_std.T, strict=True)}
+        columns |= {f"{axis}_m": _format_numbers(one) for axis, one in zip(axes, touches.position.T, strict=True)}
+        columns |= {
+            f"std_{axis}_m": _format_numbers(one) for axis, one in zip(axes, touches.position_std.T, strict=True)
+        }
     if touches.force is not None and touches.force_std is not None:
-        columns |= {"force_N": _texts(touches.force), "std_force_N": _texts(touches.force_std)}
+        columns |= {"force_N": _format_numbers(touches.force), "std_force_N": _format_numbers(touches.force_std)}
     if touches.label is not None and touches.probability is not None:
-        columns |= {"label": touches.label.tolist(), "probability": _texts(touches.probability)}
+        columns |= {"label": touches.label.tolist(), "probability": _format_numbers(touches.probability)}
     if touches.touched is not None and touches.key_probability is not None:
         said = np.where(touches.unlike[:, None], "", touches.touched.astype(int).astype(str))
         for key, (one, probability) in enumerate(zip(said.T, touches.key_probability.T, strict=True)):
-            columns |= {f"key_{key}": one.tolist(), f"probability_{key}": _texts(probability)}
+            columns |= {f"key_{key}": one.tolist(), f"probability_{key}": _format_numbers(probability)}
     columns["unlike"] = touches.unlike.astype(int).tolist()
     return columns
 
 
-def _texts(values: np.ndarray) -> list[str]:
+def _format_numbers(values: np.ndarray) -> list[str]:
     return [f"{value:.6g}" if np.isfinite(value) else "" for value in values]

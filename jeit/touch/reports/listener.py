@@ -36,7 +36,7 @@ def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -
     were estimated, `x_m`, `y_m` (`z_m`) and `std_x_m` …, empty for windows without a position. Raises `ValueError` if
     `folder` cannot be a folder.
     """
-    columns = _columns(labels)
+    columns = _table_columns(labels)
     with results(folder, SOUND_LABEL_FILES) as made:
         write_rows(made / "events.csv", list(columns), zip(*columns.values(), strict=True))
         write_json(report_sound_labels(labels, model=model), made / "report.json")
@@ -144,20 +144,23 @@ def draw_sound_labels(labels: SoundLabels):
     return figure
 
 
-def _columns(result: SoundLabels) -> dict[str, list]:
+def _table_columns(labels: SoundLabels) -> dict[str, list]:
+    """Columns of `events.csv`, by name."""
     columns: dict[str, list] = {
-        "time_s": [f"{time:.4f}" for time in result.times],
-        "heard": result.named.tolist(),
-        "probability": _texts(result.probability),
-        **{f"p_{name}": _texts(own) for name, own in zip(result.names, result.probabilities.T, strict=True)},
-        "microphone": result.strongest.tolist(),
+        "time_s": [f"{time:.4f}" for time in labels.times],
+        "heard": labels.named.tolist(),
+        "probability": _format_numbers(labels.probability),
+        **{f"p_{name}": _format_numbers(own) for name, own in zip(labels.names, labels.probabilities.T, strict=True)},
+        "microphone": labels.strongest.tolist(),
     }
-    if result.position is not None and result.position_std is not None:
-        axes = "xyz"[: result.position.shape[1]]
-        columns |= {f"{axis}_m": _texts(own) for axis, own in zip(axes, result.position.T, strict=True)}
-        columns |= {f"std_{axis}_m": _texts(own) for axis, own in zip(axes, result.position_std.T, strict=True)}
+    if labels.position is not None and labels.position_std is not None:
+        axes = "xyz"[: labels.position.shape[1]]
+        columns |= {f"{axis}_m": _format_numbers(own) for axis, own in zip(axes, labels.position.T, strict=True)}
+        columns |= {
+            f"std_{axis}_m": _format_numbers(own) for axis, own in zip(axes, labels.position_std.T, strict=True)
+        }
     return columns
 
 
-def _texts(values: np.ndarray) -> list[str]:
+def _format_numbers(values: np.ndarray) -> list[str]:
     return [f"{value:.6g}" if np.isfinite(value) else "" for value in values]

@@ -37,7 +37,7 @@ def write_health(
     semicolons; electrodes are numbered from 1. Raises `ValueError` if `folder` cannot be a folder.
     """
     with results(folder, HEALTH_FILES) as made:
-        write_rows(made / "events.csv", _EVENTS, (_row(one) for one in health.events))
+        write_rows(made / "events.csv", _EVENTS, (_event_row(one) for one in health.events))
         write_json(report_health(health, name, timed) | {"notes": list(notes)}, made / "report.json")
         draw_health(health, times, frames, timed).savefig(made / "health.png", dpi=130)
 
@@ -98,20 +98,21 @@ def draw_health(health: SkinHealth, times: Float[np.ndarray, " F"], frames: Floa
     return figure
 
 
-def _row(one: HealthEvent) -> list[object]:
-    path = "" if one.path is None else "; ".join(f"{x:.5f} {y:.5f}" for x, y in one.path)
+def _event_row(event: HealthEvent) -> list[object]:
+    """Row of `events.csv` for an event."""
+    path = "" if event.path is None else "; ".join(f"{x:.5f} {y:.5f}" for x, y in event.path)
     return [
-        one.number,
-        one.kind,
-        one.status,
-        f"{one.time:.6g}",
-        f"{one.noticed:.6g}",
-        one.frame,
-        "" if one.electrode is None else one.electrode + 1,
-        int(one.channels.sum()),
-        f"{one.strength:.4g}",
-        "" if one.path is None else f"{one.length:.5f}",
-        "" if one.path is None else f"{one.deviation:.5f}",
+        event.number,
+        event.kind,
+        event.status,
+        f"{event.time:.6g}",
+        f"{event.noticed:.6g}",
+        event.frame,
+        "" if event.electrode is None else event.electrode + 1,
+        int(event.channels.sum()),
+        f"{event.strength:.4g}",
+        "" if event.path is None else f"{event.length:.5f}",
+        "" if event.path is None else f"{event.deviation:.5f}",
         path,
-        one.reason,
+        event.reason,
     ]

@@ -126,8 +126,8 @@ def write_watch(
         for one in watched:
             for touch in one.ended:
                 touches.append(touch)
-                events.write(_event(touch))
-                for row in _path(touch):
+                events.write(_event_row(touch))
+                for row in _path_rows(touch):
                     paths.write(row)
             if one.image is not None:
                 seconds.append(one.second)
@@ -203,7 +203,7 @@ def draw_watch(written: WrittenWatch, watch: TouchWatch):
     said += f"; {counted(refused, 'frame')} refused" if refused else ""
     plot_changes(written.seconds, written.peaks, watch.level.level, title=said, ax=above)
     plot_timeline(list(written.touches), names, ax=lanes)
-    above.set_xlim(*_ends(written.seconds))
+    above.set_xlim(*_first_and_last(written.seconds))
     above.tick_params(labelbottom=False)
     model = watch.images.calibration.model
     plot_touch_paths(
@@ -217,40 +217,48 @@ def draw_watch(written: WrittenWatch, watch: TouchWatch):
     return figure
 
 
-def _ends(seconds: np.ndarray) -> tuple[float, float]:
+def _first_and_last(seconds: np.ndarray) -> tuple[float, float]:
+    """Times of the first and the last frame, seconds."""
     return float(seconds[0]), max(float(seconds[-1]), float(seconds[0]) + 1e-3)
 
 
-def _event(one: NamedTouch) -> list[object]:
-    course = one.touch.course
+def _event_row(touch: NamedTouch) -> list[object]:
+    """Row of `events.csv` for a touch."""
+    course = touch.touch.course
     at = int(course.peak.argmax())
     place = course.centroid[np.isfinite(course.centroid).all(axis=1)]
     length = float(np.linalg.norm(np.diff(place, axis=0), axis=1).sum())
     return [
-        one.number,
-        f"{one.touch.onset:.4f}",
-        f"{one.touch.offset:.4f}",
-        "" if one.unlike else one.gesture,
-        f"{one.probability:.4f}",
-        int(one.unlike),
+        touch.number,
+        f"{touch.touch.onset:.4f}",
+        f"{touch.touch.offset:.4f}",
+        "" if touch.unlike else touch.gesture,
+        f"{touch.probability:.4f}",
+        int(touch.unlike),
         *(f"{value:.5f}" for value in course.centroid[at]),
         f"{length:.5f}",
         f"{np.linalg.norm(place[-1] - place[0]):.5f}",
         f"{course.peak[at]:.6g}",
         f"{course.area[at]:.6g}",
-        int(one.touch.begun_before),
-        int(one.touch.cut_off),
-        int(one.held),
-        one.touch.lost,
-        f"{one.touch.longest_gap:.4f}",
-        f"{one.named:.4f}",
-        f"{1e3 * one.latency:.3f}",
+        int(touch.touch.begun_before),
+        int(touch.touch.cut_off),
+        int(touch.held),
+        touch.touch.lost,
+        f"{touch.touch.longest_gap:.4f}",
+        f"{touch.named:.4f}",
+        f"{1e3 * touch.latency:.3f}",
     ]
 
 
-def _path(one: NamedTouch) -> list[list[object]]:
-    course = one.touch.course
+def _path_rows(touch: NamedTouch) -> list[list[object]]:
+    """Rows of `paths.csv` for a touch, one for each of its frames."""
+    course = touch.touch.course
     return [
-        [one.number, f"{second:.4f}", *(f"{value:.5f}" if np.isfinite(value) else "" for value in place), f"{peak:.6g}"]
+        [
+            touch.number,
+            f"{second:.4f}",
+            *(f"{value:.5f}" if np.isfinite(value) else "" for value in place),
+            f"{peak:.6g}",
+        ]
         for second, place, peak in zip(course.seconds, course.centroid, course.peak, strict=True)
     ]

@@ -2,7 +2,7 @@ from .contact.half_space import HalfSpace
 from .contact.indent_sets import IndentSet
 from .contact.indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
 from .contact.indents import Indent, IndentDraws, PressDraws, depth_maps, indented_cells, relative_changes
-from .contact.joined import Joined, Placed, TwoSheets
+from .contact.joined import JoinedIndenters, PlacedIndenter, TwoSheets
 from .contact.materials import Foundation, Material, material
 from .contact.press import MovingPress, Press
 from .contact.press_sets import PressSet, open_presses, simulate_presses
@@ -20,11 +20,11 @@ __all__ = [
     "Indent",
     "IndentDraws",
     "IndentSet",
-    "Joined",
+    "JoinedIndenters",
     "Material",
     "MovingPress",
     "Person",
-    "Placed",
+    "PlacedIndenter",
     "Press",
     "PressDraws",
     "PressSet",

@@ -1,5 +1,5 @@
 from .batches import ArrayRows, MappedRows, Rows
-from .fitting import Objective, Plan, Trained, fit
+from .fitting import Objective, Plan, TrainingResult, fit
 from .model_file import check_same, read_head, read_model, write_model
 
 __all__ = [
@@ -8,7 +8,7 @@ __all__ = [
     "Objective",
     "Plan",
     "Rows",
-    "Trained",
+    "TrainingResult",
     "check_same",
     "fit",
     "read_head",

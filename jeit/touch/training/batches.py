@@ -30,10 +30,10 @@ class Rows(Protocol):
         """Fingerprint of the content of all rows, the same in every process."""
         ...
 
-    def chunk(self, number: int) -> Any:
+    def chunk(self, index: int) -> Any:
         """Return the arrays (rows, …) of a chunk, in tuples, dictionaries or modules.
 
-        Chunks may differ only in their number of rows.
+        All chunks have the same arrays; only their number of rows may differ.
         """
         ...
 
@@ -65,7 +65,7 @@ class ArrayRows:
             digest.update(values.data)
         return digest.hexdigest()
 
-    def chunk(self, number: int) -> Any:
+    def chunk(self, index: int) -> Any:
         """Return all rows."""
         return self.arrays
 
@@ -89,12 +89,12 @@ class MappedRows:
         """Fingerprint of the other rows, followed by the name."""
         return f"{self.rows.fingerprint}, {self.name}"
 
-    def chunk(self, number: int) -> Any:
+    def chunk(self, index: int) -> Any:
         """Apply the function to a chunk of the other rows."""
-        return self.function(self.rows.chunk(number))
+        return self.function(self.rows.chunk(index))
 
 
-class Leg(NamedTuple):
+class ChunkBatches(NamedTuple):
     """Consecutive batches of one chunk.
 
     `chunk`: index of the chunk; `rows` (b, batch): indices of the rows of each batch; `first`: index of the first of
@@ -106,11 +106,12 @@ class Leg(NamedTuple):
     first: int
 
 
-class Order:
+class BatchOrder:
     """The order of rows in batches.
 
-    In every epoch, the chunks and the rows within each are shuffled anew; rows that do not fill a batch are left out,
-    others each time. The order depends only on `seed`, so that the index of a batch determines its rows.
+    In every epoch, the chunks, and the rows within each chunk, are shuffled anew. The remaining rows that do not fill a
+    batch are left out; they are others in each epoch. `sizes`: number of rows of each chunk; `batch`: number of rows in
+    a batch. The order depends only on `seed`, so that the index of a batch determines its rows.
     """
 
     def __init__(self, sizes: tuple[int, ...], batch: int, seed: list[int]):
@@ -119,26 +120,28 @@ class Order:
         self.sizes = sizes
 
     @property
-    def an_epoch(self) -> int:
+    def batches_per_epoch(self) -> int:
         """Number of batches in an epoch."""
         return sum(self.batches)
 
-    def legs(self, first: int, last: int, most: int) -> Iterator[Leg]:
-        """Yield the batches from `first` to `last`, exclusive, in legs within one chunk.
+    def chunk_batches(self, first: int, last: int, max_batches: int) -> Iterator[ChunkBatches]:
+        """Yield the batches from `first` to `last`, exclusive, grouped by chunk.
 
-        `most`: maximum number of batches in a leg.
+        `max_batches`: maximum number of batches in a group.
         """
         while first < last:
-            epoch, place = divmod(first, self.an_epoch)
-            chunks = self._shuffled(len(self.sizes), epoch)
+            epoch, place = divmod(first, self.batches_per_epoch)
+            chunks = self._permutation(len(self.sizes), epoch)
             ends = np.cumsum([self.batches[one] for one in chunks])
             which = int(np.searchsorted(ends, place, side="right"))
             chunk = int(chunks[which])
             within = place - (int(ends[which]) - self.batches[chunk])
-            number = min(most, last - first, int(ends[which]) - place)
-            rows = self._shuffled(self.sizes[chunk], epoch, 1 + chunk)[within * self.batch :][: number * self.batch]
-            yield Leg(chunk, rows.reshape(number, self.batch), first)
+            number = min(max_batches, last - first, int(ends[which]) - place)
+            rows = self._permutation(self.sizes[chunk], epoch, 1 + chunk)[within * self.batch :][: number * self.batch]
+            yield ChunkBatches(chunk, rows.reshape(number, self.batch), first)
             first += number
 
-    def _shuffled(self, number: int, *place: int) -> np.ndarray:
-        return np.random.default_rng([*self.seed, *place]).permutation(number)
+    def _permutation(self, count: int, *place: int) -> np.ndarray:
+        """Random permutation of 0 … `count` - 1, determined by the seed and by `place`: the epoch, or epoch and
+        chunk."""
+        return np.random.default_rng([*self.seed, *place]).permutation(count)

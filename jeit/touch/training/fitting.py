@@ -17,11 +17,11 @@ from jaxtyping import Array, Float, Int
 
 from jeit.arguments import check_key, check_kind, describe, is_number
 from jeit.arguments.extras import need_extra
-from jeit.touch.training.batches import ArrayRows, Order
+from jeit.touch.training.batches import ArrayRows, BatchOrder
 from jeit.touch.training.model_file import Checkpoint, Course, State
 
 # Number of batches after which a checkpoint may be written; maximum number of held-out rows evaluated at once.
-_LEG, _AT_ONCE = 32, 256
+_CHECKPOINT_BATCHES, _AT_ONCE = 32, 256
 
 
 class Objective(NamedTuple):
@@ -29,8 +29,8 @@ class Objective(NamedTuple):
 
     **Fields**: `loss(network, batch, key)`: returns the loss of a batch of rows, which is minimised, and the network,
     in which leaves that are not trained, such as running means, may have changed; `held_out(network, batch)`: returns
-    the loss (b,) of each held-out row; `trained`: which leaves are trained, a function of a leaf or a tree of booleans
-    like the network, as in `equinox.filter`.
+    the loss (b,) of each held-out row; `trained`: selects the leaves (arrays) of the network that are trained: a
+    function of a leaf that returns true or false, or a tree of booleans like the network, as in `equinox.filter`.
     """
 
     loss: Callable[[Any, Any, Array], tuple[Float[Array, ""], Any]]
@@ -73,7 +73,7 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainingResult:
     """Result of a training.
 
     `network`: the trained network, with the lowest loss on held-out rows; `course`: the training history; `reason`: why
@@ -95,7 +95,7 @@ def fit(
     key: Array,
     checkpoint: str | Path | None = None,
     progress: Callable[[str], None] | None = None,
-) -> Trained:
+) -> TrainingResult:
     """Train a `network`, any tree of arrays and functions, on rows.
 
     `training` and `validation`: arrays (n, …) in any tree, such as (inputs, targets); `training` may also be `Rows` of
@@ -111,10 +111,10 @@ def fit(
     plan = Plan() if plan is None else plan
     rows = training if _are_rows(training) else ArrayRows(training)
     held = ArrayRows(validation, "validation")
-    looked_at = jax.tree.map(jnp.asarray, held.arrays)
-    seed = [int(word) for word in np.asarray(jax.random.key_data(key) if _is_new(key) else key).ravel()]
-    order = Order(rows.sizes, plan.batch, seed)
-    run = _Run(network, objective, plan, order, jax.random.wrap_key_data(jnp.asarray(seed, jnp.uint32)))
+    held_out_arrays = jax.tree.map(jnp.asarray, held.arrays)
+    seed = [int(word) for word in np.asarray(jax.random.key_data(key) if _is_typed_key(key) else key).ravel()]
+    order = BatchOrder(rows.sizes, plan.batch, seed)
+    run = _CompiledTraining(network, objective, plan, order, jax.random.wrap_key_data(jnp.asarray(seed, jnp.uint32)))
     fingerprint = {
         "plan": {**dataclasses.asdict(plan), "seconds": 0},
         "key": seed,
@@ -125,42 +125,42 @@ def fit(
         "validation": held.fingerprint,
     }
     kept = None if checkpoint is None else Checkpoint(checkpoint, fingerprint)
-    state = run.start() if kept is None else kept.read(run.start())
-    look_every = plan.look_every or order.an_epoch
-    last, saved, loaded = plan.epochs * order.an_epoch, time.monotonic(), (-1, None)
+    state = run.initial_state() if kept is None else kept.read(run.initial_state())
+    look_every = plan.look_every or order.batches_per_epoch
+    last, saved, loaded = plan.epochs * order.batches_per_epoch, time.monotonic(), (-1, None)
     while (reason := _end_reason(state, plan, last)) is None:
         upto = min(last, (state.step // look_every + 1) * look_every)
-        for leg in order.legs(state.step, upto, _LEG):
-            if loaded[0] != leg.chunk:
+        for batches in order.chunk_batches(state.step, upto, _CHECKPOINT_BATCHES):
+            if loaded[0] != batches.chunk:
                 loaded = -1, None  # so that two chunks are never in memory
-                loaded = leg.chunk, jax.tree.map(jnp.asarray, rows.chunk(leg.chunk))
-            state = run.leg(state, loaded[1], leg.rows)
+                loaded = batches.chunk, jax.tree.map(jnp.asarray, rows.chunk(batches.chunk))
+            state = run.train_batches(state, loaded[1], batches.rows)
             if state.step < upto and kept is not None and time.monotonic() - saved >= plan.seconds:
                 kept.write(state)
                 saved = time.monotonic()
-        state = run.look(state, looked_at, upto - (upto - 1) // look_every * look_every)
+        state = run.evaluate(state, held_out_arrays, upto - (upto - 1) // look_every * look_every)
         if progress is not None:
-            progress(_describe_progress(state, plan, order.an_epoch))
+            progress(_describe_progress(state, plan, order.batches_per_epoch))
         if kept is not None and (time.monotonic() - saved >= plan.seconds or _end_reason(state, plan, last)):
             kept.write(state)
             saved = time.monotonic()
-    return Trained(run.whole(state.best), state.course, reason)
+    return TrainingResult(run.combine(state.best), state.course, reason)
 
 
-class _Run:
-    """The compiled functions of a training, and the methods that advance its state by them."""
+class _CompiledTraining:
+    """Compiled functions of one training, and methods that apply them to the state of the training."""
 
-    def __init__(self, network, objective: Objective, plan: Plan, order: Order, key: Array):
+    def __init__(self, network, objective: Objective, plan: Plan, order: BatchOrder, key: Array):
         import optax
 
-        steps = plan.decay_epochs * order.an_epoch
+        steps = plan.decay_epochs * order.batches_per_epoch
         rate = plan.rate if plan.decay == 1 else optax.exponential_decay(plan.rate, steps, plan.decay, staircase=True)
         adam = optax.adam(rate)
         self.arrays, self.fixed = eqx.partition(network, eqx.is_array)
-        whole, trained = self.whole, objective.trained
+        combine, trained = self.combine, objective.trained
 
-        def moved(arrays, state, batch, key):
-            moving, still = eqx.partition(whole(arrays), trained)
+        def update(arrays, state, batch, key):
+            moving, still = eqx.partition(combine(arrays), trained)
 
             def loss(moving):
                 value, after = objective.loss(eqx.combine(moving, still), batch, key)
@@ -172,33 +172,33 @@ class _Run:
             return eqx.combine(eqx.filter(moving, eqx.is_array), still_after), state, value
 
         # Each step is one call: on CPUs, XLA's convolutions take a hundred times as long within compiled loops.
-        def step(arrays, state, total, data, rows, number):
+        def train_batch(arrays, state, total, data, rows, number):
             batch = jax.tree.map(lambda one: one[rows], data)
-            arrays, state, value = moved(arrays, state, batch, jax.random.fold_in(key, number))
+            arrays, state, value = update(arrays, state, batch, jax.random.fold_in(key, number))
             return arrays, state, total + value.astype(total.dtype)
 
-        def look(arrays, data, rows):
-            return objective.held_out(whole(arrays), jax.tree.map(lambda one: one[rows], data))
+        def held_out_loss(arrays, data, rows):
+            return objective.held_out(combine(arrays), jax.tree.map(lambda one: one[rows], data))
 
-        self._step, self._look = jax.jit(step), jax.jit(look)
+        self._train_batch, self._held_out_loss = jax.jit(train_batch), jax.jit(held_out_loss)
         self.optimiser = adam.init(eqx.filter(eqx.partition(network, trained)[0], eqx.is_inexact_array))
 
-    def whole(self, arrays) -> Any:
+    def combine(self, arrays) -> Any:
         """Combine the network's fixed parts with these arrays."""
         return eqx.combine(arrays, self.fixed)
 
-    def start(self) -> State:
+    def initial_state(self) -> State:
         """Return the state before the first batch."""
         return State(0, Course([], [], []), self.arrays, self.optimiser, self.arrays, jnp.zeros(()))
 
-    def leg(self, state: State, data, rows: Int[np.ndarray, "b batch"]) -> State:
+    def train_batches(self, state: State, data, rows: Int[np.ndarray, "b batch"]) -> State:
         """Train on batches of these rows; returns the new state."""
         arrays, optimiser, total = state.moving, state.optimiser, state.total
         for place, batch in enumerate(rows):
-            arrays, optimiser, total = self._step(arrays, optimiser, total, data, batch, state.step + place)
+            arrays, optimiser, total = self._train_batch(arrays, optimiser, total, data, batch, state.step + place)
         return State(state.step + len(rows), state.course, arrays, optimiser, state.best, total)
 
-    def look(self, state: State, data, since: int) -> State:
+    def evaluate(self, state: State, data, since: int) -> State:
         """Evaluate the held-out rows, `since` batches after the last evaluation; returns the new state.
 
         Raises `ValueError` if neither this loss nor any before was finite.
@@ -206,7 +206,7 @@ class _Run:
         number = len(jax.tree.leaves(data)[0])
         size = min(number, _AT_ONCE)
         index = np.minimum(np.arange(-(-number // size) * size), number - 1).reshape(-1, size)
-        each = [np.asarray(self._look(state.moving, data, rows)) for rows in index]
+        each = [np.asarray(self._held_out_loss(state.moving, data, rows)) for rows in index]
         held = float(np.concatenate(each)[:number].mean())
         own = state.course
         course = Course([*own.steps, state.step], [*own.training, float(state.total) / since], [*own.validation, held])
@@ -221,25 +221,27 @@ class _Run:
         return State(state.step, course, state.moving, state.optimiser, best, jnp.zeros(()))
 
 
-def _end_reason(state: State, plan: Plan, last: int) -> str | None:
+def _end_reason(state: State, plan: Plan, last_batch: int) -> str | None:
     """Return the reason why the training has ended, or None if it has not."""
     looks = len(state.course.validation)
     if looks and looks - 1 - state.course.best >= plan.patience:
         return f"no better at {plan.patience} looks in a row"
-    return f"{plan.epochs} epochs done" if state.step >= last else None
+    return f"{plan.epochs} epochs done" if state.step >= last_batch else None
 
 
-def _describe_progress(state: State, plan: Plan, an_epoch: int) -> str:
+def _describe_progress(state: State, plan: Plan, batches_per_epoch: int) -> str:
     own = state.course
     return (
-        f"epoch {state.step / an_epoch:.3g} of {plan.epochs}: {own.training[-1]:.4g}, held out "
+        f"epoch {state.step / batches_per_epoch:.3g} of {plan.epochs}: {own.training[-1]:.4g}, held out "
         f"{own.validation[-1]:.4g} (best {own.validation[own.best]:.4g})"
     )
 
 
-def _are_rows(given: Any) -> bool:
-    return all(hasattr(given, name) for name in ("sizes", "fingerprint", "chunk"))
+def _are_rows(value: Any) -> bool:
+    """Whether an argument has the interface of `Rows`."""
+    return all(hasattr(value, name) for name in ("sizes", "fingerprint", "chunk"))
 
 
-def _is_new(key: Array) -> bool:
+def _is_typed_key(key: Array) -> bool:
+    """Whether a random key is of `jax.random.key`, not of the older `jax.random.PRNGKey`."""
     return jnp.issubdtype(key.dtype, jax.dtypes.prng_key)

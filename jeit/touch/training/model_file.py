@@ -35,8 +35,8 @@ def write_model(path: str | Path, kind: str, version: int, head: dict[str, Any],
     if len(text) > _LONGEST_HEAD:
         raise ValueError(f"head has {len(text)} bytes as JSON, more than {_LONGEST_HEAD}; put arrays into the model.")
     arrays = [leaf for leaf in jax.tree.leaves(model) if eqx.is_array(leaf)]
-    if _size(arrays) > _LARGEST:
-        raise ValueError(f"model has {_size(arrays)} bytes of arrays, and a file {_LARGEST} at most.")
+    if _num_bytes(arrays) > _LARGEST:
+        raise ValueError(f"model has {_num_bytes(arrays)} bytes of arrays, and a file {_LARGEST} at most.")
     with written_whole(path) as file:
         file.write(_MAGIC + text + b"\n")
         for array in arrays:
@@ -50,7 +50,7 @@ def read_head(path: str | Path, kind: str, version: int) -> dict[str, Any]:
     write.
     """
     with _open_file(Path(path), kind) as file:
-        return _head(file, kind, version)
+        return _read_header(file, kind, version)
 
 
 def read_model(
@@ -64,20 +64,22 @@ def read_model(
     or too long, or with arrays of another architecture.
     """
     with _open_file(Path(path), kind) as file:
-        head = _head(file, kind, version)
+        head = _read_header(file, kind, version)
         try:
             like = eqx.filter_eval_shape(make, head)
         except (KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
             raise ValueError(
-                f"its head does not say what it is made of ({type(error).__name__}: {reason(error)})"
+                f"its header does not describe such a model ({type(error).__name__}: {reason(error)})"
             ) from None
         arrays = [leaf for leaf in jax.tree.leaves(like) if isinstance(leaf, jax.ShapeDtypeStruct)]
         left = os.fstat(file.fileno()).st_size - file.tell()
-        if not _size(arrays) <= min(left, _LARGEST):
-            raise ValueError(f"it has {left} bytes of arrays, fewer than the {_size(arrays)} of what its head says")
+        if not _num_bytes(arrays) <= min(left, _LARGEST):
+            raise ValueError(
+                f"it has {left} bytes of arrays, fewer than the {_num_bytes(arrays)} that its header describes"
+            )
         model = jax.tree.map(lambda leaf: _read_array(file, leaf), like)
         if file.read(1):
-            raise ValueError("it goes on after its last array")
+            raise ValueError("it has more bytes after its last array")
     return head, model
 
 
@@ -109,16 +111,16 @@ def _open_file(path: Path, kind: str) -> Iterator[BinaryIO]:
         raise ValueError(f"'{path}' is not {kind} that can be read: {reason(error)}.") from None
 
 
-def _head(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
+def _read_header(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
     if file.read(len(_MAGIC)) != _MAGIC:
         raise ValueError("it is a file of another kind")
     line = file.readline(_LONGEST_HEAD + 1)
     if not line.endswith(b"\n"):
-        raise ValueError("its head is cut short, or too long")
+        raise ValueError("its header is truncated, or too long")
     try:
         head = json.loads(line)
     except (ValueError, RecursionError):
-        raise ValueError("its head is no JSON") from None
+        raise ValueError("its header is not JSON") from None
     if not isinstance(head, dict) or head.get("kind") != kind:
         other = head.get("kind") if isinstance(head, dict) else head
         raise ValueError(f"it is {describe(other)}")
@@ -127,7 +129,7 @@ def _head(file: BinaryIO, kind: str, version: int) -> dict[str, Any]:
     return head
 
 
-def _size(arrays) -> int:
+def _num_bytes(arrays) -> int:
     return sum(math.prod(one.shape) * np.dtype(one.dtype).itemsize for one in arrays)
 
 
@@ -137,25 +139,27 @@ def _read_array(file: BinaryIO, leaf: Any) -> Any:
         return leaf
     version = np.lib.format.read_magic(file)
     if version != (1, 0):
-        raise ValueError(f"an array of it is in format {version}")
+        raise ValueError(f"one of its arrays is in format {version}")
     shape, columns_first, dtype = np.lib.format.read_array_header_1_0(file)
     if (shape, dtype, columns_first) != (leaf.shape, leaf.dtype, columns_first and len(leaf.shape) > 1):
-        raise ValueError(f"an array of it is {dtype} of shape {shape}, and its head says {leaf.dtype} of {leaf.shape}")
-    data = file.read(_size([leaf]))
-    if len(data) != _size([leaf]):
-        raise ValueError("it is cut short")
+        raise ValueError(
+            f"one of its arrays is {dtype} of shape {shape}, and its header says {leaf.dtype} of {leaf.shape}"
+        )
+    data = file.read(_num_bytes([leaf]))
+    if len(data) != _num_bytes([leaf]):
+        raise ValueError("it is truncated")
     values = np.frombuffer(data, dtype).reshape(shape, order="F" if columns_first else "C")
     if np.isnan(values).any():
-        raise ValueError("numbers of it are NaN")
+        raise ValueError("some of its numbers are NaN")
     return jax.numpy.asarray(values)
 
 
-def _are_equal(one: Any, other: Any) -> bool:
-    if isinstance(one, list | tuple) and isinstance(other, list | tuple):
-        return len(one) == len(other) and all(map(_are_equal, one, other))
-    if isinstance(one, int | float) and isinstance(other, int | float):
-        return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-12)
-    return one == other
+def _are_equal(first: Any, second: Any) -> bool:
+    if isinstance(first, list | tuple) and isinstance(second, list | tuple):
+        return len(first) == len(second) and all(map(_are_equal, first, second))
+    if isinstance(first, int | float) and isinstance(second, int | float):
+        return math.isclose(first, second, rel_tol=1e-6, abs_tol=1e-12)
+    return first == second
 
 
 def _shorten(value: Any) -> str:
@@ -186,9 +190,9 @@ class Course(NamedTuple):
 class State(NamedTuple):
     """The whole state of a training.
 
-    `step`: number of batches processed; `course`: the training history; `moving`: arrays of the network, trained and
-    others; `optimiser`: state of the optimiser; `best`: arrays of the best network so far; `total`: sum of the losses
-    since the last evaluation.
+    `step`: number of batches processed; `course`: the training history; `moving`: current arrays of the network,
+    trained or not; `optimiser`: state of the optimiser; `best`: arrays of the best network so far; `total`: sum of the
+    losses since the last evaluation.
     """
 
     step: int
@@ -210,13 +214,13 @@ class Checkpoint:
         head = {"training": self.fingerprint, "step": state.step, "course": list(state.course)}
         write_model(self.path, _KIND, _VERSION, head, state[2:])
 
-    def read(self, like: State) -> State:
-        """Read the state; if there is no file, return `like`, the state before the first batch.
+    def read(self, initial_state: State) -> State:
+        """Read the state; if there is no file, return `initial_state`, the state before the first batch.
 
         Raises `ValueError`, which states the first difference, for a file of another training.
         """
         if not self.path.exists():
-            return like
+            return initial_state
 
         def make(head: dict[str, Any]) -> Any:
             for name, value in json.loads(json.dumps(self.fingerprint)).items():
@@ -225,7 +229,7 @@ class Checkpoint:
                         f"it is of another training ({name} was {head['training'].get(name)}, and is {value} now); "
                         "delete it, or give another file"
                     )
-            return jax.tree.map(lambda leaf: leaf, like[2:])
+            return jax.tree.map(lambda leaf: leaf, initial_state[2:])
 
         head, arrays = read_model(self.path, _KIND, _VERSION, make)
         return State(head["step"], Course(*head["course"]), *arrays)

@@ -68,10 +68,10 @@ BAD = {
     "other lengths": (lambda: weber_ratio([1.0] * 9, [1.0] * 8), "as many"),
     "text": (lambda: weber_ratio("a", "b"), "load"),
     "places": (lambda: point_localisation(np.ones((3, 2)), np.ones((2, 2))), "shapes"),
-    "nothing found": (lambda: point_localisation(np.ones((3, 2)), np.full((3, 2), np.nan)), "nothing was found"),
+    "nothing found": (lambda: point_localisation(np.ones((3, 2)), np.full((3, 2), np.nan)), "no touch was found"),
     "numbers told": (lambda: least_detected([1.0, 2.0], [0, 2]), "true or false"),
     "one area": (lambda: contact_area(np.ones(4), np.ones(4)), "two different areas"),
-    "times": (lambda: response_times([0.0, 0.0, 1.0], np.ones(3)), "must rise"),
+    "times": (lambda: response_times([0.0, 0.0, 1.0], np.ones(3)), "must increase"),
     "nothing touches": (lambda: response_times([0.0, 1.0, 2.0], np.zeros(3)), "nowhere positive"),
 }
 

@@ -239,7 +239,7 @@ def test_an_image_of_nothing_has_no_contact():
 
 
 def test_noise_of_another_mesh(skin):
-    with pytest.raises(ValueError, match="both of one mesh"):
+    with pytest.raises(ValueError, match="both on the same mesh"):
         find_contacts(CellFinder(MESH), bump(0, 0), skin.noise)
     with pytest.raises(ValueError, match="noise must be ImageNoise"):
         find_contacts(CellFinder(MESH), bump(0, 0), 1e-3)

@@ -9,7 +9,7 @@ from made_touches import KINDS, touch, touches
 from jeit.touch.gestures import GestureModel, touch_features
 from jeit.touch.gestures.gesture_classifiers import (
     GESTURE_CLASSIFIERS,
-    forms_of,
+    feature_forms,
     held_out_odds,
     logit_boost,
     person_folds,
@@ -54,7 +54,7 @@ def test_the_best_on_people_held_out_is_taken():
     model = GestureModel.fit(made, labels, people=people)
     assert model.standing is not None
     errors = [error for _, error in model.standing.tried]
-    assert len(errors) == sum(len(forms_of(one)) for one in GESTURE_CLASSIFIERS)
+    assert len(errors) == sum(len(feature_forms(one)) for one in GESTURE_CLASSIFIERS)
     assert errors == sorted(errors)
     assert model.standing.method == f"{model.method} on {model.form}" == model.standing.tried[0][0]
     assert np.mean(model.standing.held_out != model.standing.right) == errors[0]
@@ -74,7 +74,7 @@ def test_a_class_that_somebody_never_made():
     kept = (labels != "slap") | (people == 0)
     some = [one for one, there in zip(made, kept, strict=True) if there]
     for method in GESTURE_CLASSIFIERS:
-        model = GestureModel.fit(some, labels[kept], people=people[kept], method=method, form=forms_of(method)[0])
+        model = GestureModel.fit(some, labels[kept], people=people[kept], method=method, form=feature_forms(method)[0])
         assert "slap" in model.names
         assert not (model.standing.held_out[people[kept] == 0] == "slap").any()
 
@@ -150,7 +150,7 @@ def test_other_files_are_refused(model, tmp_path):
         ({"labels": ["tap"] * 16}, "two gestures, or more"),
         ({"labels": ["tap"] * 15 + ["pat"]}, "only one touch of 'pat'"),
         ({"people": [1, 2]}, "people must be 16"),
-        ({"people": [0] * 8 + [1] * 8, "labels": ["tap"] * 8 + ["pat"] * 8}, "one gesture only"),
+        ({"people": [0] * 8 + [1] * 8, "labels": ["tap"] * 8 + ["pat"] * 8}, "only one gesture"),
         ({"method": "logitboost"}, "did you mean 'logit-boost'"),
         ({"form": "eight"}, "form must be one of"),
         ({"touches": "tap"}, "touches must be a list"),
@@ -167,13 +167,15 @@ def test_how_sure_a_support_vector_machine_is_differs():
     """Votes of pairs are the same for nearly all touches; distances from borders are not, and err less."""
     from sklearn.svm import SVC
 
-    from jeit.touch.learnt.array_models import Machine
+    from jeit.touch.learnt.array_models import SupportVectorMachine
     from jeit.touch.learnt.methods import log_odds
 
     rng = np.random.default_rng(0)
     right = rng.integers(0, 4, 600)
     values = 1.5 * np.eye(4)[right] + rng.normal(size=(600, 4))
-    machine = Machine.of(SVC(kernel="poly", degree=2, coef0=1.0).fit(values[:300], right[:300]))
+    machine = SupportVectorMachine.from_scikit_learn(
+        SVC(kernel="poly", degree=2, coef0=1.0).fit(values[:300], right[:300])
+    )
     odds = log_odds(machine, values[300:])
     said = np.exp(odds - np.logaddexp.reduce(odds, axis=1, keepdims=True))
     sure = said.max(axis=1)

@@ -13,7 +13,7 @@ from jeit.touch.gestures.features import (
     course_features,
     sequence_features,
 )
-from jeit.touch.gestures.gesture_classifiers import forms_of
+from jeit.touch.gestures.gesture_classifiers import feature_forms
 from jeit.touch.learnt import temporal_network
 from jeit.touch.learnt.temporal_network import TemporalNetwork
 
@@ -112,7 +112,7 @@ def test_gestures_of_people_are_told():
 
 def test_forms():
     made, labels, _ = touches(people=2)
-    assert forms_of("temporal-network") == ("sequence",)
+    assert feature_forms("temporal-network") == ("sequence",)
     with pytest.raises(ValueError, match="form: 'temporal-network' takes sequence; 'seven' was asked for"):
         GestureModel.fit(made, labels, method="temporal-network", form="seven")
     with pytest.raises(ValueError, match="takes seven or course; 'sequence'"):

@@ -84,7 +84,7 @@ def test_the_update_is_the_exact_solve(model, kind, tensor):
         return some if across is None else some[:, None, None] * across
 
     exact = np.asarray(model.transfer_impedance(whole(change)))
-    impedance, (slope,) = local.slopes(given(change), [given(way)])
+    impedance, (slope,) = local.derivatives(given(change), [given(way)])
     np.testing.assert_allclose(impedance, exact, atol=1e-9 * np.abs(exact).max())
     np.testing.assert_allclose(local.impedance(given(change)), impedance)
     step = 1e-5
@@ -111,7 +111,7 @@ def line_of_a_cut(depth):
     noise = np.full(len(rest), 2e-3 * np.sqrt(np.mean(change**2)))
     change += noise * np.random.default_rng(1).normal(size=len(rest)) + 1e-5 * rest
     fit = LossFit(coarse, np.full(coarse.mesh.num_cells, SHEET), change, np.arange(208), noise, np.array([0.01, 0.01]))
-    return cut, fit.line([np.array([0.01, 0.01])]), fit.spot(np.array([0.01, 0.01]))
+    return cut, fit.fit_line([np.array([0.01, 0.01])]), fit.fit_spot(np.array([0.01, 0.01]))
 
 
 @pytest.mark.slow

@@ -234,10 +234,10 @@ def test_frames_that_lack_something(health):
     ("ask", "said"),
     [
         (lambda _: SkinHealth.fit(recording(0)[:10]), "too few"),
-        (lambda _: SkinHealth.fit(np.zeros((100, 4))), "no channel"),
-        (lambda _: SkinHealth.fit(np.full((100, 4), np.nan)), "no channel"),
+        (lambda _: SkinHealth.fit(np.zeros((100, 4))), "every channel"),
+        (lambda _: SkinHealth.fit(np.full((100, 4), np.nan)), "every channel"),
         (lambda _: SkinHealth.fit(np.zeros(100)), "healthy must be"),
-        (lambda _: SkinHealth.fit(recording(0), np.zeros(600)), "times must rise"),
+        (lambda _: SkinHealth.fit(recording(0), np.zeros(600)), "times must increase"),
         (lambda _: SkinHealth.fit(recording(0), np.arange(9.0)), "times"),
         (lambda _: SkinHealth.fit(recording(0), patience=-1.0), "patience"),
         (lambda _: SkinHealth.fit(recording(0), protocol=two_terminal(5)), "protocol"),

@@ -70,7 +70,7 @@ BAD = {
     "two frames": (lambda s: SelfOrganisingMap.fit(FRAMES[:2], KEY), "2 frames"),
     "cube": (lambda s: SelfOrganisingMap.fit(np.ones((3, 3, 3)), KEY), "shape"),
     "a seed": (lambda s: SelfOrganisingMap.fit(FRAMES, 0), "key"),
-    "one neuron": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, shape=(1, 1)), "no map"),
+    "one neuron": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, shape=(1, 1)), "two neurons or more"),
     "one number": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, shape=16), "rows and columns"),
     "no schedule": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, schedule=100), "schedule"),
     "no scale": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, schedule=Schedule(10, 0), scale=0.0), "scale"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.touch.learnt.channels import _DIAGONALS, Channels, _missed, _variances, choose_channels
+from jeit.touch.learnt.channels import _DIAGONALS, Channels, _leave_one_out_errors, _variances, choose_channels
 
 
 def changes(number, seed, *, noise=0.01):
@@ -83,7 +83,7 @@ def test_what_is_missed_is_what_the_other_channels_leave():
         rest = np.arange(6) != one
         told = other[:, rest] @ np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[rest, one])
         left.append(other[:, one] - told)
-    missed, unpredicted = _missed(other, variance, directions)[:, 8]
+    missed, unpredicted = _leave_one_out_errors(other, variance, directions)[:, 8]
     np.testing.assert_allclose(missed, np.mean(np.square(left), axis=1), rtol=1e-9)
     # The second, over the share of a channel's diagonal in what foretells it, is the first.
     np.testing.assert_allclose(

@@ -10,7 +10,7 @@ FRAMES = RNG.normal(size=(60, 4))
 
 
 def test_they_are_stretches_of_time():
-    folds, notes = time_folds(FRAMES, alike=RNG.normal(size=(60, 2)))
+    folds, notes = time_folds(FRAMES, positions=RNG.normal(size=(60, 2)))
     np.testing.assert_array_equal(folds, np.repeat(np.arange(5), 12))
     assert notes == ()
     time = RNG.permutation(60).astype(float)
@@ -36,10 +36,10 @@ def test_copies_are_not_split():
 def test_places_pressed_one_after_the_other_are_in_all_folds():
     """A raster pressed line by line: held out by stretches, whole parts of the skin would be."""
     places = np.stack(np.meshgrid(np.arange(20.0), np.arange(15.0), indexing="ij"), axis=-1).reshape(-1, 2)
-    folds, notes = time_folds(RNG.normal(size=(300, 4)), alike=places)
+    folds, notes = time_folds(RNG.normal(size=(300, 4)), positions=places)
     apart = [KDTree(places[folds != one]).query(places[folds == one])[0].mean() for one in range(5)]
     assert max(apart) < 1.6  # where stretches of four lines would be 2.5 lines away on average
-    assert "short stretches" in notes[0]
+    assert "short intervals" in notes[0]
 
 
 def test_kinds_pressed_one_after_the_other_are_in_all_folds():
@@ -59,7 +59,7 @@ def test_places_repeated_in_any_order_are_not_said_to_be_in_turn():
     """Of a place held out no press is left, in whatever order they were pressed."""
     places = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), axis=-1).reshape(-1, 2)
     places = places[np.random.default_rng(2).integers(0, 25, 300)]
-    folds, notes = time_folds(RNG.normal(size=(300, 4)), alike=places)
+    folds, notes = time_folds(RNG.normal(size=(300, 4)), positions=places)
     assert all(len({*folds[(places == one).all(axis=1)]}) == 1 for one in np.unique(places, axis=0))
     assert len(notes) == 1
     assert "25 places were repeated" in notes[0]

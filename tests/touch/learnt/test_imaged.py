@@ -5,7 +5,7 @@ import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, ring
 from jeit.touch import LearntSkin, Presses, read_skin, write_skin
-from jeit.touch.learnt.imaged import Contacts, Imaged, Images
+from jeit.touch.learnt.imaged import ContactFeatures, ImageFeatures, ImageReconstruction
 
 RADIUS = 0.05
 ELECTRODES = BoundaryElectrodes(ring(RADIUS, 12), width=0.008, contact_impedance=0.01)
@@ -61,15 +61,15 @@ def test_the_contact_is_the_touch_whatever_its_sign_and_the_unit(sign, unit):
     """Millivolts, counts of a converter, voltages told with the other sign."""
     pressed = record(24, 0, sign=sign)
     changes = unit * (pressed["frames"] - pressed["reference"])
-    imaged, _ = Imaged.create(MODEL, changes, np.ones(len(changes.T), bool), unit * pressed["reference"])
-    place = Contacts(imaged)(changes)[:, :2]
+    imaged, _ = ImageReconstruction.create(MODEL, changes, np.ones(len(changes.T), bool), unit * pressed["reference"])
+    place = ContactFeatures(imaged)(changes)[:, :2]
     assert np.linalg.norm(place - pressed["positions"], axis=1).mean() < 3e-3
 
 
 def test_contacts_of_an_image_in_hand():
     """Of a square of 3 × 3 cells, the middle one the peak, its right neighbour above the level."""
     grid = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), axis=-1).reshape(-1, 2)
-    imaged = Imaged(np.eye(9), grid, np.full(9, 2.0), np.tile(np.arange(9), (9, 1)))
+    imaged = ImageReconstruction(np.eye(9), grid, np.full(9, 2.0), np.tile(np.arange(9), (9, 1)))
     image = np.zeros((1, 9))
     image[0, 4], image[0, 5], image[0, 0] = 1.0, 0.85, -3.0
     (found,) = imaged.contacts(image)
@@ -80,7 +80,7 @@ def test_contacts_of_an_image_in_hand():
 
 def test_what_is_far_from_the_peak_is_another_contact():
     changes = LEARNT["frames"] - LEARNT["reference"]
-    imaged, _ = Imaged.create(MODEL, changes, np.ones(108, bool), LEARNT["reference"])
+    imaged, _ = ImageReconstruction.create(MODEL, changes, np.ones(108, bool), LEARNT["reference"])
     image = sum(
         height * np.exp(-((np.linalg.norm(imaged.centres - [place, 0], axis=1) / 0.006) ** 2))
         for height, place in ((1.0, -0.03), (0.95, 0.03))
@@ -89,9 +89,11 @@ def test_what_is_far_from_the_peak_is_another_contact():
 
 
 def test_images_are_relative_to_their_size():
-    imaged, _ = Imaged.create(MODEL, LEARNT["frames"] - LEARNT["reference"], np.ones(108, bool), LEARNT["reference"])
+    imaged, _ = ImageReconstruction.create(
+        MODEL, LEARNT["frames"] - LEARNT["reference"], np.ones(108, bool), LEARNT["reference"]
+    )
     changes = LEARNT["frames"] - LEARNT["reference"]
-    one, three = Images(imaged)(changes), Images(imaged)(3 * changes)
+    one, three = ImageFeatures(imaged)(changes), ImageFeatures(imaged)(3 * changes)
     np.testing.assert_allclose(three[:, 6:], one[:, 6:], rtol=1e-9)
     np.testing.assert_allclose(three[:, 5] - one[:, 5], np.log(3))
 

@@ -330,7 +330,10 @@ def test_frames_that_never_change_teach_nothing():
     [
         (lambda skin: skin.predict(FRESH["frames"][:, :30], FRESH["reference"][:, :30]), "frames have 30 channels"),
         (lambda skin: skin.predict(FRESH["frames"]), "reference is missing"),
-        (lambda skin: skin.predict(FRESH["frames"], FRESH["reference"][0, ::-1] ** 3), "unlike those that were learnt"),
+        (
+            lambda skin: skin.predict(FRESH["frames"], FRESH["reference"][0, ::-1] ** 3),
+            "unlike that of the training set",
+        ),
         (lambda skin: skin.predict(FRESH["frames"], 1e3 * FRESH["reference"]), "1e\\+03 times as large"),
         (lambda skin: skin.predict("frames"), "give real numbers"),
         (lambda skin: LearntSkin.fit(FRESH), "presses must be Presses"),

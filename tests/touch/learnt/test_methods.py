@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from jeit.touch.learnt.array_models import Nearest
+from jeit.touch.learnt.array_models import NearestNeighbours
 from jeit.touch.learnt.methods import (
     CLASSIFIERS,
     REGRESSORS,
     GaussianProcess,
-    _tuned,
+    _estimate_length_and_noise,
+    fit_sharpness,
     log_odds,
     probabilities,
-    sharpness_of,
 )
 
 RNG = np.random.default_rng(0)
@@ -99,7 +99,7 @@ def test_machines_are_scikit_learns(name, kernel, number):
 def test_the_nearest_are_scikit_learns():
     from sklearn.neighbors import KNeighborsRegressor
 
-    ours = Nearest.of_numbers(FEATURES, TARGETS)
+    ours = NearestNeighbours.fit_regressor(FEATURES, TARGETS)
     theirs = KNeighborsRegressor(ours.count, weights="distance").fit(FEATURES, TARGETS)
     np.testing.assert_allclose(ours.predict(ASKED), theirs.predict(ASKED), rtol=1e-9)
     np.testing.assert_allclose(ours.predict(FEATURES), TARGETS, atol=1e-6)
@@ -109,7 +109,7 @@ def test_the_gaussian_process_is_scikit_learns():
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import Matern
 
-    length, noise = _tuned(FEATURES, TARGETS)
+    length, noise = _estimate_length_and_noise(FEATURES, TARGETS)
     theirs = GaussianProcessRegressor(Matern(length, nu=1.5), alpha=noise, optimizer=None).fit(FEATURES, TARGETS)
     np.testing.assert_allclose(GaussianProcess.fit(FEATURES, TARGETS).predict(ASKED), theirs.predict(ASKED), atol=1e-7)
 
@@ -127,5 +127,5 @@ def test_the_likeliest_sharpness_is_found():
     odds = RNG.normal(size=(4000, 3))
     odds = np.log(probabilities(odds, 1.0))
     drawn = (probabilities(odds, 1.0).cumsum(axis=1) > RNG.random((4000, 1))).argmax(axis=1)
-    assert 0.8 < sharpness_of(odds, drawn) < 1.25
-    assert sharpness_of(odds, right) < 0.1
+    assert 0.8 < fit_sharpness(odds, drawn) < 1.25
+    assert fit_sharpness(odds, right) < 0.1

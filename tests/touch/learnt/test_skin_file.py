@@ -57,7 +57,7 @@ def test_models_of_every_kind_tell_the_same_places(quick, tmp_path, recorded):
     members = [(features, learn(values, targets)) for learn in (*MODELS, drawn_network, coarse_map)]
     assert {type(model).__name__ for _, model in members} == {
         "RidgeCV",
-        "Nearest",
+        "NearestNeighbours",
         "GaussianProcess",
         "Forest",
         "Network",

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jeit.touch import LearntSkin, Presses
-from jeit.touch.learnt.features import Whitened, are_repeated
+from jeit.touch.learnt.features import WhitenedChanges, are_repeated
 
 
 def record(number, seed):
@@ -20,16 +20,18 @@ def test_what_varies_between_repeated_frames_becomes_one():
     rng = np.random.default_rng(0)
     group, mixed = rng.integers(0, 36, 4000), rng.normal(size=(6, 6)) * [1, 2, 3, 1, 2, 3]
     changes = 5 * rng.normal(size=(36, 6))[group] + rng.normal(size=(4000, 6)) @ mixed
-    white = Whitened.learn(changes, group[:, None].astype(float))(changes)
+    white = WhitenedChanges.learn(changes, group[:, None].astype(float))(changes)
     left = white - np.stack([white[group == one].mean(axis=0) for one in range(36)])[group]
     np.testing.assert_allclose(left.T @ left / (4000 - 36), np.eye(6), atol=0.15)
-    few = Whitened.learn(changes[:40], group[:40, None].astype(float))  # fewer repeat others than there are channels
+    few = WhitenedChanges.learn(
+        changes[:40], group[:40, None].astype(float)
+    )  # fewer repeat others than there are channels
     assert np.isfinite(few.root).all()
 
 
 def test_frames_that_do_not_repeat_are_only_scaled():
     changes, _ = record(30, 0)
-    root = Whitened.learn(changes, np.arange(30.0)[:, None]).root
+    root = WhitenedChanges.learn(changes, np.arange(30.0)[:, None]).root
     np.testing.assert_allclose(root, np.diag(1 / changes.std(axis=0)))
     assert not are_repeated(np.arange(30.0)[:, None])
     assert are_repeated(np.repeat(np.arange(20.0), 2)[:, None])

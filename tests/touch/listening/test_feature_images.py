@@ -25,10 +25,10 @@ def test_at_10_khz_bands_are_the_papers_bins():
     assert set(images.strongest.tolist()) == {7}
     assert images.intensity.shape == (len(images), 25, 41)
     assert images.spectrum.shape == (len(images), 64, 41)
-    shown = Levels.of(images)(images)
+    shown = Levels.from_images(images)(images)
     assert shown.shape == (len(images), 89, 41)
     # The loudest microphone's row is the first, and the others follow.
-    loud = Levels.of(images)
+    loud = Levels.from_images(images)
     rows = 10 ** ((shown[:, :25] * loud.deviation[0] + loud.mean[0]) / 10)
     assert (np.diff(rows.mean(axis=2), axis=1) < 1e-4).all()
     np.testing.assert_allclose(np.sort(rows.mean(axis=2)), np.sort(images.intensity.mean(axis=2)), rtol=1e-3)
@@ -98,7 +98,7 @@ def test_nan_is_silence_and_told():
     assert images.known[0]
     assert not images.known[7]
     silent = sound_images(Recording(np.zeros((2, 8000)), 10_000.0))
-    shown = Levels.of(silent)(silent)
+    shown = Levels.from_images(silent)(silent)
     assert (shown == 0).all()
     assert np.isfinite(sound_features(silent)).all()
 

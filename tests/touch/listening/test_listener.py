@@ -11,8 +11,8 @@ from jeit.acoustic import Recording
 from jeit.touch.learnt.methods import CLASSIFIERS
 from jeit.touch.listening import LabelledClips, Listener
 from jeit.touch.listening.feature_images import LENGTH, SoundImages
-from jeit.touch.listening.learners import LEARNERS, Lesson, LinearLearner, stopping_rows
-from jeit.touch.listening.windows import _pieces, held_out_folds
+from jeit.touch.listening.learners import LEARNERS, LinearLearner, TrainingSet, stopping_rows
+from jeit.touch.listening.windows import _split_pieces, held_out_folds
 
 KEY = jax.random.key(0)
 QUICK = tuple(method for method in LEARNERS if "network" not in method)
@@ -21,7 +21,7 @@ QUICK = tuple(method for method in LEARNERS if "network" not in method)
 def clips(each: int, seed: int = 0, **options) -> LabelledClips:
     random = np.random.default_rng(seed)
     labels = [name for name in MATERIALS for _ in range(each)]
-    return LabelledClips.of([struck(random, name, **options) for name in labels], labels)
+    return LabelledClips.from_recordings([struck(random, name, **options) for name in labels], labels)
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def test_what_does_not_fit_is_refused_with_the_difference(learnt):
     np.testing.assert_allclose(both.probabilities, mono.hear(tap).probabilities)
     with pytest.raises(ValueError, match=r"has 8000 samples a second, sound up to 4000 Hz, and.* up to 22050 Hz"):
         mono.hear(Recording(tap.samples[:, :8000], 8000.0))
-    stereo = LabelledClips.of(
+    stereo = LabelledClips.from_recordings(
         [Recording(one.samples.repeat(2, axis=0), one.rate) for one in clips(3).recordings], clips(3).labels
     )
     two = Listener.fit(stereo, method="linear")
@@ -127,7 +127,7 @@ def test_few_clips_are_enough_to_learn_and_what_is_not_known_is_said():
     listener = Listener.fit(one, method="linear")
     assert listener.standing is None
     assert any("nobody knows" in note for note in listener.notes)
-    several = LabelledClips.of(
+    several = LabelledClips.from_recordings(
         [*clips(3).recordings, struck(np.random.default_rng(9), "wood")], [*clips(3).labels, "cork"]
     )
     listener = Listener.fit(several, method="linear")
@@ -151,7 +151,7 @@ def test_gain_does_not_matter_unless_loudness_tells(method):
         np.testing.assert_allclose(softer.probabilities, heard.probabilities, atol=1e-3)
         assert not softer.quiet[softer.loud].any()
     soft = [_at(gain, one) for gain in (0.05, 1.0) for one in clips(4).recordings]
-    listener = Listener.fit(LabelledClips.of(soft, ["soft"] * 12 + ["hard"] * 12), method=method)
+    listener = Listener.fit(LabelledClips.from_recordings(soft, ["soft"] * 12 + ["hard"] * 12), method=method)
     assert listener.loudness
     assert listener.hear(_at(0.05, others.clip(0))).whole[0] == "soft"
     assert listener.hear(others.clip(0)).whole[0] == "hard"
@@ -164,30 +164,32 @@ def test_one_recording_of_many_taps_is_many_clips():
     for name in labels:
         taps = [np.pad(struck(random, name).samples, ((0, 0), (20_000, 30_000))) for _ in range(15)]
         long.append(Recording(np.hstack(taps), 44_100.0, name=name))
-    listener = Listener.fit(LabelledClips.of(long, labels), method="linear")
+    listener = Listener.fit(LabelledClips.from_recordings(long, labels), method="linear")
     assert listener.standing is not None
     assert len(listener.standing.right) == 45
     assert (listener.standing.held_out == listener.standing.right).mean() > 0.8
     assert any(note.startswith("glass, metal, wood: one recording only") for note in listener.notes)
-    several = LabelledClips.of([*long, *clips(2).recordings], [*labels, *clips(2).labels])
+    several = LabelledClips.from_recordings([*long, *clips(2).recordings], [*labels, *clips(2).labels])
     assert not any("one recording" in note for note in Listener.fit(several, method="linear").notes)
 
 
 def test_a_sound_that_does_not_end_is_cut_where_no_sample_is_on_both_sides():
     times = np.arange(0.25, 20, 0.1)
-    pieces = _pieces(times)
+    pieces = _split_pieces(times)
     assert len(pieces) == 8
     for one, other in pairwise(pieces):
         assert times[other[0]] - times[one[-1]] > LENGTH - 1e-9
     two = np.concatenate([times[:5], times[30:40]])
-    assert [len(piece) for piece in _pieces(two)] == [5, 10]
+    assert [len(piece) for piece in _split_pieces(two)] == [5, 10]
 
 
 def test_a_class_of_few_clips_is_told_as_often():
     """Three clips of one class beside thirty of another."""
     random = np.random.default_rng(7)
     labels = ["wood"] * 30 + ["glass"] * 3
-    listener = Listener.fit(LabelledClips.of([struck(random, name) for name in labels], labels), method="linear")
+    listener = Listener.fit(
+        LabelledClips.from_recordings([struck(random, name) for name in labels], labels), method="linear"
+    )
     assert all(listener.hear(struck(random, "glass")).whole[0] == "glass" for _ in range(10))
 
 
@@ -210,7 +212,7 @@ def test_rates_and_channels_that_differ_are_told():
     random = np.random.default_rng(5)
     mixed = [struck(random, "wood"), struck(random, "metal", rate=16_000.0)]
     mixed += [Recording(struck(random, name).samples.repeat(2, axis=0), 44_100.0) for name in ("wood", "metal")]
-    told = LabelledClips.of(mixed, ["wood", "metal", "wood", "metal"])
+    told = LabelledClips.from_recordings(mixed, ["wood", "metal", "wood", "metal"])
     assert told.highest == 8000
     assert told.channels == 1
     assert "1 or 2 channels" in told.notes[0]
@@ -222,10 +224,19 @@ def test_rates_and_channels_that_differ_are_told():
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: LabelledClips.of([], []), "there are no clips"),
-        (lambda: LabelledClips.of([struck(np.random.default_rng(0), "wood")], ["wood"]), "one class only, 'wood'"),
-        (lambda: LabelledClips.of([struck(np.random.default_rng(0), "wood")], ["wood", "metal"]), "one name for each"),
-        (lambda: LabelledClips.of([np.zeros(9), np.zeros(9)], ["a", "b"]), r"recordings\[0\] must be a Recording"),
+        (lambda: LabelledClips.from_recordings([], []), "there are no clips"),
+        (
+            lambda: LabelledClips.from_recordings([struck(np.random.default_rng(0), "wood")], ["wood"]),
+            "one class only, 'wood'",
+        ),
+        (
+            lambda: LabelledClips.from_recordings([struck(np.random.default_rng(0), "wood")], ["wood", "metal"]),
+            "one name for each",
+        ),
+        (
+            lambda: LabelledClips.from_recordings([np.zeros(9), np.zeros(9)], ["a", "b"]),
+            r"recordings\[0\] must be a Recording",
+        ),
         (lambda: Listener.fit([1, 2]), "clips must be"),
         (lambda: Listener.fit(clips(2), method="magic"), "method"),
         (lambda: Listener.fit(clips(2), key=3), "key"),
@@ -246,13 +257,13 @@ def test_files_of_another_kind_are_refused(learnt, tmp_path):
     learnt["trees"].write(path)
     whole = path.read_bytes()
     path.write_bytes(whole[:-20])
-    with pytest.raises(ValueError, match=r"cut short|fewer than|EOF"):
+    with pytest.raises(ValueError, match=r"truncated|fewer than|EOF"):
         Listener.read(path)
     path.write_bytes(whole.replace(b'"method": "trees"', b'"method": "magic"'))
     with pytest.raises(ValueError, match="magic"):
         Listener.read(path)
     path.write_bytes(whole.replace(b'"depth": ', b'"depth": -'))
-    with pytest.raises(ValueError, match="lead nowhere"):
+    with pytest.raises(ValueError, match="do not exist"):
         Listener.read(path)
 
 
@@ -265,7 +276,7 @@ def test_features_that_never_change_count_for_nothing():
         np.zeros(30), np.zeros((30, 1, 41)), np.zeros((30, 64, 41)), np.zeros(30, int), np.ones(30, bool)
     )
     right = np.repeat(np.arange(3), 10)
-    lesson = Lesson(nothing, right, np.arange(30), 3, jax.random.key(0))
+    lesson = TrainingSet(nothing, right, np.arange(30), 3, jax.random.key(0))
     found, plain = (LinearLearner(lambda _, own=own: own).learn(lesson) for own in (given, told))
     assert not found.weights[3:].any()
     np.testing.assert_allclose(found.weights[:3], plain.weights, atol=1e-9)

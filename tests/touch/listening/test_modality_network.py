@@ -9,8 +9,8 @@ from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, microphone_grid
 from jeit.acoustic.simulate.microphones import MicrophoneModel
 from jeit.acoustic.simulate.people import MODALITIES
 from jeit.touch.listening import Levels, Listener, ModalityNetwork, SoundImages, sound_images
-from jeit.touch.listening.learners import LEARNERS, Lesson, NetworkListener
-from jeit.touch.listening.modality_network import NetworkAnswers, paper_plan, plan_of
+from jeit.touch.listening.learners import LEARNERS, NetworkListener, TrainingSet
+from jeit.touch.listening.modality_network import NetworkAnswers, library_plan, paper_plan
 
 KEY = jax.random.key(1)
 
@@ -20,13 +20,13 @@ def test_answers_in_numpy_are_the_networks():
     random = np.random.default_rng(0)
     network = ModalityNetwork.draw(KEY, 89, 41, 5)
     images = (3 + 2 * random.standard_normal((4, 89, 41))).astype(np.float32)
-    said, moved = network.learn(images)
-    np.testing.assert_array_equal(said, network.learn(images)[0])
-    learn = jax.jit(lambda one: one.learn(images)[1])
+    said, moved = network.log_odds_in_training(images)
+    np.testing.assert_array_equal(said, network.log_odds_in_training(images)[0])
+    learn = jax.jit(lambda one: one.log_odds_in_training(images)[1])
     for _ in range(200):
         moved = learn(moved)
-    np.testing.assert_allclose(moved.answer(images), said, rtol=1e-3, atol=1e-3)
-    np.testing.assert_allclose(NetworkAnswers(moved).log_odds(images), moved.answer(images), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(moved.log_odds(images), said, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(NetworkAnswers(moved).log_odds(images), moved.log_odds(images), rtol=1e-3, atol=1e-4)
     assert network.dense.shape[0] == 13 * 5 * 64
     assert NetworkAnswers(network).log_odds(images[:0]).shape == (0, 5)
 
@@ -37,13 +37,13 @@ def test_the_plan_is_the_papers():
     # Five epochs of five noisy copies each.
     assert plan.decay_epochs == 25
     assert paper_plan(10, batches=1).batch == 10
-    own = plan_of(20_000, batches=20_000)
+    own = library_plan(20_000, batches=20_000)
     assert (own.rate, own.patience, own.decay_epochs) == (1e-3, 20, round(2 * own.epochs / 3))
 
 
 def test_a_network_is_kept_with_its_levels(tmp_path):
     heard = sound_images(Recording(np.random.default_rng(0).standard_normal((4, 9000)), 10_000.0))
-    own = NetworkListener.of(ModalityNetwork.draw(KEY, 68, 41, 3), Levels.of(heard))
+    own = NetworkListener.from_network(ModalityNetwork.draw(KEY, 68, 41, 3), Levels.from_images(heard))
     listener = Listener(("a", "b", "c"), "network", own, 4, 5000.0, True, 0.0, (1.0, 2.0), 1.0, 0.0)
     listener.write(tmp_path / "listener.jeit")
     again = Listener.read(tmp_path)
@@ -65,11 +65,13 @@ def test_a_small_training_tells_people_it_never_met():
     out = person == 4
 
     def share(method: str, labels) -> float:
-        lesson = Lesson(images[~out], labels[~out], person[~out], 5, KEY, batches=100)
+        lesson = TrainingSet(images[~out], labels[~out], person[~out], 5, KEY, batches=100)
         return float(np.mean(LEARNERS[method].learn(lesson).log_odds(images[out]).argmax(axis=1) == right[out]))
 
     shuffled = np.random.default_rng(0).permutation(right)
-    untrained = NetworkListener.of(ModalityNetwork.draw(KEY, 73, 41, 5), Levels.of(images)).log_odds(images)
+    untrained = NetworkListener.from_network(ModalityNetwork.draw(KEY, 73, 41, 5), Levels.from_images(images)).log_odds(
+        images
+    )
     found = {
         "untrained": float(np.mean(untrained.argmax(axis=1) == right)),
         "shuffled": share("network", shuffled),

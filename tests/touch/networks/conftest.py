@@ -8,7 +8,7 @@ from jeit.design import Skin
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.touch.networks import ImageNetwork, learn_images, write_network
-from jeit.touch.networks.sensed import Sensed
+from jeit.touch.networks.linear_channels import LinearChannels
 from jeit.touch.networks.unrolled import Unrolled
 from jeit.touch.simulate.contact.indent_sets import image_places
 
@@ -36,8 +36,10 @@ def imaging(small_skin, tmp_path_factory):
     folder, noise = tmp_path_factory.mktemp("imaging"), 1.5e-3
     network = Unrolled(small_skin.model.protocol.num_measurements, SHAPE, key=jax.random.key(0))
     places = image_places(small_skin, SHAPE[1], SHAPE[0])
-    network = network.of_skin(Sensed.of(small_skin, SHAPE), places, small_skin.layout.centres, noise)
-    network = ImageNetwork.of_skin(network, small_skin, noise, SHAPE)
+    network = network.adapted_to_skin(
+        LinearChannels.from_skin(small_skin, SHAPE), places, small_skin.layout.centres, noise
+    )
+    network = ImageNetwork.from_skin(network, small_skin, noise, SHAPE)
     write_network(network, folder / "network.jeit")
     return folder, network
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.touch.networks.image_network import filled
+from jeit.touch.networks.image_network import fill_missing
 from jeit.touch.simulate import Disc, Indent, relative_changes
 
 PLACE = (0.012, -0.02)
@@ -21,7 +21,7 @@ def test_missing_channels_are_what_is_expected_of_them():
     covariance, noise = factor @ factor.T, 0.3
     values = rng.normal(size=(3, 6))
     values[0, [1, 4]] = values[2, 0] = np.nan
-    found = filled(values, covariance, noise)
+    found = fill_missing(values, covariance, noise)
     whole = np.linalg.inv(covariance + noise**2 * np.eye(6))
     for row, given in zip(found, values, strict=True):
         lost = np.isnan(given)
@@ -51,7 +51,7 @@ def test_what_no_touch_makes(imaging, change):
         return network.doubts(frames, network.share(frames))
 
     assert doubted(np.concatenate([change, 0 * change])) == ["", ""]
-    assert "of no touch" in doubted(-change)[0]
+    assert "not that of a touch" in doubted(-change)[0]
     assert all(doubted(40 * change))
     with pytest.raises(ValueError, match="times those of the reference; are units the same"):
         network.depth(1e3 * np.ones(94), np.ones(94))

@@ -25,7 +25,7 @@ from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.protocol import adjacent
 from jeit.touch.networks import Preset, learn_images, read_network, write_network
-from jeit.touch.networks.learn import Examples, stand
+from jeit.touch.networks.learn import TouchExamples, evaluate_network
 from jeit.touch.simulate import Disc, Indent, relative_changes
 from jeit.touch.training import Plan
 
@@ -70,8 +70,8 @@ class Silent(eqx.Module):
 def test_a_network_that_says_nothing_explains_nothing(small_skin, learnt):
     _, found = learnt
     right = found.standing.right
-    examples = Examples(np.zeros((len(right), found.network.made_for["channels"])), right)
-    standing = stand(dataclasses.replace(found.network, network=Silent()), small_skin, examples)
+    examples = TouchExamples(np.zeros((len(right), found.network.made_for["channels"])), right)
+    standing = evaluate_network(dataclasses.replace(found.network, network=Silent()), small_skin, examples)
     assert (standing.explained, standing.deepest) == (0, 0)
 
 

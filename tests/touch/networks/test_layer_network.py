@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jeit.touch.networks import Preset, learn_images, read_network
-from jeit.touch.networks.sensed import touch_draws
+from jeit.touch.networks.linear_channels import touch_draws
 from jeit.touch.simulate import Disc, Indent, IndentSet, indented_cells, relative_changes
 from jeit.touch.training import Plan
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jeit.touch.networks.three_stages import Convolution, doubled
+from jeit.touch.networks.three_stages import Convolution, repeat_pixels
 
 
 def test_a_convolution_of_a_doubled_image():
@@ -22,7 +22,7 @@ def test_a_convolution_of_a_doubled_image():
 
         return jax.value_and_grad(both, argnums=(0, 1), has_aux=True)
 
-    ways = Convolution.of_doubled, lambda layer, image: layer(doubled(image))
+    ways = Convolution.apply_to_repeated, lambda layer, image: layer(repeat_pixels(image))
     found = jax.jit(lambda *at: [of_way(way)(*at) for way in ways])
     ((_, one), slopes), ((_, other), right) = found(layer, image)
     np.testing.assert_allclose(one, other, atol=1e-5)

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from jeit.touch.plots import plot_depth_map, plot_losses
-from jeit.touch.training import Trained
+from jeit.touch.training import TrainingResult
 from jeit.touch.training.model_file import Course
 
 EXTENT = (-0.05, 0.05, -0.04, 0.04)
@@ -31,7 +31,7 @@ def test_a_map_lies_where_the_skin_is(ax):
 def test_losses(ax):
     """Relative to those at first, with a mark at the best."""
     course = Course([10, 20, 30], [1.0, 0.5, 0.2], [2.0, 0.8, 0.9])
-    plot_losses({"maps": Trained(None, course, "done")}, ax=ax)
+    plot_losses({"maps": TrainingResult(None, course, "done")}, ax=ax)
     line, mark = ax.lines
     assert np.allclose(line.get_ydata(), [1.0, 0.4, 0.45])
     assert (mark.get_xdata()[0], mark.get_ydata()[0]) == (20, 0.4)
@@ -42,5 +42,5 @@ def test_what_is_no_map(ax):
         plot_depth_map(np.zeros(3), EXTENT, ax=ax)
     with pytest.raises(ValueError, match="courses must be trainings by name"):
         plot_losses([], ax=ax)
-    with pytest.raises(ValueError, match=r"courses\['a'\] must be a Trained"):
+    with pytest.raises(ValueError, match=r"courses\['a'\] must be a TrainingResult"):
         plot_losses({"a": 3}, ax=ax)

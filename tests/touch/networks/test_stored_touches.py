@@ -10,10 +10,17 @@ import pytest
 from small_networks import bits
 
 from jeit.touch.networks import ImageNetwork
-from jeit.touch.networks.learn import Examples, Runs, StoredTouches, mean_and_deviation, shuffled, train_three_stages
-from jeit.touch.networks.sensed import touch_draws
+from jeit.touch.networks.learn import (
+    StoredTouches,
+    TouchExamples,
+    TrainingRuns,
+    mean_and_deviation,
+    shuffle_pairs,
+    train_three_stages,
+)
+from jeit.touch.networks.linear_channels import touch_draws
 from jeit.touch.simulate import IndentSet, simulate_presses
-from jeit.touch.training import MappedRows, Plan, Trained
+from jeit.touch.training import MappedRows, Plan, TrainingResult
 from jeit.touch.training.model_file import Course
 
 PLAN = Plan(rate=2e-3, batch=20, epochs=3, seconds=0.0)
@@ -30,7 +37,7 @@ def stored(small_skin, tmp_path_factory):
 def other(small_skin):
     """Touches that nothing is learnt from."""
     solved = IndentSet(small_skin, touch_draws(small_skin), 40, seed=2, shape=(16, 16), chunk=40).solve(0)
-    return Examples(solved["change"], solved["depth"])
+    return TouchExamples(solved["change"], solved["depth"])
 
 
 def test_as_many_chunks_as_are_in_memory_at_once(stored):
@@ -89,7 +96,7 @@ def test_mean_and_deviation(stored):
 def test_chunks_are_read_as_arrays_are_given(stored):
     """Of one chunk: the same bits in the same order, so that trainings have the same rows."""
     indents, path, found = stored
-    arrays, touches = Examples(found["change"].to_numpy(), found["depth"].to_numpy()), StoredTouches(indents, path)
+    arrays, touches = TouchExamples(found["change"].to_numpy(), found["depth"].to_numpy()), StoredTouches(indents, path)
     for names in (("change",), ("change", "depth")):
         given, read = arrays.rows(*names), touches.rows(*names)
         assert given.sizes == read.sizes
@@ -100,7 +107,7 @@ class Stopped(Exception):
     pass
 
 
-class Until(Runs):
+class Until(TrainingRuns):
     """Trainings up to the one that begins with `unwanted`."""
 
     unwanted = ""
@@ -111,7 +118,7 @@ class Until(Runs):
         return super().run(name, network, objective, training, validation)
 
 
-class Looked(Runs):
+class Looked(TrainingRuns):
     """Trainings that are not done: what their objectives give of some rows, of the first in numbers, else in shape."""
 
     losses: dict[str, Any]
@@ -125,14 +132,14 @@ class Looked(Runs):
 
         found = jax.jit(asked)(*given) if name == "voltages" else jax.eval_shape(asked, *given)
         self.losses[name] = *found, objective.trained
-        return Trained(network, Course([1], [1.0], [1.0]), "done")
+        return TrainingResult(network, Course([1], [1.0], [1.0]), "done")
 
 
 def test_what_the_three_stages_are_taught(stored, other, small_skin, monkeypatch):
     """Untrained, the first misses all that it is to redraw; the last leads from the first's ends, which stay."""
     random = np.random.default_rng(0)
     monkeypatch.setattr(
-        "jeit.touch.networks.three_stages._start",
+        "jeit.touch.networks.three_stages._draw_weights",
         lambda key, shape, inputs: jnp.asarray(random.normal(size=shape) * np.sqrt(2 / inputs), jnp.float32),
     )
     indents, path, _ = stored
@@ -149,7 +156,7 @@ def test_what_the_three_stages_are_taught(stored, other, small_skin, monkeypatch
     assert not any(jax.tree.leaves((trained.mean, trained.deviation, trained.encoder, trained.decoder)))
     assert eqx.tree_equal(found.network.decoder, found.courses["maps"].network.decoder)
     assert eqx.tree_equal(found.network.encoder, found.courses["voltages"].network.encoder)
-    assert ImageNetwork.of_skin(found.network, small_skin, 1e-3, (16, 16)).design == "three-stages"
+    assert ImageNetwork.from_skin(found.network, small_skin, 1e-3, (16, 16)).design == "three-stages"
 
 
 @pytest.fixture(scope="module")
@@ -217,24 +224,24 @@ def test_three_trainings_of_the_paper_s_network(paper, small_skin):
     assert all(one.course.validation[-1] < 0.9 * one.course.validation[0] for one in found.courses.values())
     assert eqx.tree_equal(found.network.decoder, found.courses["maps"].network.decoder)
     assert eqx.tree_equal(found.network.encoder, found.courses["voltages"].network.encoder)
-    assert ImageNetwork.of_skin(found.network, small_skin, 1e-3, (16, 16)).design == "three-stages"
+    assert ImageNetwork.from_skin(found.network, small_skin, 1e-3, (16, 16)).design == "three-stages"
 
 
 @pytest.mark.slow
 def test_the_paper_s_network_learns_from_voltages(stored, other):
     """Taught other touches' maps it learns none of them."""
     found = stored[2]
-    right = Examples(found["change"].to_numpy(), found["depth"].to_numpy())
-    runs = Runs(Plan(rate=3e-3, batch=20, epochs=12, patience=12), jax.random.key(1))
+    right = TouchExamples(found["change"].to_numpy(), found["depth"].to_numpy())
+    runs = TrainingRuns(Plan(rate=3e-3, batch=20, epochs=12, patience=12), jax.random.key(1))
     own, lost = (
         train_three_stages(taught, other, 1e-3, runs).courses["projection"].course
-        for taught in (right, shuffled(right))
+        for taught in (right, shuffle_pairs(right))
     )
     assert min(own.validation) < min(lost.validation)
 
 
 def test_shuffled_maps_are_another_s(other):
-    lost = shuffled(other)
+    lost = shuffle_pairs(other)
     assert np.array_equal(lost.change, other.change)
     assert not np.array_equal(lost.depth, other.depth)
     assert np.array_equal(np.sort(lost.depth.sum(axis=(1, 2))), np.sort(other.depth.sum(axis=(1, 2))))
@@ -251,7 +258,7 @@ def test_stopped_amid_chunks_it_goes_on_to_the_same_bits(paper, stored, other, t
 
     def train():
         touches = StoredTouches(stored[0], stored[1], at_once=50)
-        return train_three_stages(touches, other, 1e-3, Runs(PLAN, jax.random.key(0), tmp_path, stop))
+        return train_three_stages(touches, other, 1e-3, TrainingRuns(PLAN, jax.random.key(0), tmp_path, stop))
 
     with pytest.raises(Stopped):
         train()

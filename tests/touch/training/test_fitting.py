@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jeit.touch.training import ArrayRows, Objective, Plan, fit
-from jeit.touch.training.batches import Order
+from jeit.touch.training.batches import BatchOrder
 
 
 def loss(network, batch, key):
@@ -186,15 +186,15 @@ def test_what_was_stopped_amid_chunks_goes_on(tmp_path):
 
 
 def test_every_epoch_takes_each_row_once_at_most():
-    order = Order((70, 50), 16, [1, 2])
-    legs = list(order.legs(0, 2 * order.an_epoch, 3))
+    order = BatchOrder((70, 50), 16, [1, 2])
+    legs = list(order.chunk_batches(0, 2 * order.batches_per_epoch, 3))
     for epoch in range(2):
-        own = [leg for leg in legs if leg.first // order.an_epoch == epoch]
-        assert sum(len(leg.rows) for leg in own) == order.an_epoch == 7
+        own = [leg for leg in legs if leg.first // order.batches_per_epoch == epoch]
+        assert sum(len(leg.rows) for leg in own) == order.batches_per_epoch == 7
         for chunk, size in enumerate((70, 50)):
             taken = np.concatenate([leg.rows.ravel() for leg in own if leg.chunk == chunk])
             assert len(set(taken.tolist())) == len(taken) == size // 16 * 16
-    again = list(order.legs(5, 2 * order.an_epoch, 3))
+    again = list(order.chunk_batches(5, 2 * order.batches_per_epoch, 3))
     assert np.array_equal(np.concatenate([leg.rows for leg in again]), np.concatenate([leg.rows for leg in legs])[5:])
 
 

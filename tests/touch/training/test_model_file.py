@@ -54,12 +54,12 @@ def put(path, first, head, rest):
         (lambda first, head, rest: (first, [1], rest), "it is a list"),
         (lambda first, head, rest: (first, {**head, "version": 2}, rest), "version 2, and this jeit reads 1"),
         (lambda first, head, rest: (first, {**head, "width": 10**9}, rest), "fewer than the"),
-        (lambda first, head, rest: (first, {**head, "width": 4}, rest), "its head says"),
-        (lambda first, head, rest: (first, {**head, "width": "many"}, rest), "does not say what it is made of"),
-        (lambda first, head, rest: (first, {"kind": KIND, "version": 1}, rest), "does not say what it is made of"),
+        (lambda first, head, rest: (first, {**head, "width": 4}, rest), r"its header says"),
+        (lambda first, head, rest: (first, {**head, "width": "many"}, rest), "does not describe such a model"),
+        (lambda first, head, rest: (first, {"kind": KIND, "version": 1}, rest), "does not describe such a model"),
         (lambda first, head, rest: (first, head, rest[:40]), "fewer than the"),
-        (lambda first, head, rest: (first, head, rest[:-3]), "cut short"),
-        (lambda first, head, rest: (first, head, rest + b"more"), "goes on after"),
+        (lambda first, head, rest: (first, head, rest[:-3]), "truncated"),
+        (lambda first, head, rest: (first, head, rest + b"more"), "more bytes after"),
         (lambda first, head, rest: (first, head, b"x" * len(rest)), "magic string"),
     ],
 )
@@ -93,7 +93,7 @@ def test_arrays_of_another_kind(written):
     file = io.BytesIO()
     np.save(file, np.zeros((5, 3)))
     put(path, first, head, file.getvalue() + rest)
-    with pytest.raises(ValueError, match=r"float64 of shape \(5, 3\), and its head says float32"):
+    with pytest.raises(ValueError, match=r"float64 of shape \(5, 3\), and its header says float32"):
         read_model(path, KIND, 1, make)
 
 

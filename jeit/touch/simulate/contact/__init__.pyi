@@ -2,7 +2,7 @@ from .half_space import HalfSpace
 from .indent_sets import IndentSet
 from .indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
 from .indents import Indent, IndentDraws, PressDraws, depth_maps, indented_cells, relative_changes
-from .joined import Joined, Placed, TwoSheets
+from .joined import JoinedIndenters, PlacedIndenter, TwoSheets
 from .materials import Foundation, Material, material
 from .press import MovingPress, Press
 from .press_sets import PressSet, open_presses, simulate_presses
@@ -17,10 +17,10 @@ __all__ = [
     "Indent",
     "IndentDraws",
     "IndentSet",
-    "Joined",
+    "JoinedIndenters",
     "Material",
     "MovingPress",
-    "Placed",
+    "PlacedIndenter",
     "Press",
     "PressDraws",
     "PressSet",

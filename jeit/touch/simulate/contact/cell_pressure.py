@@ -18,7 +18,7 @@ from jeit.touch.simulate.contact.samples import Samples
 
 # Lattice for contacts on few samples; number of samples below which it is used; width that it resolves, as a share of
 # the radius of a cell.
-_FINE_LATTICE, _FEW, _FOUND = 11, 6, 1 / 6
+_FINE_LATTICE, _FEW, _RESOLVED_WIDTH = 11, 6, 1 / 6
 # Number of presses computed at once, so that the arrays fit in the cache.
 _AT_ONCE = 16
 # Factor of the reach of a contact with about half its area on the skin; 2^(1/4) for a ball on a Winkler foundation.
@@ -28,7 +28,9 @@ _ON_SKIN = 0.6
 
 
 class PressedCells(NamedTuple):
-    """**Fields**: `cells`: (n, c), numbers of the cells under n touches; `pressure`: (n, c, s), pressure at the samples
+    """Cells under touches, and the pressure on them.
+
+    **Fields**: `cells`: (n, c), numbers of the cells under n touches; `pressure`: (n, c, s), pressure at the samples
     of each cell, pascals. Rows of touches with fewer cells are padded with zeros."""
 
     cells: Int[np.ndarray, "n c"]
@@ -49,7 +51,7 @@ def pressed_cells(
     presses = [press for touch in touches for press in touch]
     if not presses:
         return PressedCells(np.zeros((len(touches), 1), int), np.zeros((len(touches), 1, samples.points.shape[1])))
-    found = _of_each(samples, support, presses, progress)
+    found = _pressed_cells(samples, support, presses, progress)
     if all(len(touch) == 1 for touch in touches):
         return found
     rows, pressures, first = [], [], 0
@@ -62,25 +64,25 @@ def pressed_cells(
         np.add.at(total, place, found.pressure[own][there])
         rows.append(cells)
         pressures.append(total)
-    return _joined(rows, pressures)
+    return _pad_and_stack(rows, pressures)
 
 
-def _of_each(
+def _pressed_cells(
     samples: Samples, support: AbstractSupport, presses: Sequence[Press], progress: Callable[[str], None] | None
 ) -> PressedCells:
     samples.check(presses)
     position = np.array([press.position for press in presses])
-    shapes = _shapes(presses)
+    shapes = _indenter_numbers(presses)
     farthest = samples.chord * np.array([press.indenter.reach for press in presses])
     # The extent of the pressure on a flat skin is no upper bound for that on a concave skin.
-    reaches = farthest if samples.curved is not None else _reaches(support, presses, shapes)
+    reaches = farthest if samples.curved is not None else _reach_bounds(support, presses, shapes)
     extent = np.minimum(reaches, farthest) + samples.radius
     tree = KDTree(samples.points.mean(axis=1))
     near = tree.query_ball_point(position, extent, return_sorted=True)
     on_skin = samples.points.shape[1] * np.array([samples.area[cells].sum() for cells in near])
     beyond = np.flatnonzero(on_skin < _ON_SKIN * np.pi * extent**2)
     near[beyond] = tree.query_ball_point(position[beyond], farthest[beyond] + samples.radius, return_sorted=True)
-    near = samples.near(presses, near)
+    near = samples.facing_cells(presses, near)
     number = np.array([len(cells) for cells in near])
     empty = np.flatnonzero(number == 0)
     if empty.size:
@@ -96,17 +98,17 @@ def _of_each(
         same = same[np.argsort(number[same], kind="stable")]
         for some in np.split(same, range(_AT_ONCE, len(same), _AT_ONCE)):
             cells, there = pad_rows([np.asarray(near[one], int) for one in some])
-            pressure = _alike(samples, support, [presses[one] for one in some], cells, there)
+            pressure = _pressures_of_equal_indenters(samples, support, [presses[one] for one in some], cells, there)
             for one, own, pressed in zip(some, cells, pressure, strict=True):
                 kept = pressed.any(axis=-1)
                 rows[one], pressures[one] = own[kept], pressed[kept]
             done += len(some)
             if progress is not None:
                 progress(f"pressure: {done} of {len(presses)}")
-    return _joined(rows, pressures)
+    return _pad_and_stack(rows, pressures)
 
 
-def _shapes(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
+def _indenter_numbers(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
     """Numbers of the indenters of presses; equal indenters have the same number."""
     numbers: dict = {}
     known: dict[int, int] = {}
@@ -118,7 +120,7 @@ def _shapes(presses: Sequence[Press]) -> Int[np.ndarray, " n"]:
     return np.array([known[id(press.indenter)] for press in presses])
 
 
-def _reaches(support: AbstractSupport, presses: Sequence[Press], shapes) -> Float[np.ndarray, " n"]:
+def _reach_bounds(support: AbstractSupport, presses: Sequence[Press], shapes) -> Float[np.ndarray, " n"]:
     """Upper bound of the distance from the origin at which each press exerts pressure, metres.
 
     The bound is the reach for the load rounded up to a power of two, times `_MARGIN` for presses at the edge of the
@@ -136,38 +138,38 @@ def _reaches(support: AbstractSupport, presses: Sequence[Press], shapes) -> Floa
     return np.array([known[case] for case in zip(shapes, doublings, strict=True)])
 
 
-def _alike(samples: Samples, support: AbstractSupport, presses: Sequence[Press], cells, there):
+def _pressures_of_equal_indenters(samples: Samples, support: AbstractSupport, presses: Sequence[Press], cells, is_cell):
     """Pressures (b, c, s) of presses with the same indenter at the samples of `cells` (b, c)."""
     points = samples.points[cells]
     shape = points.shape[:-1]
-    local, fall, share = samples.seen(presses, cells, points.reshape(len(cells), -1, points.shape[-1]))
-    area = np.broadcast_to((share * samples.area[cells] * there)[..., None], shape).reshape(len(cells), -1)
+    local, fall, share = samples.to_indenter_frames(presses, cells, points.reshape(len(cells), -1, points.shape[-1]))
+    area = np.broadcast_to((share * samples.area[cells] * is_cell)[..., None], shape).reshape(len(cells), -1)
     load = np.array([press.load for press in presses])
-    pressure = support.spread(presses[0].indenter, load, local, area, _bulge(samples, fall)) * (area > 0)
+    pressure = support.spread(presses[0].indenter, load, local, area, _height_below_plane(samples, fall)) * (area > 0)
     pressure = pressure.reshape(shape)
     for one in np.flatnonzero(np.count_nonzero(pressure, axis=(1, 2)) < _FEW).tolist():
-        pressure[one] = _between(samples, support, presses[one], cells[one], there[one])
+        pressure[one] = _pressures_on_finer_lattice(samples, support, presses[one], cells[one], is_cell[one])
     return pressure
 
 
-def _between(samples: Samples, support: AbstractSupport, press: Press, cells, there):
+def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, press: Press, cells, is_cell):
     """Pressures (c, s) of a press on few samples: the mean over a finer lattice in each of the `cells` (c,).
 
     If the press touches no point of the finer lattice either, the nearest sample carries the load. Raises `ValueError`
     for a press that touches no skin.
     """
-    points = samples.on(cells, _FINE_LATTICE)
+    points = samples.lattice_points(cells, _FINE_LATTICE)
     fine, coarse = points.shape[1], samples.points.shape[1]
-    local, fall, share = samples.seen([press], cells[None], points.reshape(1, -1, points.shape[-1]))
-    area = np.repeat(share[0] * samples.area[cells] * there * coarse / fine, fine)[None]
+    local, fall, share = samples.to_indenter_frames([press], cells[None], points.reshape(1, -1, points.shape[-1]))
+    area = np.repeat(share[0] * samples.area[cells] * is_cell * coarse / fine, fine)[None]
     load = np.array([press.load])
-    pressure = support.spread(press.indenter, load, local, area, _bulge(samples, fall)) * (area > 0)
+    pressure = support.spread(press.indenter, load, local, area, _height_below_plane(samples, fall)) * (area > 0)
     if pressure.any():
         return np.repeat(pressure.reshape(-1, fine).mean(axis=1, keepdims=True), coarse, axis=1)
     pressure = np.zeros((len(cells), coarse))
     distance = np.linalg.norm(local.reshape(-1, fine, 2), axis=-1).min(axis=1)
-    cell = np.where(there, distance, np.inf).argmin()
-    if not (distance[cell] < _FOUND * samples.radius and np.isfinite(press.indenter.gap(np.zeros(2)))):
+    cell = np.where(is_cell, distance, np.inf).argmin()
+    if not (distance[cell] < _RESOLVED_WIDTH * samples.radius and np.isfinite(press.indenter.gap(np.zeros(2)))):
         raise ValueError(
             f"position: the press at {millimetre_text(press.position)} mm touches no skin, or does with less than a "
             "tenth of a "
@@ -179,12 +181,13 @@ def _between(samples: Samples, support: AbstractSupport, press: Press, cells, th
     return pressure
 
 
-def _bulge(samples: Samples, fall):
+def _height_below_plane(samples: Samples, fall):
     """Distance of the surface below the plane of the press, for curved skins; None for flat skins."""
     return None if samples.curved is None else fall
 
 
-def _joined(rows: list, pressures: list) -> PressedCells:
+def _pad_and_stack(rows: list, pressures: list) -> PressedCells:
+    """Stack the cells and pressures of all touches, padded with zeros to the largest number of cells."""
     cells, there = pad_rows(rows)
     pressure = np.zeros((*cells.shape, pressures[0].shape[-1]))
     pressure[there] = np.concatenate(pressures)

@@ -19,7 +19,7 @@ from jeit.touch.simulate.contact.press import (
     AbstractSupport,
     PressureRaster,
     check_load,
-    check_seen,
+    check_resolved,
     contact_window,
     raster,
 )
@@ -67,13 +67,13 @@ class HalfSpace(AbstractSupport):
         """
         check_load(load)
 
-        def pressed(window, number: int) -> np.ndarray:
-            return self._balanced(indenter, load, window, number)[0] > 0
+        def is_pressed(window, num_pixels: int) -> np.ndarray:
+            return self._solve_pressure(indenter, load, window, num_pixels)[0] > 0
 
-        window = contact_window(pressed, indenter.reach, _COARSE)
-        values, approach = self._balanced(indenter, load, window, self.pixels)
+        window = contact_window(is_pressed, indenter.reach, _COARSE)
+        values, approach = self._solve_pressure(indenter, load, window, self.pixels)
         points, pixel = raster(window, self.pixels)
-        check_seen(values > 0, pixel)
+        check_resolved(values > 0, pixel)
         reach = float(np.linalg.norm(points[values > 0], axis=-1).max() + np.hypot(*pixel))
         return PressureRaster(float(load), approach, reach, values, pixel)
 
@@ -91,12 +91,12 @@ class HalfSpace(AbstractSupport):
             _check_on_skin(free[number], points[number], areas[number])
         return pressures * np.where(carried > 0, loads / np.where(carried > 0, carried, 1.0), 0.0)[:, None]
 
-    def _balanced(self, indenter: AbstractIndenter, load: float, window, number: int):
-        points, pixel = raster(window, number)
+    def _solve_pressure(self, indenter: AbstractIndenter, load: float, window, num_pixels: int):
+        points, pixel = raster(window, num_pixels)
         gap = indenter.gap(points)
         if not np.isfinite(gap).any():
             return np.zeros_like(gap), 0.0
-        return rigid_contact(gap, sinking(number, pixel, self.plane_modulus), load / pixel.prod())
+        return rigid_contact(gap, displacement_function(num_pixels, pixel, self.plane_modulus), load / pixel.prod())
 
 
 def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
@@ -114,47 +114,47 @@ def _check_on_skin(pressure: PressureRaster, points, areas) -> None:
         )
 
 
-def sinking(number: int, pixel, plane_modulus: float):
+def displacement_function(num_pixels: int, pixel, plane_modulus: float):
     """Return a function that computes the displacements (N, N) of the centres of pixels, metres, from pressures (N, N),
-    pascals. `number`: N; `pixel`: sides of a pixel, metres.
+    pascals. `num_pixels`: N; `pixel`: sides of a pixel, metres.
 
     The displacement due to a rectangle under uniform pressure is that of Love (1929): Johnson, Contact Mechanics, 1985,
     equation 3.25.
     """
-    along, half = np.arange(2 * number) - number, np.asarray(pixel) / 2
+    along, half = np.arange(2 * num_pixels) - num_pixels, np.asarray(pixel) / 2
     x, y = np.meshgrid(pixel[0] * along, pixel[1] * along)
 
-    def corner(x, y):
+    def corner_displacement(x, y):
         return x * np.arcsinh(y / np.abs(x)) + y * np.arcsinh(x / np.abs(y))
 
-    influence = sum(i * j * corner(x + i * half[0], y + j * half[1]) for i in (1, -1) for j in (1, -1)) / (
+    influence = sum(i * j * corner_displacement(x + i * half[0], y + j * half[1]) for i in (1, -1) for j in (1, -1)) / (
         np.pi * plane_modulus
     )
     spectrum = np.fft.rfft2(np.fft.ifftshift(influence))
 
-    def sink(pressure):
-        padded = np.fft.rfft2(pressure, s=(2 * number, 2 * number))
-        return np.fft.irfft2(padded * spectrum, s=(2 * number, 2 * number))[:number, :number]
+    def displacements(pressure):
+        padded = np.fft.rfft2(pressure, s=(2 * num_pixels, 2 * num_pixels))
+        return np.fft.irfft2(padded * spectrum, s=(2 * num_pixels, 2 * num_pixels))[:num_pixels, :num_pixels]
 
-    return sink
+    return displacements
 
 
-def rigid_contact(gap: np.ndarray, sink, total: float) -> tuple[np.ndarray, float]:
-    """Find the pressures ≥ 0 with sum `total` whose displacements, computed by `sink`, close the `gap`; return them and
-    the approach, metres. The gap is infinite where nothing can touch. Raises `RuntimeError` if the iteration does not
-    converge."""
+def rigid_contact(gap: np.ndarray, displacements, total_pressure: float) -> tuple[np.ndarray, float]:
+    """Find the pressures ≥ 0 with sum `total_pressure` whose displacements, computed by `displacements`, close the
+    `gap`; return them and the approach, metres. The gap is infinite where nothing can touch. Raises `RuntimeError` if
+    the iteration does not converge."""
     may = np.isfinite(gap)
     gap = np.where(may, gap, 0.0)
-    pressure = may * (total / may.sum())
+    pressure = may * (total_pressure / may.sum())
     direction, last, again = np.zeros_like(gap), 1.0, False
     for _ in range(_MOST_STEPS):
         touching = pressure > 0
-        distance = sink(pressure) + gap
+        distance = displacements(pressure) + gap
         distance -= distance[touching].mean()
         square = np.sum(distance[touching] ** 2)
         direction = np.where(touching, distance + (square / last if again else 0.0) * direction, 0.0)
         last = square
-        response = sink(direction)
+        response = displacements(direction)
         response -= response[touching].mean()
         slope = np.sum(response * direction)
         if square == 0 or slope <= 0:  # converged to rounding errors, or only one pixel is in contact
@@ -164,9 +164,9 @@ def rigid_contact(gap: np.ndarray, sink, total: float) -> tuple[np.ndarray, floa
         overlapping = may & (pressure == 0) & (distance < 0)
         again = not overlapping.any()
         pressure[overlapping] -= length * distance[overlapping]
-        pressure *= total / pressure.sum()
-        if again and np.abs(pressure - before).sum() < _TOLERANCE * total:
+        pressure *= total_pressure / pressure.sum()
+        if again and np.abs(pressure - before).sum() < _TOLERANCE * total_pressure:
             break
     else:
         raise RuntimeError(f"the contact was not found in {_MOST_STEPS} steps; give the support fewer pixels.")
-    return pressure, float((sink(pressure) + gap)[pressure > 0].mean())
+    return pressure, float((displacements(pressure) + gap)[pressure > 0].mean())

@@ -19,7 +19,7 @@ from jeit.touch.simulate.contact.indents import IndentDraws, depth_maps, relativ
 # Version of the simulation, to be increased when its results change.
 _VERSION = 2
 # Lock with which only one thread of a worker computes the data shared by all chunks.
-_ONE = Lock()
+_ONE_THREAD = Lock()
 _MEANINGS = {
     "change": ("1", "change of each channel's voltage, relative to the skin at rest"),
     "depth": ("1", "depth of the indentation over the thickness of the skin, row 0 at the least y"),
@@ -75,20 +75,20 @@ class IndentSet:
         own = _VERSION, self.number, self.seed, self.chunk, self.shape
         return _digest(parts, str(own))
 
-    def solve(self, number: int) -> dict[str, np.ndarray]:
+    def solve(self, chunk: int) -> dict[str, np.ndarray]:
         """Simulate one chunk of k touches: relative changes of voltages (k, M) and depth maps (k, rows, columns), by
         name as in the store."""
-        key = jax.random.fold_in(jax.random.key(self.seed), number)
-        touches = self.draws.draw(key, len(self.chunks[number]))
+        key = jax.random.fold_in(jax.random.key(self.seed), chunk)
+        touches = self.draws.draw(key, len(self.chunks[chunk]))
         depth = depth_maps(touches, self.places) / float(self.skin.thickness)
-        with _ONE:
-            resting = _resting(_Deep(self.skin, self.draws.depth[1]))
+        with _ONE_THREAD:
+            resting = _shared_resting_skin(_SkinAndDepth(self.skin, self.draws.depth[1]))
         return {"change": relative_changes(self.skin, touches, resting), "depth": depth.astype(np.float32)}
 
     def contents(self) -> Contents:
         """Description of the arrays in the store of the set."""
 
-        def fill(group: Any) -> None:
+        def create_arrays(zarr_group: Any) -> None:
             channels = self.skin.model.protocol.num_measurements
             kinds = {
                 "change": ((channels,), ("channel",), "float64"),
@@ -96,7 +96,7 @@ class IndentSet:
             }
             for name, (shape, dimensions, dtype) in kinds.items():
                 unit, meaning = _MEANINGS[name]
-                group.create_array(
+                zarr_group.create_array(
                     name,
                     shape=(self.number, *shape),
                     chunks=(min(self.chunk, self.number), *shape),
@@ -108,10 +108,12 @@ class IndentSet:
 
         names = [*_MEANINGS]
         attributes = {"seed": self.seed}
-        return Contents("indent set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, fill)
+        return Contents(
+            "indent set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, create_arrays
+        )
 
 
-class _Deep:
+class _SkinAndDepth:
     """A skin and its maximum depth of indentation, metres, as a hashable key: equal for equal skins and depths."""
 
     def __init__(self, skin: Skin, depth: float):
@@ -120,16 +122,16 @@ class _Deep:
         self._all = _digest((model.mesh, model.electrodes, model.protocol, skin.model_conductivity), str(depth))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Deep) and other._all == self._all
+        return isinstance(other, _SkinAndDepth) and other._all == self._all
 
     def __hash__(self) -> int:
         return hash(self._all)
 
 
 @lru_cache(maxsize=1)
-def _resting(deep: _Deep) -> RestingSkin | None:
+def _shared_resting_skin(skin_and_depth: _SkinAndDepth) -> RestingSkin | None:
     """Data of the skin at rest shared by all chunks and sets of a skin; about a gigabyte for a layer."""
-    return resting_skin(deep.skin, deep.depth)
+    return resting_skin(skin_and_depth.skin, skin_and_depth.depth)
 
 
 def _digest(parts: Any, text: str) -> str:

@@ -41,7 +41,7 @@ class Disc(AbstractIndenter):
 
     def gap(self, points):
         """Zero beneath the disc, infinite elsewhere."""
-        return _flat(_distance(points) <= self.diameter / 2)
+        return _flat_gap(_distance_from_origin(points) <= self.diameter / 2)
 
     @property
     def reach(self) -> float:
@@ -68,8 +68,8 @@ class Ring(AbstractIndenter):
 
     def gap(self, points):
         """Zero beneath the wall of the tube, infinite elsewhere."""
-        distance = _distance(points)
-        return _flat((distance <= self.outer_diameter / 2) & (distance >= self.inner_diameter / 2))
+        distance = _distance_from_origin(points)
+        return _flat_gap((distance <= self.outer_diameter / 2) & (distance >= self.inner_diameter / 2))
 
     @property
     def reach(self) -> float:
@@ -92,7 +92,7 @@ class Bar(AbstractIndenter):
 
     def gap(self, points):
         """Zero beneath the bar, infinite elsewhere."""
-        return _flat(_within(points, self.length, self.width))
+        return _flat_gap(_is_within_rectangle(points, self.length, self.width))
 
     @property
     def reach(self) -> float:
@@ -118,7 +118,7 @@ class Prism(AbstractIndenter):
     def gap(self, points):
         """Height 2 height |y| / width beneath the prism, infinite elsewhere."""
         slope = 2 * self.height * np.abs(np.asarray(points)[..., 1]) / self.width
-        return np.where(_within(points, self.length, self.width), slope, np.inf)
+        return np.where(_is_within_rectangle(points, self.length, self.width), slope, np.inf)
 
     @property
     def reach(self) -> float:
@@ -139,7 +139,7 @@ class Revolved(AbstractIndenter):
 
     def gap(self, points):
         """Depth of the profile in its middle minus that at the points; infinite beyond its reach."""
-        distance = _distance(points)
+        distance = _distance_from_origin(points)
         deepest = float(self.indentation.depth_at(host.zeros(())))
         gap = deepest - np.asarray(self.indentation.depth_at(distance))
         return np.where(distance < self.reach, gap, np.inf)
@@ -192,26 +192,26 @@ class DepthMap(AbstractIndenter):
         return float(np.hypot(*self.height.shape) * self.pixel / 2)
 
 
-def check_indenter(name: str, given) -> None:
+def check_indenter(name: str, value) -> None:
     """Check that the argument `name` is an indenter. Raises `ValueError` otherwise."""
-    check_kind(name, given, AbstractIndenter, "an indenter, such as Disc(0.02) or ball(0.015)")
+    check_kind(name, value, AbstractIndenter, "an indenter, such as Disc(0.02) or ball(0.015)")
 
 
-def _check_size(name: str, value, most: float = np.inf, limit: str = "") -> None:
+def _check_size(name: str, value, maximum: float = np.inf, limit: str = "") -> None:
     """Check a length as `check_metres`, and warn if it looks like millimetres. Raises `ValueError` as
     `check_metres`."""
-    check_metres(name, value, most, limit)
+    check_metres(name, value, maximum, limit)
     check_length(name, value)
 
 
-def _distance(points):
+def _distance_from_origin(points):
     return np.linalg.norm(np.asarray(points), axis=-1)
 
 
-def _flat(there):
-    return np.where(there, 0.0, np.inf)
+def _flat_gap(is_beneath):
+    return np.where(is_beneath, 0.0, np.inf)
 
 
-def _within(points, length: float, width: float):
+def _is_within_rectangle(points, length: float, width: float):
     points = np.asarray(points)
     return (np.abs(points[..., 0]) <= length / 2) & (np.abs(points[..., 1]) <= width / 2)

@@ -73,7 +73,7 @@ class PressDraws(eqx.Module):
             raise ValueError(f"margin must be metres, zero or more; it is {describe(margin)}.")
         self.indenters, self.outline, self.at_once = indenters, outline, at_once
         self.load, self.margin = (float(span[0]), float(span[1])), float(margin)
-        if not self._inside(self._anywhere(np.random.default_rng(0), 1000)).any():
+        if not self._is_inside(self._random_places(np.random.default_rng(0), 1000)).any():
             raise ValueError(f"margin is {1e3 * self.margin:g} mm, which leaves no place on the skin; give less.")
 
     def draw(self, key: Array, number: int) -> list[tuple[Press, ...]]:
@@ -89,8 +89,8 @@ class PressDraws(eqx.Module):
         angle = random.uniform(-np.pi, np.pi, total)
         place = np.zeros((0, 2))
         while len(place) < total:
-            tried = self._anywhere(random, _TRIES * int(total))
-            place = np.concatenate([place, tried[self._inside(tried)]])
+            tried = self._random_places(random, _TRIES * int(total))
+            place = np.concatenate([place, tried[self._is_inside(tried)]])
         presses = [
             Press(self.indenters[one], float(newtons), where, float(turned))
             for one, newtons, where, turned in zip(which, load, place[:total], angle, strict=True)
@@ -101,14 +101,14 @@ class PressDraws(eqx.Module):
     def innermost(self) -> np.ndarray:
         """Place (x, y), metres, approximately farthest from the edge of the skin: the best of a thousand random
         places."""
-        places = self._anywhere(np.random.default_rng(0), 1000)
+        places = self._random_places(np.random.default_rng(0), 1000)
         return places[np.asarray(self.outline.signed_distance(places)).argmax()]
 
-    def _anywhere(self, random: np.random.Generator, number: int) -> np.ndarray:
+    def _random_places(self, random: np.random.Generator, count: int) -> np.ndarray:
         low_x, high_x, low_y, high_y = map(float, self.outline.extent)
-        return random.uniform((low_x, low_y), (high_x, high_y), (number, 2))
+        return random.uniform((low_x, low_y), (high_x, high_y), (count, 2))
 
-    def _inside(self, places: np.ndarray) -> np.ndarray:
+    def _is_inside(self, places: np.ndarray) -> np.ndarray:
         return np.asarray(self.outline.signed_distance(places)) >= self.margin
 
 
@@ -227,7 +227,7 @@ def indented_cells(skin: Skin, touches: Sequence[Sequence[Indent]]) -> TouchedCe
 def relative_changes(
     skin: Skin, touches: Sequence[Sequence[Indent]], resting: RestingSkin | None = None
 ) -> Float[np.ndarray, "n M"]:
-    """Exact changes (n, M) of a skin's voltages due to n touches, relative to those at rest, see `relative_to`.
+    """Exact changes (n, M) of a skin's voltages due to n touches, relative to the voltages at rest (see `relative_to`).
 
     `resting`: data of the same skin at rest, from `resting_skin`, which several calls can share. Raises `ValueError` as
     `indented_cells`.

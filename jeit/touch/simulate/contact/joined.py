@@ -74,9 +74,9 @@ class TwoSheets(eqx.Module):
             cell_conductivity(mesh, host.asarray(check_conductivity(mesh, one)))
             for one in (conductivity, upper_conductivity)
         ]
-        lower, upper = (_matrices(np.asarray(stiffness(mesh, one))) for one in sheets)
+        lower, upper = (_symmetric_matrices(np.asarray(stiffness(mesh, one))) for one in sheets)
         area = np.asarray(measures(mesh))
-        between = np.maximum(_checked(conductance, mesh.num_cells), _LEAST * sheets[1] / area.sum())
+        between = np.maximum(_check_conductance(conductance, mesh.num_cells), _LEAST * sheets[1] / area.sum())
         coupling = (between * area / 12)[:, None, None] * (1 + np.eye(3))
         element = host.block([[lower + coupling, -coupling], [-coupling, upper + coupling]])
         contact = electrodes.contact(mesh)
@@ -90,24 +90,25 @@ class TwoSheets(eqx.Module):
         return np.asarray(channel_voltages(on_host(self.model.protocol), impedance))
 
 
-def _matrices(packed: Float[np.ndarray, "6 m"]) -> Float[np.ndarray, "m 3 3"]:
+def _symmetric_matrices(packed: Float[np.ndarray, "6 m"]) -> Float[np.ndarray, "m 3 3"]:
+    """Symmetric matrices (m, 3, 3) from the six entries of their lower triangles."""
     rows, columns = np.tril_indices(3)
     full = np.zeros((packed.shape[1], 3, 3))
     full[:, rows, columns] = full[:, columns, rows] = packed.T
     return full
 
 
-def _checked(conductance, number: int) -> Float[np.ndarray, " m"]:
+def _check_conductance(conductance, num_cells: int) -> Float[np.ndarray, " m"]:
     conductance = np.asarray(conductance, float)
-    if conductance.shape not in [(), (number,)] or not np.isfinite(conductance).all() or (conductance < 0).any():
+    if conductance.shape not in [(), (num_cells,)] or not np.isfinite(conductance).all() or (conductance < 0).any():
         raise ValueError(
-            f"conductance must be zero or more, S/m², one for all or one a cell ({number},); it has shape "
+            f"conductance must be zero or more, S/m², one for all or one a cell ({num_cells},); it has shape "
             f"{conductance.shape}."
         )
-    return np.broadcast_to(conductance, number)
+    return np.broadcast_to(conductance, num_cells)
 
 
-class Placed(AbstractIndenter):
+class PlacedIndenter(AbstractIndenter):
     """An `indenter` rotated counter-clockwise by `angle` in radians, then moved to `position` (x, y) in metres."""
 
     indenter: AbstractIndenter
@@ -130,9 +131,9 @@ class Placed(AbstractIndenter):
         return float(np.hypot(*self.position) + self.indenter.reach)
 
 
-class Joined(AbstractIndenter):
+class JoinedIndenters(AbstractIndenter):
     """One rigid body of several `parts` under one load, with their lowest points at the same height. Parts beside each
-    other are `Placed`."""
+    other are `PlacedIndenter`."""
 
     parts: tuple[AbstractIndenter, ...]
 
@@ -140,7 +141,8 @@ class Joined(AbstractIndenter):
         """Create the body. Raises `ValueError` without parts, and for parts that are not indenters."""
         if not parts:
             raise ValueError(
-                "parts: give one indenter at least, such as Joined(Disc(0.01), Placed(Disc(0.01), (0.02, 0)))"
+                "parts: give one indenter at least, such as JoinedIndenters(Disc(0.01), PlacedIndenter(Disc(0.01), "
+                "(0.02, 0)))"
             )
         for number, part in enumerate(parts):
             check_indenter(f"part {number}", part)

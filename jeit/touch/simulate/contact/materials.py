@@ -14,7 +14,7 @@ from jeit.touch.simulate.contact.press import (
     AbstractPressure,
     AbstractSupport,
     check_load,
-    check_seen,
+    check_resolved,
     check_support,
     contact_window,
     raster,
@@ -67,20 +67,20 @@ class Foundation(AbstractSupport):
         """
         check_load(load)
 
-        def balanced(window, number: int) -> tuple[np.ndarray, float]:
-            points, pixel = raster(window, number)
+        def balance_load(window, num_pixels: int) -> tuple[np.ndarray, float]:
+            points, pixel = raster(window, num_pixels)
             gap = indenter.gap(points)
             area = np.full(gap.size, pixel.prod())
-            return gap, float(level(gap.ravel(), area, load / self.stiffness))
+            return gap, float(water_level(gap.ravel(), area, load / self.stiffness))
 
-        def pressed(window, number: int) -> np.ndarray:
-            gap, approach = balanced(window, number)
+        def is_pressed(window, num_pixels: int) -> np.ndarray:
+            gap, approach = balance_load(window, num_pixels)
             return gap < approach
 
-        window = contact_window(pressed, indenter.reach, _COARSE)
-        gap, approach = balanced(window, _FINE)
+        window = contact_window(is_pressed, indenter.reach, _COARSE)
+        gap, approach = balance_load(window, _FINE)
         points, pixel = raster(window, _FINE)
-        check_seen(gap < approach, pixel)
+        check_resolved(gap < approach, pixel)
         self._check_approach(approach, load)
         reach = float(np.linalg.norm(points[gap < approach], axis=-1).max() + np.hypot(*pixel))
         return FoundationPressure(float(load), approach, reach, indenter, self.stiffness)
@@ -89,7 +89,7 @@ class Foundation(AbstractSupport):
         """Pressures (n, q) with the approach that balances each load on the given points. On a curved skin, `fall` is
         added to the gaps. Raises `ValueError` for a load that presses through the layer."""
         gap = indenter.gap(points) if fall is None else indenter.gap(points) + fall
-        approach = level(gap, areas, loads / self.stiffness)
+        approach = water_level(gap, areas, loads / self.stiffness)
         deepest = approach.argmax()
         self._check_approach(approach[deepest], loads[deepest])
         return self.stiffness * np.maximum(approach[:, None] - gap, 0.0)
@@ -97,12 +97,12 @@ class Foundation(AbstractSupport):
     def _check_approach(self, approach: float, load: float) -> None:
         if approach >= self.thickness:
             raise ValueError(
-                f"load is {load:g} N, which takes the indenter {1e3 * approach:.3g} mm into a layer "
+                f"load is {load:g} N, which presses the indenter {1e3 * approach:.3g} mm into a layer "
                 f"{1e3 * self.thickness:.3g} mm thick; give less load, a wider indenter or a stiffer layer."
             )
 
 
-def level(
+def water_level(
     gap: Float[np.ndarray, "*n q"], area: Float[np.ndarray, "*n q"], volume: Float[np.ndarray, "*n"] | float
 ) -> Float[np.ndarray, "*n"]:
     """Level δ at which Σ area · max(δ − gap, 0) equals `volume`, like the level of water over uneven ground; 0 if every
@@ -163,13 +163,13 @@ class Material(eqx.Module):
         check_metres("thickness", self.thickness)
         check_support("support", self.support)
         for name in ("conductivity", "half_pressure"):
-            _check(name, getattr(self, name), lambda value: value > 0, "positive")
-        _check("saturation", self.saturation, lambda value: value > -1, "above −1, where nothing conducts")
-        _check("hysteresis", self.hysteresis, lambda value: 0 <= value < 1, "from 0 to below 1")
+            _check_number(name, getattr(self, name), lambda value: value > 0, "positive")
+        _check_number("saturation", self.saturation, lambda value: value > -1, "above −1, where nothing conducts")
+        _check_number("hysteresis", self.hysteresis, lambda value: 0 <= value < 1, "from 0 to below 1")
         for name in ("conductivity_walk", "contact_walk", "noise", "gain_spread"):
-            _check(name, getattr(self, name), lambda value: value >= 0, "zero or more")
+            _check_number(name, getattr(self, name), lambda value: value >= 0, "zero or more")
         for name in ("conductivity_trend", "contact_trend"):
-            _check(name, getattr(self, name), lambda _: True, "a number")
+            _check_number(name, getattr(self, name), lambda _: True, "a number")
         if not _are_branches(self.creep):
             raise ValueError(
                 f"creep: give (share, seconds) of every branch, shares of sum below 1, such as ((0.1, 1.0), (0.1, "
@@ -182,9 +182,9 @@ class Material(eqx.Module):
         return self.saturation * pressure / (pressure + self.half_pressure)
 
 
-def _check(name: str, value, holds: Callable[[float], bool], wanted: str) -> None:
-    if not (is_number(value) and holds(value)):
-        raise ValueError(f"{name} must be {wanted}; it is {describe(value)}.")
+def _check_number(name: str, value, is_valid: Callable[[float], bool], requirement: str) -> None:
+    if not (is_number(value) and is_valid(value)):
+        raise ValueError(f"{name} must be {requirement}; it is {describe(value)}.")
 
 
 def _are_branches(creep) -> bool:

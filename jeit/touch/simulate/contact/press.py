@@ -77,15 +77,15 @@ class PressureRaster(AbstractPressure):
         return flat.reshape(place.shape[1:])
 
 
-def raster(half_widths, number: int) -> tuple[Float[np.ndarray, "N N 2"], Float[np.ndarray, "2"]]:
+def raster(half_widths, num_pixels: int) -> tuple[Float[np.ndarray, "N N 2"], Float[np.ndarray, "2"]]:
     """Centres (N, N, 2) of the N × N pixels of a rectangle around the origin, and the sides of a pixel (2,), metres.
-    `half_widths`: half the sides of the rectangle; `number`: N."""
-    pixel = 2 * np.asarray(half_widths, float) / number
-    along = np.arange(number) - (number - 1) / 2
+    `half_widths`: half the sides of the rectangle; `num_pixels`: N."""
+    pixel = 2 * np.asarray(half_widths, float) / num_pixels
+    along = np.arange(num_pixels) - (num_pixels - 1) / 2
     return np.stack(np.meshgrid(pixel[0] * along, pixel[1] * along), axis=-1), pixel
 
 
-def contact_window(pressed, reach: float, number: int) -> Float[np.ndarray, "2"]:
+def contact_window(is_pressed, reach: float, num_pixels: int) -> Float[np.ndarray, "2"]:
     """Half the sides, in metres, of a rectangle around the origin that encloses the contact closely.
 
     `pressed(half_widths, number)`: (N, N), whether each pixel of a raster over that rectangle is in contact. Starting
@@ -94,8 +94,8 @@ def contact_window(pressed, reach: float, number: int) -> Float[np.ndarray, "2"]
     """
     window = np.full(2, reach)
     while True:
-        points, pixel = raster(window, number)
-        touched = points[pressed(window, number)]
+        points, pixel = raster(window, num_pixels)
+        touched = points[is_pressed(window, num_pixels)]
         if not len(touched):
             return window
         extent = np.abs(touched).max(axis=0) + pixel
@@ -110,7 +110,7 @@ def check_load(load) -> None:
         raise ValueError(f"load must be positive, in newtons (100 g weigh 0.98 N); it is {describe(load)}.")
 
 
-def check_seen(contact: Bool[np.ndarray, "N N"], pixel) -> None:
+def check_resolved(contact: Bool[np.ndarray, "N N"], pixel) -> None:
     """Check that a contact covers at least one pixel of a raster; `pixel`: sides of a pixel, metres. Raises
     `ValueError` otherwise."""
     if not contact.any():
@@ -120,9 +120,9 @@ def check_seen(contact: Bool[np.ndarray, "N N"], pixel) -> None:
         )
 
 
-def check_support(name: str, given) -> None:
+def check_support(name: str, value) -> None:
     """Check that the argument `name` is a support. Raises `ValueError` otherwise."""
-    check_kind(name, given, AbstractSupport, "a support, such as Foundation(1e6, 3e-3) or HalfSpace(1e6)")
+    check_kind(name, value, AbstractSupport, "a support, such as Foundation(1e6, 3e-3) or HalfSpace(1e6)")
 
 
 class Press(eqx.Module):

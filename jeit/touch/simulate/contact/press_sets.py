@@ -86,11 +86,11 @@ class PressSet:
             digest.update(np.asarray(leaf).tobytes())
         return digest.hexdigest()
 
-    def solve(self, number: int) -> dict[str, np.ndarray]:
+    def solve(self, chunk: int) -> dict[str, np.ndarray]:
         """Simulate one chunk of k touches: arrays (k, …) by name as in the store, NaN where a touch has fewer presses
         than `at_once`."""
-        for_draws, for_frames = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), number))
-        touches = self.draws.draw(for_draws, len(self.chunks[number]))
+        for_draws, for_frames = jax.random.split(jax.random.fold_in(jax.random.key(self.seed), chunk))
+        touches = self.draws.draw(for_draws, len(self.chunks[chunk]))
         results = {name: np.full((len(touches), *shape), np.nan) for name, (shape, _) in self._shapes().items()}
         results["voltages"] = self.skin.frames(for_frames, touches, held=self.held, elapsed=self.elapsed)
         kinds = {id(indenter): kind for kind, indenter in enumerate(self.draws.indenters)}
@@ -103,10 +103,10 @@ class PressSet:
     def contents(self) -> Contents:
         """Description of the arrays in the store of the set."""
 
-        def fill(group: Any) -> None:
+        def create_arrays(zarr_group: Any) -> None:
             for name, (shape, dimensions) in self._shapes().items():
                 unit, meaning = _MEANINGS[name]
-                group.create_array(
+                zarr_group.create_array(
                     name,
                     shape=(self.number, *shape),
                     chunks=(min(self.chunk, self.number), *shape),
@@ -118,7 +118,9 @@ class PressSet:
 
         attributes = {"seed": self.seed, "held_s": self.held, "elapsed_s": self.elapsed}
         names = [*self._shapes()]
-        return Contents("press set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, fill)
+        return Contents(
+            "press set", "simulate_presses", self.fingerprint, self.chunks, names, attributes, create_arrays
+        )
 
     def _shapes(self) -> dict[str, tuple[tuple[int, ...], tuple[str, ...]]]:
         """Shape and dimensions of each array for one touch, by name."""
@@ -152,7 +154,7 @@ def simulate_presses(
         done = set(store.sound())
         left = [number for number in range(len(presses.chunks)) if number not in done]
         report = ProgressReporter(presses.chunks, done, progress)
-        for number, results in _solved(presses, left, client):
+        for number, results in _solve_chunks(presses, left, client):
             store.write(number, results)
             report.finished(number)
     return open_presses(presses, path)
@@ -173,14 +175,14 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
     return store.open_dataset().assign_coords(finished=("touch", finished))
 
 
-def solve_presses(presses: PressSet | IndentSet, number: int) -> dict[str, np.ndarray]:
+def solve_presses(presses: PressSet | IndentSet, chunk: int) -> dict[str, np.ndarray]:
     """Simulate one chunk of a set as `PressSet.solve`, but as a function, which can be sent to workers of a cluster."""
-    return presses.solve(number)
+    return presses.solve(chunk)
 
 
-def _solved(
-    presses: PressSet | IndentSet, numbers: list[int], client: Any
+def _solve_chunks(
+    presses: PressSet | IndentSet, chunks: list[int], client: Any
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     if client is None:
-        return ((number, solve_presses(presses, number)) for number in numbers)
-    return over_cluster(client, solve_presses, presses, numbers)
+        return ((number, solve_presses(presses, number)) for number in chunks)
+    return over_cluster(client, solve_presses, presses, chunks)

@@ -49,19 +49,19 @@ def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..
     return np.asarray(jax.random.normal(key, (1 << max(number - 1, 0).bit_length(),)))[:number].reshape(shape)
 
 
-def walk(
-    key: Array, seconds: Float[np.ndarray, " T"], trend: float, deviation: float, number: int
+def random_walk(
+    key: Array, seconds: Float[np.ndarray, " T"], trend: float, deviation: float, count: int
 ) -> Float[np.ndarray, "T k"]:
-    """Logarithms (T, k) of `number` = k drifting quantities, 0 at time 0: a common `trend` per second, and an
+    """Logarithms (T, k) of `count` = k drifting quantities, 0 at time 0: a common `trend` per second, and an
     independent random walk with standard `deviation` per √s for each. `seconds`: (T,), in ascending order."""
     steps = np.diff(seconds, prepend=0.0)
-    normal = standard_normal(key, (len(steps), number))
+    normal = standard_normal(key, (len(steps), count))
     return trend * np.asarray(seconds)[:, None] + deviation * np.cumsum(np.sqrt(steps)[:, None] * normal, axis=0)
 
 
-def gains(key: Array, spread: float, number: int) -> Float[np.ndarray, " M"]:
-    """Draw gains of `number` channels, log-normal about 1; `spread`: standard deviation of the logarithm."""
-    return np.exp(spread * standard_normal(key, (number,)))
+def draw_gains(key: Array, spread: float, num_channels: int) -> Float[np.ndarray, " M"]:
+    """Draw gains of `num_channels` channels, log-normal about 1; `spread`: standard deviation of the logarithm."""
+    return np.exp(spread * standard_normal(key, (num_channels,)))
 
 
 def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
@@ -69,7 +69,7 @@ def white_noise(key: Array, deviation: float, shape: tuple[int, ...]) -> Float[n
     return deviation * standard_normal(key, shape)
 
 
-class Strain(NamedTuple):
+class MaterialState(NamedTuple):
     """State of a material at m points, in pascals. **Fields**: `held`: (m,), output w of the hysteresis; `late`: (k,
     m), states y of the delayed branches."""
 
@@ -77,25 +77,25 @@ class Strain(NamedTuple):
     late: Float[np.ndarray, "k m"]
 
 
-def unstrained(material: Material, number: int) -> Strain:
-    """State of a material at `number` points without earlier load."""
-    return Strain(np.zeros(number), np.zeros((len(material.creep), number)))
+def unloaded_state(material: Material, num_points: int) -> MaterialState:
+    """State of a material at `num_points` points without earlier load."""
+    return MaterialState(np.zeros(num_points), np.zeros((len(material.creep), num_points)))
 
 
-def advance(
-    material: Material, strain: Strain, pressure: Float[np.ndarray, " m"], seconds: float
-) -> tuple[Strain, Float[np.ndarray, " m"]]:
-    """Advance the state `strain` by a time step in `seconds` to `pressure` (m,); return the new state and the effective
+def advance_state(
+    material: Material, state: MaterialState, pressure: Float[np.ndarray, " m"], seconds: float
+) -> tuple[MaterialState, Float[np.ndarray, " m"]]:
+    """Advance the state `state` by a time step in `seconds` to `pressure` (m,); return the new state and the effective
     pressure (m,), pascals."""
-    held = np.maximum(pressure, np.minimum(strain.held, pressure / (1 - material.hysteresis)))
+    held = np.maximum(pressure, np.minimum(state.held, pressure / (1 - material.hysteresis)))
     shares, times = _branches(material)
-    late = strain.late
+    late = state.late
     if seconds > 0:
         passed = seconds / times
         kept = np.exp(-passed)
         slope = 1 + np.expm1(-passed) / passed
-        late = kept * late + (1 - kept) * strain.held + slope * (held - strain.held)
-    return Strain(held, late), (1 - shares.sum()) * held + np.sum(shares * late, axis=0)
+        late = kept * late + (1 - kept) * state.held + slope * (held - state.held)
+    return MaterialState(held, late), (1 - shares.sum()) * held + np.sum(shares * late, axis=0)
 
 
 def held_pressure(material: Material, pressure: Float[np.ndarray, "..."], seconds: float) -> Float[np.ndarray, "..."]:
@@ -159,11 +159,11 @@ class PressedSkin(eqx.Module):
         check_name("face", face, ("outer", "inner"))
         self.model, self.material, self.face = model, material, face
         self.conductivity = np.asarray(check_conductivity(model.mesh, conductivity))
-        self.gain = gains(key, material.gain_spread, model.protocol.num_measurements)
+        self.gain = draw_gains(key, material.gain_spread, model.protocol.num_measurements)
 
     def rest(self) -> Float[np.ndarray, " M"]:
         """Voltages (M,) of the untouched skin with gains, but without drift and noise."""
-        return self.gain * self._at_rest
+        return self.gain * self._exact_rest
 
     def frames(
         self,
@@ -197,10 +197,10 @@ class PressedSkin(eqx.Module):
         """Cells whose conductivity is changed by n touches, and their relative changes. Arguments as in `frames`.
         Raises `ValueError` as `frames`."""
         touches = touches_of(presses)
-        pressed = pressed_cells(Samples.of(self.model.mesh, self.face), self.material.support, touches, progress)
+        pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
         change = self.material.change(held_pressure(self.material, pressed.pressure, held)).mean(axis=-1)
         places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
-        return _touched(places, pressed.cells, change, self.model.mesh.num_cells)
+        return _collect_changes(places, pressed.cells, change, self.model.mesh.num_cells)
 
     def record(
         self,
@@ -243,7 +243,7 @@ class PressedSkin(eqx.Module):
             return []
         times = [_check_times(seconds) for _, seconds in recordings]
         each = [self.touched_in_time(motions, own) for (motions, _), own in zip(recordings, times, strict=True)]
-        exact = self.voltages_under(_together(each), progress=progress)
+        exact = self.voltages_under(_concatenate(each), progress=progress)
         parts = np.split(exact, np.cumsum([len(own) for own in times])[:-1])
         keys = jax.random.split(key, len(times))
         return [self.read(one, part, own) for one, part, own in zip(keys, parts, times, strict=True)]
@@ -261,20 +261,20 @@ class PressedSkin(eqx.Module):
         motions = motions_of(motions, len(seconds))
         found = [[motion.at(frame) for motion in motions] for frame in range(len(seconds))]
         touches = [tuple(press for press in some if press is not None) for some in found]
-        pressed = pressed_cells(Samples.of(self.model.mesh, self.face), self.material.support, touches, progress)
+        pressed = pressed_cells(Samples.from_mesh(self.model.mesh, self.face), self.material.support, touches, progress)
         there = [own.any(axis=-1) for own in pressed.pressure]
         cells = np.unique(pressed.cells[np.array(there)]) if motions else np.zeros(1, int)
         place = np.searchsorted(cells, pressed.cells)
         shape = len(cells), pressed.pressure.shape[-1]
-        strain, before = unstrained(self.material, cells.size * shape[1]), seconds[0]
+        strain, before = unloaded_state(self.material, cells.size * shape[1]), seconds[0]
         change = np.zeros((len(seconds), len(cells)))
         for frame, now in enumerate(seconds):
             pressure = np.zeros(shape)
             pressure[place[frame][there[frame]]] = pressed.pressure[frame][there[frame]]
-            strain, effective = advance(self.material, strain, pressure.ravel(), now - before)
+            strain, effective = advance_state(self.material, strain, pressure.ravel(), now - before)
             change[frame], before = self.material.change(effective.reshape(shape)).mean(axis=-1), now
         places = np.array([touch[0].position if touch else np.zeros(self._dimension) for touch in touches])
-        return _touched(places, np.broadcast_to(cells, change.shape), change, self.model.mesh.num_cells)
+        return _collect_changes(places, np.broadcast_to(cells, change.shape), change, self.model.mesh.num_cells)
 
     def voltages_under(
         self, touched: TouchedCells, *, progress: Callable[[str], None] | None = None
@@ -284,12 +284,12 @@ class PressedSkin(eqx.Module):
         `progress` is called with the number of touches done. Raises as `touch_changes`.
         """
         done = 0
-        voltages = np.tile(self._at_rest, (len(touched.places), 1))
+        voltages = np.tile(self._exact_rest, (len(touched.places), 1))
         places, cells, change = (np.asarray(one) for one in (touched.places, touched.cells, touched.change))
-        for alike in _kinds(self.model.mesh, cells, change):
+        for alike in _groups_of_similar_cost(self.model.mesh, cells, change):
             for some in np.split(alike, range(_AT_ONCE, len(alike), _AT_ONCE)):
-                even = some[np.minimum(np.arange(_even(len(some))), len(some) - 1)]
-                own = slice(0, _even(int(np.count_nonzero(change[some], axis=1).max())))
+                even = some[np.minimum(np.arange(_round_up(len(some))), len(some) - 1)]
+                own = slice(0, _round_up(int(np.count_nonzero(change[some], axis=1).max())))
                 arrays = as_array(places[even]), as_array(cells[even, own]), as_array(change[even, own])
                 rows = TouchedCells(*arrays, num_cells=touched.num_cells)
                 voltages[some] += np.asarray(touch_changes(self.model, self.conductivity, rows))[: len(some)]
@@ -309,12 +309,12 @@ class PressedSkin(eqx.Module):
         check_key(key)
         for_conductivity, for_contacts, for_noise = jax.random.split(key, 3)
         own = self.material
-        drift = walk(for_conductivity, seconds, own.conductivity_trend, own.conductivity_walk, 1)
+        drift = random_walk(for_conductivity, seconds, own.conductivity_trend, own.conductivity_walk, 1)
         if drift.any() or own.contact_trend or own.contact_walk:
             number = self.model.electrodes.num_electrodes
-            contacts = walk(for_contacts, seconds, own.contact_trend, own.contact_walk, number)
+            contacts = random_walk(for_contacts, seconds, own.contact_trend, own.contact_walk, number)
             exact = (exact + (contacts + drift) @ self._contact_slope) * np.exp(-drift)
-        deviation = own.noise * float(np.sqrt(np.mean(self._at_rest**2)))
+        deviation = own.noise * float(np.sqrt(np.mean(self._exact_rest**2)))
         return self.gain * (exact + white_noise(for_noise, deviation, exact.shape))
 
     @property
@@ -323,7 +323,7 @@ class PressedSkin(eqx.Module):
         return 3 if is_curved(self.model.mesh) else 2
 
     @cached_property
-    def _at_rest(self) -> Float[np.ndarray, " M"]:
+    def _exact_rest(self) -> Float[np.ndarray, " M"]:
         """Voltages (M,) of the model at rest."""
         return np.asarray(self.model.voltages(self.conductivity))
 
@@ -339,30 +339,32 @@ class PressedSkin(eqx.Module):
         return np.stack([select_channels(protocol, one) for one in slope])
 
 
-def _touched(places, cells, change, number: int) -> TouchedCells:
+def _collect_changes(places, cells, change, num_cells: int) -> TouchedCells:
     """Collect the changes that are not negligible as `TouchedCells`, padded with zeros at the end of each row."""
     kept = np.abs(change) > _LEAST * np.abs(change).max(axis=1, keepdims=True)
     rows, there = pad_rows([row[one] for row, one in zip(cells, kept, strict=True)])
-    wide = _even(rows.shape[1]) - rows.shape[1]
+    wide = _round_up(rows.shape[1]) - rows.shape[1]
     changes = np.zeros(rows.shape)
     changes[there] = change[kept]
     rows, changes = (np.pad(array, ((0, 0), (0, wide))) for array in (rows, changes))
-    return TouchedCells(as_array(places), as_array(rows), as_array(changes), number)
+    return TouchedCells(as_array(places), as_array(rows), as_array(changes), num_cells)
 
 
-def _together(each: Sequence[TouchedCells]) -> TouchedCells:
+def _concatenate(each: Sequence[TouchedCells]) -> TouchedCells:
     """Concatenate the touched cells of several recordings, padded with zeros at the end of each row."""
     wide = max(one.cells.shape[1] for one in each)
 
-    def joined(name: str) -> Array:
+    def concatenate(name: str) -> Array:
         arrays = [np.asarray(getattr(one, name)) for one in each]
         return as_array(np.concatenate([np.pad(one, ((0, 0), (0, wide - one.shape[1]))) for one in arrays]))
 
     places = as_array(np.concatenate([np.asarray(one.places) for one in each]))
-    return TouchedCells(places, joined("cells"), joined("change"), each[0].num_cells)
+    return TouchedCells(places, concatenate("cells"), concatenate("change"), each[0].num_cells)
 
 
-def _kinds(mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, "n c"]) -> list[np.ndarray]:
+def _groups_of_similar_cost(
+    mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, "n c"]
+) -> list[np.ndarray]:
     """Group touches by similar cost, and return the numbers of the touches in each group.
 
     Groups differ in the number of touched cells, and in whether these are close together or form contacts that are
@@ -378,9 +380,9 @@ def _kinds(mesh: Mesh, cells: Int[np.ndarray, "n c"], change: Float[np.ndarray, 
     return [np.flatnonzero(kinds == kind) for kind in np.unique(kinds[kinds > 0])]
 
 
-def _even(number: int) -> int:
+def _round_up(count: int) -> int:
     """Round up to a power of two, at least 16, since JAX compiles a program for every number of touches and cells."""
-    return 2 ** max(4, (number - 1).bit_length())
+    return 2 ** max(4, (count - 1).bit_length())
 
 
 def check_seconds(name: str, value) -> None:

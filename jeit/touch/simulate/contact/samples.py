@@ -28,7 +28,7 @@ _LEVEL = 0.866
 _OFF = 0.5
 
 
-class Curved(NamedTuple):
+class CurvedGeometry(NamedTuple):
     """Geometry of a curved skin. **Fields**: `surface`: the touched surface; `corners`: (m, k, 3), its unit normals at
     the corners of cells; `cells`: (m, 3), its unit normals at the cells."""
 
@@ -51,10 +51,10 @@ class Samples(NamedTuple):
     area: Float[np.ndarray, " m"]
     radius: float
     corners: Float[np.ndarray, "m k d"]
-    curved: Curved | None = None
+    curved: CurvedGeometry | None = None
 
     @classmethod
-    def of(cls, mesh: Mesh, face: str = "outer") -> "Samples":
+    def from_mesh(cls, mesh: Mesh, face: str = "outer") -> "Samples":
         """Create the samples of a sheet or a layer. The cells of a layer are pressed like the surface above them, in a
         curved layer like its `face`."""
         if is_curved(mesh):
@@ -65,7 +65,7 @@ class Samples(NamedTuple):
         corners = corners[..., :2]
         points = lattice(corners, _LATTICE)
         area = np.asarray(measures(mesh)) / thickness / points.shape[1]
-        return cls(points, area, _radius(corners), corners)
+        return cls(points, area, _largest_cell_radius(corners), corners)
 
     @classmethod
     def _of_curved(cls, mesh: Mesh, face: str) -> "Samples":
@@ -73,17 +73,23 @@ class Samples(NamedTuple):
         feet = surface.nearest(np.asarray(mesh.points))
         corners, normals = feet.points[cells], surface.normals_at(feet)[cells]
         above = surface.nearest(corners.mean(axis=1)).triangle
-        points = _rounded(corners, normals, _LATTICE)
+        points = _curved_lattice(corners, normals, _LATTICE)
         # In a layer, the area of a triangle of the surface is divided among the cells beneath it by their volumes.
         share = size / np.bincount(above, size, len(surface.cells))[above]
         area = share * surface.areas[above] / points.shape[1]
-        return cls(points, area, _radius(corners), corners, Curved(surface, normals, surface.normals[above]))
+        return cls(
+            points,
+            area,
+            _largest_cell_radius(corners),
+            corners,
+            CurvedGeometry(surface, normals, surface.normals[above]),
+        )
 
-    def on(self, cells: Int[np.ndarray, " c"], number: int) -> Float[np.ndarray, "c s d"]:
-        """Sample points (c, s, d) in the given cells, on a lattice whose fineness increases with `number`."""
+    def lattice_points(self, cells: Int[np.ndarray, " c"], fineness: int) -> Float[np.ndarray, "c s d"]:
+        """Sample points (c, s, d) in the given cells, on a lattice whose fineness increases with `fineness`."""
         if self.curved is None:
-            return lattice(self.corners[cells], number)
-        return _rounded(self.corners[cells], self.curved.corners[cells], number)
+            return lattice(self.corners[cells], fineness)
+        return _curved_lattice(self.corners[cells], self.curved.corners[cells], fineness)
 
     def check(self, presses: Sequence[Press]) -> None:
         """Check the positions of presses. Raises `ValueError` for positions with another number of coordinates, and for
@@ -108,11 +114,11 @@ class Samples(NamedTuple):
                 "face."
             )
 
-    def near(self, presses: Sequence[Press], cells: Sequence) -> list[Int[np.ndarray, " c"]]:
+    def facing_cells(self, presses: Sequence[Press], cells: Sequence) -> list[Int[np.ndarray, " c"]]:
         """Select the cells of each press that face it, unlike the far side of a sleeve."""
         if self.curved is None:
             return [np.asarray(own, int) for own in cells]
-        towards = _frames(self.curved.surface, presses)[1][:, 2]
+        towards = _indenter_axes(self.curved.surface, presses)[1][:, 2]
         own = [np.asarray(one, int) for one in cells]
         return [some[self.curved.cells[some] @ axis > _BENEATH] for some, axis in zip(own, towards, strict=True)]
 
@@ -122,7 +128,9 @@ class Samples(NamedTuple):
         press."""
         return 1.0 if self.curved is None else _CHORD
 
-    def seen(self, presses: Sequence[Press], cells: Int[np.ndarray, "b c"], points: Float[np.ndarray, "b q d"]):
+    def to_indenter_frames(
+        self, presses: Sequence[Press], cells: Int[np.ndarray, "b c"], points: Float[np.ndarray, "b q d"]
+    ):
         """Transform points to the frames of indenters, which move along the inward normal at the place pressed.
 
         Returns the coordinates of the points in the frames (b, q, 2); their distance (b, q) below the tangent plane at
@@ -134,29 +142,31 @@ class Samples(NamedTuple):
             x, y = np.moveaxis(points - np.array([press.position for press in presses])[:, None], -1, 0)
             fall, share = np.zeros(points.shape[:-1]), np.ones(cells.shape)
         else:
-            origin, axes = _frames(self.curved.surface, presses)
+            origin, axes = _indenter_axes(self.curved.surface, presses)
             x, y, up = np.moveaxis(np.einsum("bqd,bad->bqa", points - origin[:, None], axes), -1, 0)
             fall, share = -up, np.einsum("bcd,bd->bc", self.curved.cells[cells], axes[:, 2])
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1), fall, share
 
 
-def lattice(corners: Float[np.ndarray, "m k d"], number: int) -> Float[np.ndarray, "m s d"]:
-    """Evenly spaced points (m, s, d) in cells with the given corners; their number s increases with `number`."""
-    return np.einsum("sk,mkd->msd", _weights(corners.shape[1], number), corners)
+def lattice(corners: Float[np.ndarray, "m k d"], fineness: int) -> Float[np.ndarray, "m s d"]:
+    """Evenly spaced points (m, s, d) in cells with the given corners; their number s increases with `fineness`."""
+    return np.einsum("sk,mkd->msd", _barycentric_weights(corners.shape[1], fineness), corners)
 
 
-def _weights(size: int, number: int) -> Float[np.ndarray, "s k"]:
-    steps = [each for each in itertools.product(range(number + 1), repeat=size) if sum(each) == number]
-    return (np.array(steps) + 1 / size) / (number + 1)
+def _barycentric_weights(num_corners: int, fineness: int) -> Float[np.ndarray, "s k"]:
+    steps = [each for each in itertools.product(range(fineness + 1), repeat=num_corners) if sum(each) == fineness]
+    return (np.array(steps) + 1 / num_corners) / (fineness + 1)
 
 
-def _rounded(corners, normals, number: int) -> Float[np.ndarray, "m s 3"]:
+def _curved_lattice(corners, normals, fineness: int) -> Float[np.ndarray, "m s 3"]:
     """Points of the `lattice`, moved from flat triangles onto the curved surface that they approximate."""
-    weights = _weights(corners.shape[1], number)
-    return rounded(np.einsum("sk,mkd->msd", weights, corners), weights, corners[:, None], normals[:, None])
+    weights = _barycentric_weights(corners.shape[1], fineness)
+    return project_to_curved_surface(
+        np.einsum("sk,mkd->msd", weights, corners), weights, corners[:, None], normals[:, None]
+    )
 
 
-def rounded(points, weights, corners, normals) -> Float[np.ndarray, "... 3"]:
+def project_to_curved_surface(points, weights, corners, normals) -> Float[np.ndarray, "... 3"]:
     """Move points (…, 3) of flat triangles onto the curved surface with unit `normals` (…, k, 3) at the `corners`
     (…, k, 3); `weights`: (…, k), barycentric coordinates of the points.
 
@@ -167,12 +177,12 @@ def rounded(points, weights, corners, normals) -> Float[np.ndarray, "... 3"]:
     return points + np.einsum("...k,...k,...kd->...d", weights / 2, below, normals)
 
 
-def _frames(surface: Triangles, presses: Sequence[Press]):
+def _indenter_axes(surface: Triangles, presses: Sequence[Press]):
     """Points pressed (b, 3) and axes of the frames there (b, 3, 3): right, up and outwards, as seen from outside with z
     upwards."""
     at = surface.nearest(np.array([press.position for press in presses]))
     corners = surface.cells[at.triangle]
-    origin = rounded(at.points, at.weights, surface.points[corners], surface.node_normals[corners])
+    origin = project_to_curved_surface(at.points, at.weights, surface.points[corners], surface.node_normals[corners])
     out = surface.normals_at(at)
     up = np.where(np.abs(out[:, 2:]) > _LEVEL, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     up -= np.sum(up * out, axis=1, keepdims=True) * out
@@ -180,5 +190,5 @@ def _frames(surface: Triangles, presses: Sequence[Press]):
     return origin, np.stack([np.cross(up, out), up, out], axis=1)
 
 
-def _radius(corners) -> float:
+def _largest_cell_radius(corners) -> float:
     return float(np.linalg.norm(corners - corners.mean(axis=1, keepdims=True), axis=-1).max())

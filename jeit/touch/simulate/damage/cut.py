@@ -38,7 +38,7 @@ class Cut(eqx.Module):
         if path.ndim != 2 or path.shape[1] != 2 or len(path) < 2 or not np.isfinite(path).all():
             raise ValueError(f"path must be finite places (k, 2), metres, two or more; it has shape {path.shape}.")
         if not np.linalg.norm(np.diff(path, axis=0), axis=1).min() > 0:
-            raise ValueError("path: two places that follow each other are one; give a path that goes somewhere.")
+            raise ValueError("path: two consecutive vertices coincide; give different places.")
         if not (is_number(depth) and 0 < depth <= 1):
             raise ValueError(f"depth must be a share of the thickness, above 0 and up to 1; it is {describe(depth)}.")
         if not (is_number(residual) and 0 < residual < 1):
@@ -79,12 +79,12 @@ class Cut(eqx.Module):
         there = np.zeros(len(cells), bool)
         for start, end in itertools.pairwise(self.path):
             for a, b in itertools.combinations(range(cells.shape[1]), 2):
-                there |= _cross(start, end, points[cells[:, a], :2], points[cells[:, b], :2])
+                there |= _segments_cross(start, end, points[cells[:, a], :2], points[cells[:, b], :2])
         if mesh.dimension == 3:
             top = points[:, 2].max()
             there &= np.asarray(centroids(mesh))[:, 2] > top - self.depth * (top - points[:, 2].min())
         if not there.any():
-            raise ValueError("cut: it goes through no cell of the mesh; are both in metres, about one origin?")
+            raise ValueError("cut: it crosses no cell of the mesh; are both in metres, with the same origin?")
         return np.flatnonzero(there)
 
     def conductivity(
@@ -104,7 +104,9 @@ class Cut(eqx.Module):
         cells, left = self.cells(mesh), self.residual
         if mesh.dimension == 2 and self.depth < 1:
             if thickness is None:
-                raise ValueError("thickness: give that of the sheet, metres; what half a cut resists depends on it.")
+                raise ValueError(
+                    "thickness: give that of the sheet, metres; the resistance across a partial cut depends on it."
+                )
             check_metres("thickness", thickness)
             width = float(np.asarray(measures(mesh))[cells].sum()) / self.length
             longer = -4 * thickness / np.pi * np.log(np.sin(np.pi * (1 - self.depth) / 2))
@@ -134,7 +136,7 @@ def draw_cut(
     if span.shape != (2,) or not 0 < span[0] <= span[1] < np.inf:
         raise ValueError(f"length must be the least and the greatest, metres, such as (0.02, 0.06); it is {length!r}.")
     if not (is_number(bent) and 0 <= bent <= 1):
-        raise ValueError(f"bent must be a chance, from 0 to 1; it is {describe(bent)}.")
+        raise ValueError(f"bent must be a probability, from 0 to 1; it is {describe(bent)}.")
     if not (is_number(margin) and margin >= 0):
         raise ValueError(f"margin must be metres, zero or more; it is {describe(margin)}.")
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
@@ -148,23 +150,25 @@ def draw_cut(
         cut = Cut(np.cumsum([start, *moves], axis=0), depth)
         if (np.asarray(outline.signed_distance(cut.along(whole / 20))) > margin).all():
             return cut
-    raise ValueError(f"length: no cut of {1e3 * whole:.3g} mm was found that lies within the skin; give less.")
+    raise ValueError(
+        f"length: no cut of {1e3 * whole:.3g} mm was found that lies within the skin; give a shorter length."
+    )
 
 
-def _cross(start, end, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _segments_cross(start, end, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Whether the segments from `first` to `second` (m, 2) cross the segment from `start` to `end`."""
     along, edge = end - start, second - first
-    one, other = _turn(along, first - start), _turn(along, second - start)
-    return (one * other <= 0) & (_turn(edge, start - first) * _turn(edge, end - first) <= 0)
+    one, other = _orientation(along, first - start), _orientation(along, second - start)
+    return (one * other <= 0) & (_orientation(edge, start - first) * _orientation(edge, end - first) <= 0)
 
 
-def _turn(first, second) -> np.ndarray:
+def _orientation(first, second) -> np.ndarray:
     return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
 
 
 # Factor of the hysteresis after a repair. Park et al. (2022), figure S13, show an increase without a number; 1.5 is an
 # assumption.
-_MORE = 1.5
+_HYSTERESIS_FACTOR = 1.5
 
 
 def mended(
@@ -182,4 +186,4 @@ def mended(
         raise ValueError(f"share must be positive, about 0.9 to 1.1; it is {describe(share)}.")
     values = np.array(np.broadcast_to(np.asarray(check_conductivity(mesh, conductivity)), mesh.num_cells), float)
     values[cut.cells(mesh)] *= share
-    return values, dataclasses.replace(material, hysteresis=min(0.9, _MORE * material.hysteresis))
+    return values, dataclasses.replace(material, hysteresis=min(0.9, _HYSTERESIS_FACTOR * material.hysteresis))

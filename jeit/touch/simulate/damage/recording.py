@@ -23,7 +23,7 @@ FAULTS: tuple[FaultKind, ...] = ("dead", "loose", "torn")
 _DEAD, _RAIL = 1e7, 5.0
 # Minimum and maximum factor of the impedance of a loose contact; time constant of the fluctuations of its logarithm, in
 # seconds; number of levels for which voltages are solved.
-_LOOSE, _WANDERING, _LEVELS = (10.0, 1000.0), 0.5, 7
+_LOOSE, _FLUCTUATION_TIME, _LEVELS = (10.0, 1000.0), 0.5, 7
 # Voltage picked up by a disconnected wire, relative to the root mean square of all voltages.
 _STRAY = 0.02
 
@@ -68,7 +68,7 @@ class ElectrodeFault(eqx.Module):
         for_wandering, for_strays = jax.random.split(key)
         rest = np.asarray(model.voltages(conductivity))
         if self.kind == "loose":
-            return self._wandering(for_wandering, model, conductivity, seconds) - rest
+            return self._loose_contact_voltages(for_wandering, model, conductivity, seconds) - rest
         stray = (
             _STRAY * np.sqrt(np.mean(rest**2)) * np.asarray(jax.random.normal(for_strays, (len(seconds), rest.size)))
         )
@@ -77,36 +77,40 @@ class ElectrodeFault(eqx.Module):
         if self.kind == "torn":
             silent = np.broadcast_to(stray if self.rail is None else self.rail, stray.shape)
             return np.where(driving | reading, silent - rest, 0.0)
-        dead = self._driven(model, conductivity)
+        dead = self._dead_electrode_voltages(model, conductivity)
         changed = np.where(reading & ~driving, stray - rest, dead - rest)
         return np.where(driving | reading, changed, (dead - rest) * np.ones_like(stray))
 
-    def _worse(self, model: ForwardModel, factor: float) -> ForwardModel:
+    def _with_contact_factor(self, model: ForwardModel, factor: float) -> ForwardModel:
         impedance = np.array(np.broadcast_to(model.electrodes.contact_impedance, model.protocol.num_electrodes), float)
         impedance[self.electrode] *= factor
         worse = eqx.tree_at(lambda one: one.contact_impedance, model.electrodes, jax.numpy.asarray(impedance))
         return model.with_electrodes(worse)
 
-    def _driven(self, model: ForwardModel, conductivity) -> Float[np.ndarray, " M"]:
+    def _dead_electrode_voltages(self, model: ForwardModel, conductivity) -> Float[np.ndarray, " M"]:
         """Voltages (M,) with a dead electrode and a source of limited voltage."""
-        before, after = (np.asarray(one.transfer_impedance(conductivity)) for one in (model, self._worse(model, _DEAD)))
+        before, after = (
+            np.asarray(one.transfer_impedance(conductivity)) for one in (model, self._with_contact_factor(model, _DEAD))
+        )
         drive = np.asarray(model.protocol.drive)
         spans = [np.ptp(np.where(drive != 0, drive @ z.T, 0.0), axis=1) for z in (before, after)]
         current = np.minimum(1.0, _RAIL * spans[0].max() / spans[1])
         voltages = np.asarray(select_channels(model.protocol, after))
         return voltages * current[np.asarray(model.protocol.drive_index)]
 
-    def _wandering(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
+    def _loose_contact_voltages(self, key: Array, model: ForwardModel, conductivity, seconds: np.ndarray) -> np.ndarray:
         """Voltages (T, M) for a fluctuating contact impedance, interpolated between solutions at a few levels of its
         logarithm."""
         low, high = np.log(_LOOSE)
         levels = np.linspace(low, high, _LEVELS)
-        solved = [np.asarray(self._worse(model, float(np.exp(one))).voltages(conductivity)) for one in levels]
+        solved = [
+            np.asarray(self._with_contact_factor(model, float(np.exp(one))).voltages(conductivity)) for one in levels
+        ]
         normal = np.asarray(jax.random.normal(key, (len(seconds),)))
         place, steps = np.empty(len(seconds)), np.diff(seconds, prepend=seconds[:1])
         now = 0.0
         for number, (step, one) in enumerate(zip(steps, normal, strict=True)):
-            kept = np.exp(-step / _WANDERING) if number else 0.0
+            kept = np.exp(-step / _FLUCTUATION_TIME) if number else 0.0
             now = kept * now + np.sqrt(1 - kept**2) * one
             place[number] = now
         # The distribution function of the normal variable makes the logarithm uniformly distributed.
@@ -117,9 +121,9 @@ class ElectrodeFault(eqx.Module):
         return (1 - part) * table[below] + part * table[below + 1]
 
 
-def check_fault(name: str, given) -> None:
+def check_fault(name: str, value) -> None:
     """Check that the argument `name` is an `ElectrodeFault`. Raises `ValueError` otherwise."""
-    check_kind(name, given, ElectrodeFault, 'an ElectrodeFault(3, "dead")')
+    check_kind(name, value, ElectrodeFault, 'an ElectrodeFault(3, "dead")')
 
 
 class Mishap(eqx.Module):
@@ -188,17 +192,17 @@ def exact_record(
     skin: PressedSkin,
     motions: MovingPress | Sequence[MovingPress],
     seconds: Float[np.ndarray, " T"],
-    wanted: np.ndarray,
+    selected_frames: np.ndarray,
 ) -> Float[np.ndarray, "T M"]:
-    """Voltages (T, M) of the model without drift and noise in the `wanted` (T,) frames, and voltages at rest in the
-    others. Raises `ValueError` as `PressedSkin.touched_in_time`."""
+    """Voltages (T, M) of the model without drift and noise in the `selected_frames` (T,) frames, and voltages at rest
+    in the others. Raises `ValueError` as `PressedSkin.touched_in_time`."""
     voltages = np.tile(np.asarray(skin.model.voltages(skin.conductivity)), (len(seconds), 1))
     if not np.any([np.any(motion.load) for motion in ([motions] if isinstance(motions, MovingPress) else motions)]):
         return voltages
     touched = skin.touched_in_time(motions, seconds)
     cells, change = np.asarray(touched.cells), np.asarray(touched.change)
     rest = np.array(np.broadcast_to(skin.conductivity, skin.model.mesh.num_cells))
-    for row in np.flatnonzero(wanted & (change != 0).any(axis=1)):
+    for row in np.flatnonzero(selected_frames & (change != 0).any(axis=1)):
         conductivity = rest.copy()
         np.multiply.at(conductivity, cells[row], 1 + change[row])
         voltages[row] = np.asarray(skin.model.voltages(conductivity))

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from jeit.arguments import check_key, check_kind, check_name, describe, is_number
 from jeit.mesh import Domain
 from jeit.touch.simulate.contact.indenters import Disc
-from jeit.touch.simulate.contact.joined import Joined, Placed
+from jeit.touch.simulate.contact.joined import JoinedIndenters, PlacedIndenter
 from jeit.touch.simulate.contact.press import MovingPress
 
 TRAITS = ("force", "radius", "duration", "speed", "path")
@@ -32,7 +32,7 @@ _AREA = {"small": (7e-3, 0.2), "sm-large": (12e-3, 0.45), "med-large": (20e-3, 0
 _INTENSITY = {"low": (1.0, 0.3), "low-med": (2.0, 0.4), "med-high": (5.0, 0.4), "high": (10.0, 0.3)}
 _DURATION = {"short": (0.15, 0.3), "med-long": (1.2, 0.4)}
 # Standard deviation of the logarithm of speed and path among people.
-_MOVING = 0.35
+_PATH_SPREAD = 0.35
 # Standard deviation of the logarithm of each parameter among touches of one person.
 _WITHIN = 0.25
 
@@ -54,12 +54,12 @@ class Manner:
     @property
     def medians(self) -> Float[np.ndarray, " 5"]:
         """Medians of `TRAITS` among people, in SI units; speed and path are 0 for gestures that do not move."""
-        return np.array([*(one[0] for one in self._words), self.speed, self.path])
+        return np.array([*(one[0] for one in self._word_parameters), self.speed, self.path])
 
     @property
     def spread(self) -> Float[np.ndarray, " 5"]:
         """Standard deviations of the logarithms of `TRAITS` among people."""
-        return np.array([*(one[1] for one in self._words), _MOVING, _MOVING])
+        return np.array([*(one[1] for one in self._word_parameters), _PATH_SPREAD, _PATH_SPREAD])
 
     @property
     def within(self) -> float:
@@ -72,7 +72,7 @@ class Manner:
         return self.path > 0
 
     @property
-    def _words(self) -> tuple[tuple[float, float], ...]:
+    def _word_parameters(self) -> tuple[tuple[float, float], ...]:
         return _INTENSITY[self.intensity], _AREA[self.area], _DURATION[self.duration]
 
 
@@ -121,21 +121,21 @@ def gesture_motion(
     within = (share > 0) & (share < 1)
     share = np.clip(share, 0, 1)
     sweeps = max(1, round(speed * duration / path)) if manner.moves else 1
-    load = force * np.where(within, _loads(rng, share, gesture, sweeps), 0.0)
+    load = force * np.where(within, _relative_loads(rng, share, gesture, sweeps), 0.0)
     length = path if manner.moves else _ROLL * rng.uniform(0, 1)
-    middle, angle, length = _somewhere(rng, outline, length)
+    middle, angle, length = _random_path(rng, outline, length)
     along = (1 - np.abs((sweeps * share) % 2 - 1) - 0.5) * length
     place = middle + along[:, None] * np.array([np.cos(angle), np.sin(angle)])
-    indenter: Disc | Joined = Disc(2 * radius)
+    indenter: Disc | JoinedIndenters = Disc(2 * radius)
     if gesture == "scratch":
         tip = radius / np.sqrt(_TIPS)
         offsets = _APART * tip * (np.arange(_TIPS) - (_TIPS - 1) / 2)
-        indenter = Joined(*(Placed(Disc(2 * tip), (0.0, offset)) for offset in offsets))
+        indenter = JoinedIndenters(*(PlacedIndenter(Disc(2 * tip), (0.0, offset)) for offset in offsets))
     # The hand may extend over the edge of the skin, but its path lies on the skin.
     return MovingPress(indenter, load, place, angle), seconds
 
 
-def _loads(rng: np.random.Generator, share: np.ndarray, gesture: str, sweeps: int) -> np.ndarray:
+def _relative_loads(rng: np.random.Generator, share: np.ndarray, gesture: str, sweeps: int) -> np.ndarray:
     """Load relative to its nominal value, at times given as shares of the duration."""
     if MANNERS[gesture].duration == "short":
         return np.sin(np.pi * share)
@@ -148,7 +148,7 @@ def _loads(rng: np.random.Generator, share: np.ndarray, gesture: str, sweeps: in
     return load
 
 
-def _somewhere(rng: np.random.Generator, outline: Domain, length: float) -> tuple[np.ndarray, float, float]:
+def _random_path(rng: np.random.Generator, outline: Domain, length: float) -> tuple[np.ndarray, float, float]:
     """Draw the middle, angle and length of a straight path on the skin; the length is reduced if no place is found."""
     low_x, high_x, low_y, high_y = map(float, outline.extent)
     while True:

@@ -92,7 +92,7 @@ def test_pressures_carry_the_load(kind):
         thickness=4e-3,
         num_layers=0 if kind == "sheet" else 2,
     )
-    samples = Samples.of(skin.model.mesh, skin.touched_face)
+    samples = Samples.from_mesh(skin.model.mesh, skin.touched_face)
     surface = skin.outline
     assert isinstance(surface, Triangles)
     assert samples.area.sum() * samples.points.shape[1] == pytest.approx(surface.areas.sum(), rel=1e-9)
@@ -111,7 +111,7 @@ def test_pressures_carry_the_load(kind):
 def test_a_ball_on_a_ball_touches_a_smaller_circle():
     """Winkler's foundation: two balls of radii r, R have a gap ρ² / 2 (1/r + 1/R), and a⁴ = 4 W / π K (1/r + 1/R)."""
     surface = sphere(0.05, num_points=8000)
-    samples, support = Samples.of(surface), Foundation(1e6, 4e-3)
+    samples, support = Samples.from_mesh(surface), Foundation(1e6, 4e-3)
     place = Triangles.of(surface).nearest([[0.02, 0.03, 0.04]]).points[0]
     cells, pressure = pressed_cells(samples, support, [(Press(ball(0.04), 2.0, place),)])
     there = samples.points[cells[0]][pressure[0] > 0]
@@ -123,7 +123,7 @@ def test_a_ball_on_a_ball_touches_a_smaller_circle():
 
 def test_a_weight_on_a_tube_rests_along_it():
     surface = tube(0.04, 0.1, num_points=8000)
-    samples = Samples.of(surface)
+    samples = Samples.from_mesh(surface)
     cells, pressure = pressed_cells(samples, Foundation(1e6, 4e-3), [(Press(Disc(0.02), 0.5, (0.04, 0.0, 0.05)),)])
     points = samples.points[cells[0]][pressure[0] > 0]
     assert np.ptp(points[:, 2]) == pytest.approx(0.02, rel=0.1)
@@ -182,7 +182,7 @@ def test_a_moving_press_is_its_presses():
 
 def test_says_what_cannot_be_pressed():
     surface = tube(0.04, 0.1, num_points=700)
-    curved, flat = Samples.of(surface), Samples.of(PLANE.mesh(num_points=300))
+    curved, flat = Samples.from_mesh(surface), Samples.from_mesh(PLANE.mesh(num_points=300))
     layer, shape = Foundation(1e6, 4e-3), ball(0.02)
     for samples, place, match in (
         (curved, (0.0, 0.0), r"a press on a curved skin is at \(x, y, z\) on it.*has 2 coordinates"),
@@ -193,6 +193,6 @@ def test_says_what_cannot_be_pressed():
             pressed_cells(samples, layer, [(Press(shape, 1.0, place),)])
     with pytest.raises(ValueError, match="a HalfSpace is flat, and the skin is curved; take a Foundation"):
         pressed_cells(curved, HalfSpace(1e6), [(Press(shape, 1.0, (0.04, 0.0, 0.05)),)])
-    with pytest.raises(ValueError, match=r"which takes the indenter .* into a layer 4 mm thick"):
+    with pytest.raises(ValueError, match=r"which presses the indenter .* into a layer 4 mm thick"):
         pressed_cells(curved, layer, [(Press(shape, 500.0, (0.04, 0.0, 0.05)),)])
     assert float(np.asarray(measures(surface)).sum()) == pytest.approx(curved.area.sum() * curved.points.shape[1])

@@ -4,7 +4,17 @@ import numpy as np
 import pytest
 
 from jeit.design import Bell
-from jeit.touch.simulate.contact import Bar, DepthMap, Disc, Joined, Placed, Prism, Revolved, Ring, ball
+from jeit.touch.simulate.contact import (
+    Bar,
+    DepthMap,
+    Disc,
+    JoinedIndenters,
+    PlacedIndenter,
+    Prism,
+    Revolved,
+    Ring,
+    ball,
+)
 
 MIDDLE = np.zeros(2)
 
@@ -22,11 +32,15 @@ MIDDLE = np.zeros(2)
         (ball(0.02), (0.006, 0.0), 0.002),
         (ball(0.02), (0.0, 0.0101), np.inf),
         (Revolved(Bell(2e-3, 5e-3)), (0.005, 0.0), 2e-3 * (1 - np.exp(-0.5))),
-        (Placed(Disc(0.02), (0.03, 0.0)), (0.039, 0.0), 0.0),
-        (Placed(Bar(0.1, 0.002), (0.01, 0.0), np.pi / 2), (0.01, 0.04), 0.0),
-        (Placed(Prism(0.04, 0.02, 0.01), (0.01, 0.02), np.pi / 6), (0.01 - 0.0025, 0.02 + 0.0025 * 3**0.5), 0.005),
-        (Joined(Placed(Disc(0.01), (0.02, 0)), ball(0.01)), (0.02, 0.003), 0.0),
-        (Joined(Placed(Disc(0.01), (0.02, 0)), ball(0.01)), (0.003, 0.0), 0.001),
+        (PlacedIndenter(Disc(0.02), (0.03, 0.0)), (0.039, 0.0), 0.0),
+        (PlacedIndenter(Bar(0.1, 0.002), (0.01, 0.0), np.pi / 2), (0.01, 0.04), 0.0),
+        (
+            PlacedIndenter(Prism(0.04, 0.02, 0.01), (0.01, 0.02), np.pi / 6),
+            (0.01 - 0.0025, 0.02 + 0.0025 * 3**0.5),
+            0.005,
+        ),
+        (JoinedIndenters(PlacedIndenter(Disc(0.01), (0.02, 0)), ball(0.01)), (0.02, 0.003), 0.0),
+        (JoinedIndenters(PlacedIndenter(Disc(0.01), (0.02, 0)), ball(0.01)), (0.003, 0.0), 0.001),
     ],
 )
 def test_gap(indenter, point, gap):
@@ -41,7 +55,7 @@ def test_gap(indenter, point, gap):
         Bar(0.1, 0.002),
         Prism(0.04, 0.02, 0.01),
         ball(0.01),
-        Joined(Disc(0.01), ball(0.02)),
+        JoinedIndenters(Disc(0.01), ball(0.02)),
     ],
 )
 def test_nothing_beyond_reach_and_zero_somewhere(indenter):
@@ -79,14 +93,14 @@ def test_sizes_in_millimetres_are_noticed(make):
         (lambda: Revolved(0.01), "indentation must be"),
         (lambda: DepthMap(np.zeros(4), 1e-3), "height must be an image"),
         (lambda: DepthMap(np.full((4, 4), np.nan), 1e-3), "0 pixels of it finite"),
-        (lambda: Placed(0.01), "indenter must be an indenter"),
-        (lambda: Placed(Disc(0.01), (0.0, np.nan)), r"position: give \(x, y\)"),
-        (lambda: Placed(Disc(0.01), (0.0, 0.0), np.inf), "angle: give radians"),
-        (lambda: Placed(Disc(0.01), "ab"), r"position must be \(x, y\) in metres, real numbers"),
-        (lambda: Placed(Disc(0.01), (0.0, 0.0), "a"), "angle: give radians"),
+        (lambda: PlacedIndenter(0.01), "indenter must be an indenter"),
+        (lambda: PlacedIndenter(Disc(0.01), (0.0, np.nan)), r"position: give \(x, y\)"),
+        (lambda: PlacedIndenter(Disc(0.01), (0.0, 0.0), np.inf), "angle: give radians"),
+        (lambda: PlacedIndenter(Disc(0.01), "ab"), r"position must be \(x, y\) in metres, real numbers"),
+        (lambda: PlacedIndenter(Disc(0.01), (0.0, 0.0), "a"), "angle: give radians"),
         (lambda: DepthMap([[0.0, 1.0], [2.0]], 1e-3), "height must be an image"),
-        (Joined, "parts: give one"),
-        (lambda: Joined(Disc(0.01), "ball"), "part 1 must be an indenter"),
+        (JoinedIndenters, "parts: give one"),
+        (lambda: JoinedIndenters(Disc(0.01), "ball"), "part 1 must be an indenter"),
     ],
 )
 def test_impossible_indenters_are_refused(make, message):

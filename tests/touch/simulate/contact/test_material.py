@@ -9,12 +9,12 @@ import pytest
 from jeit.touch.simulate.contact import Foundation, Material, material
 from jeit.touch.simulate.contact.materials import MATERIALS
 from jeit.touch.simulate.contact.pressed_skin import (
-    advance,
-    gains,
+    advance_state,
+    draw_gains,
     held_pressure,
+    random_walk,
     standard_normal,
-    unstrained,
-    walk,
+    unloaded_state,
     white_noise,
 )
 
@@ -27,9 +27,9 @@ KEY = jax.random.key(0)
 
 def follow(made, pressures, seconds):
     """Effective pressure of one place in time."""
-    strain, found, before = unstrained(made, 1), [], seconds[0]
+    strain, found, before = unloaded_state(made, 1), [], seconds[0]
     for pressure, now in zip(pressures, seconds, strict=True):
-        strain, effective = advance(made, strain, np.array([pressure]), now - before)
+        strain, effective = advance_state(made, strain, np.array([pressure]), now - before)
         found.append(effective[0])
         before = now
     return np.array(found)
@@ -85,7 +85,7 @@ def test_creep_goes_back_to_rest():
 
 def test_drift_is_a_trend_and_a_random_walk():
     seconds = np.array([100.0, 400.0, 400.0, 2500.0])
-    logs = walk(KEY, seconds, 1e-3, 0.01, 20_000)
+    logs = random_walk(KEY, seconds, 1e-3, 0.01, 20_000)
     np.testing.assert_allclose(logs.mean(axis=1), 1e-3 * seconds, rtol=0.05)
     np.testing.assert_allclose(logs.std(axis=1), 0.01 * np.sqrt(seconds), rtol=0.03)
     np.testing.assert_array_equal(logs[1], logs[2])
@@ -94,9 +94,9 @@ def test_drift_is_a_trend_and_a_random_walk():
 
 
 def test_gains_and_noise():
-    assert np.log(gains(KEY, 0.05, 20_000)).std() == pytest.approx(0.05, rel=0.03)
+    assert np.log(draw_gains(KEY, 0.05, 20_000)).std() == pytest.approx(0.05, rel=0.03)
     assert white_noise(KEY, 2e-3, (100, 200)).std() == pytest.approx(2e-3, rel=0.03)
-    np.testing.assert_array_equal(gains(KEY, 0.05, 9), gains(KEY, 0.05, 9))
+    np.testing.assert_array_equal(draw_gains(KEY, 0.05, 9), draw_gains(KEY, 0.05, 9))
 
 
 def test_materials_have_what_their_sources_print():

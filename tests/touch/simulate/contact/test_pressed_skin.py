@@ -17,9 +17,9 @@ from jeit.touch.simulate.contact import (
     Disc,
     Foundation,
     HalfSpace,
-    Joined,
+    JoinedIndenters,
     MovingPress,
-    Placed,
+    PlacedIndenter,
     Press,
     PressedSkin,
     ball,
@@ -39,7 +39,7 @@ PRESSES = [
     Press(ball(0.015), 2.0, (0.01, 0.02)),
     Press(Disc(0.016), 5.0, (-0.02, 0.0)),
     Press(Bar(0.03, 0.004), 3.0, (0.0, -0.02), 0.5),
-    Press(Joined(Disc(0.006), Placed(Disc(0.006), (0.012, 0.0))), 1.0, (0.02, -0.01), -1.0),
+    Press(JoinedIndenters(Disc(0.006), PlacedIndenter(Disc(0.006), (0.012, 0.0))), 1.0, (0.02, -0.01), -1.0),
 ]
 
 
@@ -69,7 +69,7 @@ def anew(skin, touched):
 )
 def test_cells_carry_the_load(model, support):
     """To rounding: also what hangs over the edge, and what falls between the samples."""
-    samples = Samples.of(model.mesh)
+    samples = Samples.from_mesh(model.mesh)
     presses = [*PRESSES, Press(Disc(0.01), 1.0, (0.049, 0.0)), Press(ball(0.001), 1e-3, (0.0123, 0.0))]
     found = pressed_cells(samples, support, [(press,) for press in presses])
     carried = np.einsum("ncs,nc->n", found.pressure, samples.area[found.cells])
@@ -79,7 +79,7 @@ def test_cells_carry_the_load(model, support):
 
 def test_a_ball_beyond_the_edge_is_carried_by_all_that_it_touches(model):
     """Less of the skin is under it, so that it comes down farther, and touches more."""
-    samples, layer, shape = Samples.of(model.mesh), Foundation(1e6, 2e-3), ball(0.02)
+    samples, layer, shape = Samples.from_mesh(model.mesh), Foundation(1e6, 2e-3), ball(0.02)
     found = pressed_cells(samples, layer, [(Press(shape, 2.0, (0.053, 0.0)),)])
     points = (samples.points - np.array([0.053, 0.0])).reshape(1, -1, 2)
     area = np.repeat(samples.area, samples.points.shape[1])[None]
@@ -92,14 +92,14 @@ def test_a_ball_beyond_the_edge_is_carried_by_all_that_it_touches(model):
 @pytest.mark.parametrize(
     ("shape", "place", "spread"),
     [
-        (Placed(Disc(0.0005), (0.02, 0.0)), (0.02, 0.0), 0.0),
-        (Placed(Bar(0.04, 0.0004), (0.0, 0.003), 0.1), (0.0, 0.003), 0.04 / np.sqrt(12)),
+        (PlacedIndenter(Disc(0.0005), (0.02, 0.0)), (0.02, 0.0), 0.0),
+        (PlacedIndenter(Bar(0.04, 0.0004), (0.0, 0.003), 0.1), (0.0, 0.003), 0.04 / np.sqrt(12)),
         (Disc(1e-9), (0.0, 0.0), 0.0),
     ],
     ids=["moved in its frame", "an edge", "a point"],
 )
 def test_what_falls_between_samples_presses_where_it_is(model, shape, place, spread):
-    samples = Samples.of(model.mesh)
+    samples = Samples.from_mesh(model.mesh)
     found = pressed_cells(samples, Foundation(1e6, 2e-3), [(Press(shape, 0.01),)])
     load = np.einsum("cs,c->cs", found.pressure[0], samples.area[found.cells[0]])
     points = samples.points[found.cells[0]]
@@ -111,7 +111,7 @@ def test_what_falls_between_samples_presses_where_it_is(model, shape, place, spr
 
 
 def test_pressure_on_cells_is_that_under_the_indenter(model):
-    samples, support = Samples.of(model.mesh), VELOSTAT.support
+    samples, support = Samples.from_mesh(model.mesh), VELOSTAT.support
     press = PRESSES[0]
     cells, pressure = pressed_cells(samples, support, [(press,)])
     exact = support.pressure(press.indenter, press.load).at(samples.points[cells[0]] - press.position)
@@ -136,7 +136,7 @@ def test_a_layer_is_pressed_too():
     layer = Skin.create(named_layout("grid-3x3", Rectangle(0.08, 0.08)), num_layers=1, cell_size=0.008)
     skin = PressedSkin(KEY, layer.model, dataclasses.replace(material("hydrogel"), noise=0.0, gain_spread=0.0))
     presses = [Press(ball(0.04), 3.0, (0.015, 0.01)), Press(Disc(0.03), 3.0, (-0.015, 0.0))]
-    samples = Samples.of(layer.model.mesh)
+    samples = Samples.from_mesh(layer.model.mesh)
     cells, pressure = pressed_cells(samples, skin.material.support, [(press,) for press in presses])
     np.testing.assert_allclose(np.einsum("ncs,nc->n", pressure, samples.area[cells]), 3.0, rtol=1e-12)
     touched = skin.touched(presses)
@@ -146,7 +146,7 @@ def test_a_layer_is_pressed_too():
 
 def test_several_at_once_press_as_their_sum(skin):
     near = [Press(Disc(0.01), 1.0, (0.0, 0.0)), Press(Disc(0.01), 2.0, (0.004, 0.0))]
-    samples, support = Samples.of(skin.model.mesh), STILL.support
+    samples, support = Samples.from_mesh(skin.model.mesh), STILL.support
     both = pressed_cells(samples, support, [tuple(near)])
     total = np.zeros((skin.model.mesh.num_cells, samples.points.shape[1]))
     for press in near:

@@ -3,8 +3,19 @@
 import numpy as np
 import pytest
 
-from jeit.touch.simulate.contact import Bar, DepthMap, Disc, Foundation, HalfSpace, Joined, Placed, Prism, Ring, ball
-from jeit.touch.simulate.contact.half_space import sinking
+from jeit.touch.simulate.contact import (
+    Bar,
+    DepthMap,
+    Disc,
+    Foundation,
+    HalfSpace,
+    JoinedIndenters,
+    PlacedIndenter,
+    Prism,
+    Ring,
+    ball,
+)
+from jeit.touch.simulate.contact.half_space import displacement_function
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
 from jeit.touch.simulate.contact.press import raster
 
@@ -12,7 +23,7 @@ RADIUS, LOAD = 0.01, 0.05
 MIDDLE = np.zeros((1, 2))
 RUBBER = HalfSpace(1e6, 0.5)
 LAYER = Foundation(1e6, 3e-3)
-TWO = Joined(Placed(Disc(0.01), (0.01, 0.0)), Placed(ball(0.02), (-0.01, 0.002)))
+TWO = JoinedIndenters(PlacedIndenter(Disc(0.01), (0.01, 0.0)), PlacedIndenter(ball(0.02), (-0.01, 0.002)))
 ROUGH = DepthMap(1e-4 * np.random.default_rng(0).normal(size=(24, 24)), 5e-4)
 SHAPES = {
     "disc": Disc(0.02),
@@ -77,7 +88,7 @@ def test_the_surface_sinks_under_a_pressed_square():
     side, number = 0.01, 120
     points, pixel = raster((3 * side, 3 * side), number)
     pressure = np.where(np.abs(points).max(axis=-1) < side / 2, 1000.0, 0.0)
-    found = sinking(number, pixel, 2e6)(pressure)
+    found = displacement_function(number, pixel, 2e6)(pressure)
     middle = found[number // 2 - 1 : number // 2 + 1, number // 2 - 1 : number // 2 + 1].mean()
     assert middle == pytest.approx(4 * side * 1000 * np.log(1 + 2**0.5) / (np.pi * 2e6), rel=2e-3)
     far = np.linalg.norm(points[0, 0])
@@ -128,7 +139,7 @@ def test_bodies_do_not_overlap(shape):
     support = HalfSpace(1e6, 0.5, 48)
     found = support.pressure(indenter, 3.0)
     points, pixel = raster(found.pixel * support.pixels / 2, support.pixels)
-    distance = sinking(support.pixels, pixel, support.plane_modulus)(found.values) + indenter.gap(points)
+    distance = displacement_function(support.pixels, pixel, support.plane_modulus)(found.values) + indenter.gap(points)
     distance -= found.approach
     assert np.abs(distance[found.values > 0]).max() < 1e-6 * found.approach
     assert distance.min() > -1e-6 * found.approach
@@ -139,9 +150,9 @@ def test_bodies_do_not_overlap(shape):
     [
         (lambda: LAYER.pressure(ball(0.01), 0.0), "load must be positive, in newtons"),
         (lambda: RUBBER.pressure(ball(0.01), np.nan), "load must be positive"),
-        (lambda: LAYER.pressure(Disc(0.01), 100.0), "takes the indenter 3.8. mm into a layer 3 mm thick"),
+        (lambda: LAYER.pressure(Disc(0.01), 100.0), "presses the indenter 3.8. mm into a layer 3 mm thick"),
         (lambda: LAYER.pressure(Bar(0.04, 1e-5), 1.0), "thinner than a pixel"),
-        (lambda: RUBBER.pressure(Placed(Disc(1e-5), (0.02, 0.0)), 1.0), "thinner than a pixel"),
+        (lambda: RUBBER.pressure(PlacedIndenter(Disc(1e-5), (0.02, 0.0)), 1.0), "thinner than a pixel"),
         (lambda: Foundation(-1.0, 1e-3), "modulus must be positive"),
         (lambda: Foundation(1e6, 0.0), "thickness must be"),
         (lambda: HalfSpace(1e6, 0.6), "poisson must be"),

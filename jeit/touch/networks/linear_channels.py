@@ -1,4 +1,4 @@
-"""Random touches for training networks, positions in depth maps, and a linear model of a skin's channels."""
+"""Linear model of a skin's channels, random touches for training networks, and positions in depth maps."""
 
 from __future__ import annotations
 
@@ -12,35 +12,49 @@ from scipy.spatial import KDTree
 from jeit.design import Bell, Skin, touches_away_from_the_edge
 from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import select_channels
-from jeit.touch.simulate import Bar, Disc, Indent, IndentDraws, Joined, Placed, Revolved, Ring, ball, material
+from jeit.touch.simulate import (
+    Bar,
+    Disc,
+    Indent,
+    IndentDraws,
+    JoinedIndenters,
+    PlacedIndenter,
+    Revolved,
+    Ring,
+    ball,
+    material,
+)
 from jeit.touch.simulate.contact.indent_sets import image_places
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
 from jeit.touch.simulate.contact.indents import relative_changes, relative_to
 from jeit.touch.simulate.contact.samples import lattice
 
 # Fraction of a map's maximum depth below which a pixel is not part of a touch.
-_PART = 0.5
+_TOUCH_FRACTION = 0.5
 
 
-def peaks(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
-    """Positions (n, 2) of the deepest pixels of maps, metres; `places` (r, c, 2): positions of the pixels, metres."""
+def deepest_positions(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
+    """Positions (n, 2) of the deepest pixels of maps, metres; `places` (r, c, 2): positions of the pixels,
+    metres."""
     deepest = maps.reshape(len(maps), -1).argmax(axis=1)
     return places.reshape(-1, 2)[deepest]
 
 
-def centroids_of(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
-    """Centroids (n, 2) of the pixels deeper than half of the maximum depth, weighted by depth, metres."""
+def depth_centroids(maps: Float[np.ndarray, "n r c"], places: Float[np.ndarray, "r c 2"]) -> Float[np.ndarray, "n 2"]:
+    """Centroid (n, 2) of the indentation in each of n maps, metres: the mean position of the pixels deeper than half of
+    the map's maximum depth, weighted by depth. `places` (r, c, 2): positions of the pixels, metres."""
     flat = maps.reshape(len(maps), -1)
     most = flat.max(axis=1, keepdims=True)
-    weight = np.where(flat > _PART * most, np.maximum(flat, 0), 0)
+    weight = np.where(flat > _TOUCH_FRACTION * most, np.maximum(flat, 0), 0)
     # A map without any depth gives the middle of the skin.
     weight = np.where(most > 0, weight, 1.0)
     return weight @ places.reshape(-1, 2) / weight.sum(axis=1, keepdims=True)
 
 
-def errors(found: Float[np.ndarray, "n 2"], right: Float[np.ndarray, "n 2"]) -> dict[str, float]:
-    """Mean, standard deviation and root mean square of the distance between estimated and true places, metres."""
-    off = np.linalg.norm(found - right, axis=1)
+def error_statistics(estimated: Float[np.ndarray, "n 2"], true: Float[np.ndarray, "n 2"]) -> dict[str, float]:
+    """Mean, standard deviation (sd) and root mean square (rms) of the distance between estimated and true positions,
+    metres."""
+    off = np.linalg.norm(estimated - true, axis=1)
     return {"mean": float(off.mean()), "sd": float(off.std()), "rms": float(np.sqrt(np.mean(off**2)))}
 
 
@@ -50,18 +64,18 @@ DEPTHS = (0.1, 0.8)
 _AT_ONCE = 3
 # Limit of detection of Park et al., newtons, for a ball of 15 mm diameter; the change at this limit, in standard
 # deviations of the noise; number of places along a side at which the change is computed.
-_LIMIT, _DEVIATIONS, _PLACES = 0.7, 3.0, 15
+_DETECTED_FORCE, _DEVIATIONS, _PLACES = 0.7, 3.0, 15
 # Minimum distance of a touch's centre from the skin's edge, divided by the skin's shorter side.
 _MARGIN = 0.04
 
 
-def wrench() -> Joined:
+def wrench() -> JoinedIndenters:
     """An open-ended wrench laid flat, 100 mm long."""
-    jaw = Placed(Ring(0.030, 0.014), (0.040, 0.0))
-    return Joined(Placed(Bar(0.070, 0.010), (-0.010, 0.0)), jaw)
+    jaw = PlacedIndenter(Ring(0.030, 0.014), (0.040, 0.0))
+    return JoinedIndenters(PlacedIndenter(Bar(0.070, 0.010), (-0.010, 0.0)), jaw)
 
 
-def bodies() -> list[AbstractIndenter]:
+def touching_bodies() -> list[AbstractIndenter]:
     """Bodies that touch the skin: bells, balls, discs, bars, and a wrench."""
     return [
         *(Revolved(Bell(0.02, deviation)) for deviation in (5e-3, 7.5e-3, 10e-3)),
@@ -73,19 +87,20 @@ def bodies() -> list[AbstractIndenter]:
 
 
 def touch_draws(skin: Skin) -> IndentDraws:
-    """Random touches by one to three of the `bodies`, anywhere on a skin and turned by any angle."""
+    """Random touches by one to three of the `touching_bodies`, anywhere on a skin and turned by any angle."""
     thickness = float(skin.thickness)
     low_x, high_x, low_y, high_y = map(float, skin.flat_outline.extent)
     depth = (DEPTHS[0] * thickness, DEPTHS[1] * thickness)
     margin = _MARGIN * min(high_x - low_x, high_y - low_y)
-    return IndentDraws(bodies(), skin.flat_outline, depth, margin=margin, at_once=_AT_ONCE)
+    return IndentDraws(touching_bodies(), skin.flat_outline, depth, margin=margin, at_once=_AT_ONCE)
 
 
-def detection_noise(skin: Skin, limit: float = _LIMIT) -> float:
-    """Relative noise of a channel with which a ball of 15 mm diameter under `limit` newtons is just detected.
+def detection_noise(skin: Skin, limit: float = _DETECTED_FORCE) -> float:
+    """Relative noise of a channel at which a ball of 15 mm diameter, pressed with `limit` newtons, is just detected.
 
-    It is one third of the maximum relative change of all channels, in the median over places all over the skin. Park et
-    al. 2022 detect 0.7 N; this load indents a hydrogel of 100 kPa by 1.7 mm.
+    The ball is pressed at places all over the skin. At each, the maximum relative change over all channels is computed;
+    the noise is a third of the median of these maxima. Park et al. 2022 detect 0.7 N; this load indents a hydrogel of
+    100 kPa by 1.7 mm.
     """
     tip = ball(0.015)
     depth = material("hydrogel").support.pressure(tip, limit).approach
@@ -96,12 +111,12 @@ def detection_noise(skin: Skin, limit: float = _LIMIT) -> float:
 
 
 # Number of points along a side of each cell; there are several, since pixels are smaller than cells.
-_LATTICE = 6
+_POINTS_PER_SIDE = 6
 # Maximum depth for the nonlinear formula; larger depths continue it linearly.
-_DEEPEST = 0.9
+_MOST_DEPTH = 0.9
 
 
-class Sensed(NamedTuple):
+class LinearChannels(NamedTuple):
     """Linear model of a skin's channels.
 
     **Fields**: `operator` (M, P): relative changes of the channels per unit of `strength` of each of P pixels;
@@ -114,13 +129,13 @@ class Sensed(NamedTuple):
     shape: tuple[int, int]
 
     @classmethod
-    def of(cls, skin: Skin, shape: tuple[int, int] = (48, 48)) -> "Sensed":
+    def from_skin(cls, skin: Skin, shape: tuple[int, int] = (48, 48)) -> "LinearChannels":
         """Compute the model of a skin, with its pixels on a grid of this shape over its bounding box."""
         rows, columns = shape
         model, conductivity = skin.model, np.asarray(skin.model_conductivity)
         rest, jacobian = (np.asarray(one) for one in model.voltages_and_jacobian(conductivity))
-        points = lattice(np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)], _LATTICE)
-        each = relative_to(rest, rest - jacobian.T * np.broadcast_to(conductivity, jacobian.shape[1])[:, None])
+        points = lattice(np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)], _POINTS_PER_SIDE)
+        cell_changes = relative_to(rest, rest - jacobian.T * np.broadcast_to(conductivity, jacobian.shape[1])[:, None])
         tree = KDTree(image_places(skin, columns, rows).reshape(-1, 2))
         pixel = np.asarray(tree.query(points[..., :2].reshape(-1, 2))[1])
         # A point at depth b, divided by the skin's thickness, loses all conductivity under indentations δ > b. The line
@@ -133,17 +148,18 @@ class Sensed(NamedTuple):
             share = np.maximum(most - np.maximum(below, least), 0) / ((most**2 - least**2) / 2)
         operator = np.zeros((rows * columns, len(rest)))
         for place, number in enumerate(pixel.reshape(points.shape[:2]).T):
-            np.add.at(operator, number, each * share[:, place, None] / points.shape[1])
-        return cls(rounded(operator.T), rounded(_contact_changes(skin, rest, conductivity)), shape)
+            np.add.at(operator, number, cell_changes * share[:, place, None] / points.shape[1])
+        return cls(round_relative(operator.T), round_relative(_contact_changes(skin, rest, conductivity)), shape)
 
-    def halved(self) -> Float[np.ndarray, "M p"]:
-        """Operator for pixels twice as wide and high."""
+    def coarser_operator(self) -> Float[np.ndarray, "M p"]:
+        """Operator (M, P / 4) for pixels twice as wide and high: the sum over the four pixels that each of them
+        covers."""
         rows, columns = self.shape
         parts = self.operator.reshape(len(self.operator), rows // 2, 2, columns // 2, 2)
         return parts.sum(axis=(2, 4)).reshape(len(parts), -1)
 
 
-def rounded(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+def round_relative(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
     """Round values to a millionth of their maximum, or finer, to remove effects of the order of summation.
 
     The same random key then gives the same training wherever NumPy's arrays are in memory.
@@ -153,23 +169,28 @@ def rounded(values: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
 
 
 def strength(depth):
-    """Strength δ / √(1 − δ) of depths δ, divided by the skin's thickness; changes of voltages are proportional to it.
+    """Strength δ / √(1 − δ), to which changes of voltages are proportional, of an indentation of relative depth δ.
+
+    δ is the depth divided by the skin's thickness.
 
     A patch of lower conductivity has a larger effect than in proportion to its change, since current flows around it.
     In two dimensions, patches with e^s and e^−s times the conductivity change voltages oppositely, to first order in
     their size (Keller's duality). The strength 2 sinh(s / 2), with log(1 − δ) = −s, has this property.
     """
-    clipped = jnp.clip(depth, 0.0, _DEEPEST)
+    clipped = jnp.clip(depth, 0.0, _MOST_DEPTH)
     return clipped / jnp.sqrt(1 - clipped) + (depth - clipped)
 
 
-def depth_of(strength):
-    """Depths that have the given strengths, the inverse of `strength`; negative strengths give negative depths."""
+def depth_from_strength(strength):
+    """Relative depths δ with the given strengths: the inverse of `strength`. Negative strengths give negative
+    depths."""
     above = jnp.maximum(strength, 0.0)
     return (jnp.sqrt(above**2 + 4) - above) * above / 2 + jnp.minimum(strength, 0.0)
 
 
 def _contact_changes(skin: Skin, rest, conductivity) -> Float[np.ndarray, "L M"]:
+    """Relative changes of the M channels per unit of the logarithm of each of the L contact impedances; `rest` (M,):
+    voltages of the untouched skin."""
     model = skin.model
     fields, impedance = (np.asarray(one) for one in model.fields(conductivity))
     slope = ContactSensitivity(model.mesh, model.electrodes)(fields, impedance, model.electrodes.contact_impedance)

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.touch.networks.sensed import Sensed, bodies, depth_of, strength
+from jeit.touch.networks.linear_channels import LinearChannels, depth_from_strength, strength, touching_bodies
 from jeit.touch.simulate import Disc, Indent, depth_maps, indented_cells, relative_changes
 from jeit.touch.simulate.contact.indent_sets import image_places
 
 
 @pytest.fixture(scope="module")
 def sensed(small_skin):
-    return Sensed.of(small_skin)
+    return LinearChannels.from_skin(small_skin)
 
 
 def felt(sensed, depth):
@@ -38,7 +38,7 @@ def test_halved_pixels_feel_the_same(sensed):
     """Of a map that is alike in each 2 × 2."""
     coarse = np.random.default_rng(0).uniform(size=(24, 24))
     fine = coarse.repeat(2, axis=0).repeat(2, axis=1)
-    assert np.allclose(sensed.halved() @ coarse.ravel(), sensed.operator @ fine.ravel(), rtol=1e-12)
+    assert np.allclose(sensed.coarser_operator() @ coarse.ravel(), sensed.operator @ fine.ravel(), rtol=1e-12)
 
 
 def test_contacts(small_skin, sensed):
@@ -54,14 +54,14 @@ def test_strength():
     """√ε apart at most from 2 sinh(s / 2) of e^−s = 1 − δ, and smooth beyond what it is clipped at."""
     depth = np.linspace(0, 0.9, 10)
     assert np.allclose(strength(jnp.asarray(depth)), 2 * np.sinh(-np.log1p(-depth) / 2), rtol=1e-12)
-    assert np.allclose(depth_of(strength(jnp.asarray(depth))), depth, rtol=1e-6)
+    assert np.allclose(depth_from_strength(strength(jnp.asarray(depth))), depth, rtol=1e-6)
     slopes = jax.vmap(jax.grad(strength))(jnp.asarray([-0.1, 0.95, 1.2]))
     assert np.isfinite(slopes).all()
 
 
 def test_a_layer_feels_less_of_the_same_indent(layer):
     """Its electrodes are below, and what is taken is above."""
-    own = Sensed.of(layer, (24, 24))
+    own = LinearChannels.from_skin(layer, (24, 24))
     touches = [[Indent(Disc(0.02), 2.5e-3, (0.002, 0.004))]]
     maps = depth_maps(touches, image_places(layer, 24, 24)) / float(layer.thickness)
     touched, conductivity = (
@@ -76,7 +76,7 @@ def test_a_layer_feels_less_of_the_same_indent(layer):
 def test_bodies_that_are_pressed_in():
     """All reach the depth that they are pressed to, near their origin; the largest is the wrench, 100 mm long."""
     places = np.stack(np.meshgrid(np.linspace(-0.07, 0.07, 141), np.linspace(-0.03, 0.03, 61)), axis=-1)
-    maps = depth_maps([[Indent(one, 2e-3)] for one in bodies()], places)
+    maps = depth_maps([[Indent(one, 2e-3)] for one in touching_bodies()], places)
     assert np.allclose(maps.max(axis=(1, 2)), 2e-3, rtol=0.1)
     length = [np.ptp(places[one > 0][:, 0]) for one in maps]
     assert length[-1] == max(length) == pytest.approx(0.1, abs=3e-3)
