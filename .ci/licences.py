@@ -13,7 +13,13 @@ from packaging.requirements import Requirement
 FREE = ("Apache", "BSD", "MIT", "Python", "PSF", "ISC", "HPND", "MPL", "Mozilla", "Zlib", "Unlicense", "CC0", "0BSD")
 WEAK = ("LGPL", "Lesser General Public")
 # Tools that write no part of jeit, and extras that a user asks for: named, with the reason why they may be used.
-KNOWN = {"gmsh": "GPL-2.0-or-later: the extra 'mesh' alone imports it; what is given away with it is under the GPL."}
+KNOWN = {
+    "gmsh": "GPL-2.0-or-later: the extra 'mesh' alone imports it; what is given away with it is under the GPL.",
+    **dict.fromkeys(
+        ("mkl", "intel-openmp", "intel-cmplr-lib-ur", "tbb", "tcmlib", "umf"),
+        "Intel Simplified Software License: closed, may be given away; the extra 'mkl' alone loads it.",
+    ),
+}
 
 
 def licence_of(name: str) -> str:

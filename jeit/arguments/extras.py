@@ -14,6 +14,7 @@ EXTRAS = {
     "sound": {"soundfile": "soundfile"},
     "large": {"pyamg": "pyamg"},
     "live": {"starlette": "starlette", "uvicorn": "uvicorn", "websockets": "websockets", "serial": "pyserial"},
+    "mkl": {"pypardiso": "pypardiso"},
     "vision": {"cv2": "opencv-python-headless"},
     "view": {"pyvista": "pyvista"},
     "cluster": {"dask": "dask", "distributed": "distributed", "zarr": "zarr", "xarray": "xarray"},

@@ -111,7 +111,8 @@ class ForwardModel(eqx.Module):
         solver: str | lx.AbstractLinearSolver = "auto",
     ):
         """`solver`: "auto" (chosen by size; `model.system.solver` states which solver and why), "cholesky", "cg", or
-        any lineax solver. With any value but "auto" and `jeit_solvers.Multigrid` the methods are always compiled.
+        any lineax solver. With "auto", `jeit_solvers.Multigrid` or
+        `jeit_solvers.Pardiso` methods run in NumPy where they can, with other values they are always compiled.
         Raises `ValueError` if electrodes, mesh and protocol do not fit together."""
         _check_model_parts(mesh, electrodes, protocol)
         self.mesh = mesh

@@ -21,7 +21,7 @@ from jeit_solvers import (
     ConjugateGradient,
     DirectSolver,
     Fronts,
-    Multigrid,
+    NumpySolver,
     SparseCholesky,
     SparseSymmetric,
     SparsityPattern,
@@ -163,7 +163,7 @@ class System(eqx.Module):
     @property
     def at_once(self) -> bool:
         """Whether matrices with known values are solved in NumPy."""
-        return self.fronts is not None or isinstance(self.solver, Multigrid)
+        return self.fronts is not None or isinstance(self.solver, NumpySolver)
 
     @classmethod
     def create(cls, mesh: Mesh, electrodes: AbstractElectrodes, solver: str | lx.AbstractLinearSolver = "auto"):
@@ -210,7 +210,7 @@ class System(eqx.Module):
         if self.fronts is not None and isinstance(load, np.ndarray):
             found: Any = factorise_fronts(self.fronts, host.asarray(operator.values)).solve(load)
             return found.astype(load.dtype)
-        if isinstance(self.solver, Multigrid) and isinstance(load, np.ndarray):
+        if isinstance(self.solver, NumpySolver) and isinstance(load, np.ndarray):
             return self.solver.solve_columns(operator, load)
         constant = jax.lax.stop_gradient(operator)  # derivatives come from A X = B, not through the factor
         state: Any = self.solver.init(constant, {})

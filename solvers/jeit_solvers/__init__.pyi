@@ -36,7 +36,7 @@ from .sparse.exact_fronts import Fronts, find_fronts
 from .sparse.exact_fronts_numpy import FrontalFactor, factorise_fronts
 from .sparse.multigrid import Multigrid
 from .sparse.near_inverse import NearInverse, Strips, near_inverse
-from .sparse.operator import SparseSymmetric
+from .sparse.operator import NumpySolver, SparseSymmetric
 from .sparse.padded_fronts import FactorisationPlan, analyse
 from .sparse.padded_fronts_jax import (
     Factor,
@@ -47,6 +47,7 @@ from .sparse.padded_fronts_jax import (
     quadratic_form,
     solve,
 )
+from .sparse.pardiso import Pardiso
 from .sparse.pattern import SparsityPattern
 
 __all__ = [
@@ -64,6 +65,8 @@ __all__ = [
     "Minimum",
     "Multigrid",
     "NearInverse",
+    "NumpySolver",
+    "Pardiso",
     "QuadraticModel",
     "SparseCholesky",
     "SparseSymmetric",

@@ -15,7 +15,7 @@ from jeit_solvers.engines import has_values
 from jeit_solvers.sparse.exact_fronts import Fronts, find_fronts
 from jeit_solvers.sparse.exact_fronts_numpy import solve_at_once
 from jeit_solvers.sparse.multigrid import Multigrid, multigrid_is_installed
-from jeit_solvers.sparse.operator import MatrixSolver, SparseSymmetric, require_sparse_symmetric
+from jeit_solvers.sparse.operator import MatrixSolver, NumpySolver, SparseSymmetric, require_sparse_symmetric
 from jeit_solvers.sparse.padded_fronts import FactorisationPlan, analyse
 from jeit_solvers.sparse.padded_fronts_jax import Factor, factorise, solve
 from jeit_solvers.sparse.pattern import SparsityPattern
@@ -210,7 +210,7 @@ class FrontalCholesky(MatrixSolver):
 DirectSolver = SparseCholesky | FrontalCholesky
 """The solvers that factorise."""
 
-ColumnSolver = DirectSolver | Multigrid
+ColumnSolver = DirectSolver | NumpySolver
 """The solvers that solve for several right-hand sides at once, by `solve_columns`."""
 
 

@@ -9,23 +9,16 @@ without an estimate (Baker, Falgout, Kolev and Yang, SIAM J. Sci. Comput. 33, 20
 
 from __future__ import annotations
 
-import hashlib
 import importlib
-from functools import partial
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
-import lineax
 import numpy as np
-from jaxtyping import Array, Inexact
 from scipy.sparse import csr_array
 
 from jeit_solvers.cores import number_of_cores, on_cores
-from jeit_solvers.engines import call_numpy, has_values, host, on_host
-from jeit_solvers.sparse.operator import LastMatrix, MatrixSolver, SparseSymmetric
+from jeit_solvers.sparse.operator import LastMatrix, NumpySolver, pattern_key
 from jeit_solvers.sparse.pattern import SparsityPattern
 
 # Maximum number of right-hand sides that are iterated together. More of them share each read of the matrix; fewer fit
@@ -59,7 +52,7 @@ class Hierarchy(NamedTuple):
     levels: list[Level] | None
 
 
-class Multigrid(MatrixSolver):
+class Multigrid(NumpySolver):
     """Conjugate gradients preconditioned by multigrid, for large real or complex `SparseSymmetric` operators.
 
     Iteration ends when the residual is less than `tolerance` times the right-hand side, and the preconditioned
@@ -85,28 +78,25 @@ class Multigrid(MatrixSolver):
         if not multigrid_is_installed():
             raise ImportError("Multigrid needs pyamg: pip install 'jeit[large]', or in a clone '.[large]'.")
 
-    def solve_columns(self, state: SparseSymmetric, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
-        """Solutions for several right-hand sides."""
-        pattern, kind = state.pattern, jnp.result_type(state.values, columns)
-        shape = jax.ShapeDtypeStruct(columns.shape, kind)
-        if has_values(pattern):  # constants, kept out of the compiled program because they are large
-            solve = partial(_solve_in_numpy, self, kind, on_host(pattern))
-            if has_values(state, columns):
-                return host.asarray(solve(state.values, columns))
-            return call_numpy(solve, shape, state.values, columns)
+    def solve_in_numpy(self, pattern: SparsityPattern, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Solutions (n, k) for columns (n, k); NaN where there is none."""
+        key = pattern_key(pattern)
+        made = _LAST_HIERARCHY.get_or_compute(key, values, lambda: hierarchy(pattern.to_scipy(values)))
+        dtype = np.result_type(values, columns, float)
+        load = np.ascontiguousarray(columns, dtype)
+        if made.levels is None:
+            return np.full(load.shape, np.nan, dtype)
+        if np.iscomplexobj(load) and not np.iscomplexobj(values):
+            load = load.view(float)  # real and imaginary parts are columns of their own
+        solution = np.empty_like(load)
 
-        def solve_any(indices: np.ndarray, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
-            given = SparsityPattern(indices, pattern.layout, pattern.size)  # pyright: ignore[reportArgumentType]
-            return _solve_in_numpy(self, kind, given, values, columns)
+        def solve(part: slice) -> None:
+            group = np.ascontiguousarray(load[:, part])
+            solution[:, part] = _conjugate_gradients(made, group, self.tolerance, self.max_steps)
 
-        return call_numpy(solve_any, shape, pattern.indices, state.values, columns)
-
-    def compute(
-        self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]
-    ) -> tuple[Inexact[Array, " n"], lineax.RESULTS, dict[str, Any]]:
-        """Solve for one right-hand side. A failure yields NaN, which `lineax.linear_solve` reports as singular."""
-        del options
-        return self.solve_columns(state, vector[:, None])[:, 0], lineax.RESULTS.successful, {}
+        together = max(1, min(_MAX_COLUMNS, -(-load.shape[1] // number_of_cores())))
+        on_cores(solve, [slice(start, start + together) for start in range(0, load.shape[1], together)])
+        return solution.view(dtype)
 
 
 def multigrid_is_installed() -> bool:
@@ -212,26 +202,6 @@ def _column_products(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 def _column_norms(columns: Any) -> np.ndarray:
     squares = _column_products(columns.real, columns.real)
     return np.sqrt(squares + _column_products(columns.imag, columns.imag) if np.iscomplexobj(columns) else squares)
-
-
-def _solve_in_numpy(solver: Multigrid, dtype: Any, pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
-    columns, values = np.asarray(columns), np.asarray(values)
-    key = hashlib.blake2b(np.ascontiguousarray(pattern.indices).tobytes(), digest_size=16).digest()
-    made = _LAST_HIERARCHY.get_or_compute(key, values, lambda: hierarchy(pattern.to_scipy(values)))
-    load = np.ascontiguousarray(columns, np.result_type(dtype, float))
-    if made.levels is None:
-        return np.full(load.shape, np.nan, dtype)
-    if np.iscomplexobj(load) and not np.iscomplexobj(values):
-        load = load.view(float)  # real and imaginary parts are columns of their own
-    solution = np.empty_like(load)
-
-    def solve(part: slice) -> None:
-        group = np.ascontiguousarray(load[:, part])
-        solution[:, part] = _conjugate_gradients(made, group, solver.tolerance, solver.max_steps)
-
-    together = max(1, min(_MAX_COLUMNS, -(-load.shape[1] // number_of_cores())))
-    on_cores(solve, [slice(start, start + together) for start in range(0, load.shape[1], together)])
-    return solution.view(np.result_type(dtype, float)).astype(dtype)
 
 
 _LAST_HIERARCHY = LastMatrix()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import hashlib
 from collections.abc import Callable
 from typing import Any
@@ -13,6 +14,7 @@ import lineax
 import numpy as np
 from jaxtyping import Array, Inexact
 
+from jeit_solvers.engines import call_numpy, has_values, host, on_host
 from jeit_solvers.sparse.pattern import SparsityPattern
 
 
@@ -133,6 +135,47 @@ class MatrixSolver(lineax.AbstractLinearSolver[SparseSymmetric]):
     def assume_full_rank(self) -> bool:
         """Always true, because a positive definite matrix has full rank."""
         return True
+
+
+class NumpySolver(MatrixSolver):
+    """Solver for several right-hand sides at once, in NumPy: compiled programs call it."""
+
+    @abc.abstractmethod
+    def solve_in_numpy(self, pattern: SparsityPattern, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Solutions (n, k) for columns (n, k); NaN where there is none."""
+
+    def solve_columns(self, state: SparseSymmetric, columns: Inexact[Array, "n k"]) -> Inexact[Array, "n k"]:
+        """Solutions for several right-hand sides."""
+        pattern, dtype = state.pattern, jnp.result_type(state.values, columns)
+        shape = jax.ShapeDtypeStruct(columns.shape, dtype)
+
+        def solve_with(pattern: SparsityPattern, values: Any, columns: Any) -> np.ndarray:
+            found = self.solve_in_numpy(pattern, np.asarray(values), np.asarray(columns))
+            return found.astype(dtype, copy=False)
+
+        if has_values(pattern):  # constants, kept out of the compiled program because they are large
+            known = on_host(pattern)
+            if has_values(state, columns):
+                return host.asarray(solve_with(known, state.values, columns))
+            return call_numpy(lambda values, columns: solve_with(known, values, columns), shape, state.values, columns)
+
+        def solve_any(indices: np.ndarray, values: np.ndarray, columns: np.ndarray) -> np.ndarray:
+            given = SparsityPattern(indices, pattern.layout, pattern.size)  # pyright: ignore[reportArgumentType]
+            return solve_with(given, values, columns)
+
+        return call_numpy(solve_any, shape, pattern.indices, state.values, columns)
+
+    def compute(
+        self, state: SparseSymmetric, vector: Inexact[Array, " n"], options: dict[str, Any]
+    ) -> tuple[Inexact[Array, " n"], lineax.RESULTS, dict[str, Any]]:
+        """Solve for one right-hand side. A failure yields NaN, which `lineax.linear_solve` reports as singular."""
+        del options
+        return self.solve_columns(state, vector[:, None])[:, 0], lineax.RESULTS.successful, {}
+
+
+def pattern_key(pattern: SparsityPattern) -> bytes:
+    """Key of a sparsity pattern for `LastMatrix`."""
+    return hashlib.blake2b(np.ascontiguousarray(pattern.indices).tobytes(), digest_size=16).digest()
 
 
 class LastMatrix:
