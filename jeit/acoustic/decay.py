@@ -10,18 +10,18 @@ import abc
 import math
 from typing import ClassVar, Self
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
 from jeit.acoustic.noise import column
 from jeit.arguments import check_name
 from jeit_solvers.engines import host, namespace
+from jeit_solvers.module import Module
 
 # Constant in m² added to r², since r = √r² has no derivative at r = 0: the square of a hundredth of a micrometre.
 _TIP = 1e-16
 
 
-class AbstractDecay(eqx.Module):
+class AbstractDecay(Module):
     """Base class of decay models, which give the responses f_i of M microphones. A new model is a subclass."""
 
     name: ClassVar[str]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import operator
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
 from jeit.acoustic.decay import AbstractDecay
@@ -13,9 +12,10 @@ from jeit.acoustic.noise import IntensityNoise
 from jeit.acoustic.surface import AbstractSurface
 from jeit.arguments import check_kind
 from jeit_solvers.engines import namespace
+from jeit_solvers.module import Module
 
 
-class MicrophoneArray(eqx.Module):
+class MicrophoneArray(Module):
     """Model of an array of microphones, from which the intensities of a source are computed.
 
     **Fields**: `microphones`: positions (M, d) in metres; `surface`: surface on which sources lie; `decay`: decay model

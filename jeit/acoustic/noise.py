@@ -14,12 +14,12 @@ an upper bound of the intensity. The level is nearly normally distributed in bot
 
 from __future__ import annotations
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jeit_solvers.engines import as_array, namespace
+from jeit_solvers.module import Module
 
 # Minimum relative error of a decay model.
 LEAST_RELATIVE = 1e-3
@@ -28,7 +28,7 @@ LEAST_RELATIVE = 1e-3
 _FLOOR_DEVIATIONS = 4.0
 
 
-class IntensityNoise(eqx.Module):
+class IntensityNoise(Module):
     """Noise parameters of the intensities of M microphones; see `jeit.acoustic.noise` for the error model.
 
     **Fields**, each (M,): `floor`: noise floor N; `deviation`: standard deviation s of the power of noise; `cross`:

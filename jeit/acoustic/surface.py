@@ -15,12 +15,13 @@ from numpy.typing import ArrayLike
 from jeit.arguments import describe
 from jeit.mesh import Domain, Polygon
 from jeit_solvers.engines import as_array, namespace, on_host, slopes
+from jeit_solvers.module import Module
 
 # Maximum number of spline knots: more would slow down evaluation without making the surface smoother.
 _MOST_KNOTS = 300
 
 
-class AbstractSurface(eqx.Module):
+class AbstractSurface(Module):
     """Base class of surfaces. `outline` is the outline of the surface in chart coordinates, in metres."""
 
     outline: eqx.AbstractVar[Polygon]

@@ -14,12 +14,13 @@ from jeit.acoustic.localisation.locations import Locations
 from jeit.acoustic.signal.intensity import IntensitySettings
 from jeit.acoustic.signal.recording import Intensities, Recording
 from jeit.acoustic.tracking import Track, track
+from jeit_solvers.module import Module
 
 # Rows and columns of the map on which the consistency loss is minimised, as in Park 2022.
 _PAPERS_MAP = (200, 200)
 
 
-class LocatedTouches(eqx.Module):
+class LocatedTouches(Module):
     """Touches located in a recording.
 
     **Fields**: `intensities`: intensities of the recording; `locations`: position and status of each frame; `track`:

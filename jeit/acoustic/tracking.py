@@ -8,7 +8,6 @@ from a range.
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -17,6 +16,7 @@ from scipy.special import chdtri
 from jeit.acoustic.localisation.locations import FEW_FRAMES, Locations
 from jeit.arguments import check_kind
 from jeit_solvers.engines import at_once, namespace, scan
+from jeit_solvers.module import Module
 
 # Candidate spectral densities of acceleration in m²/s³, from a finger at rest to one that moves violently.
 _DENSITIES = np.geomspace(1e-5, 10.0, 13)
@@ -26,7 +26,7 @@ _FALSE_REJECTION = 1e-4
 _FIRST_SPEED = 0.5
 
 
-class Touch(eqx.Module):
+class Touch(Module):
     """A touch in a track.
 
     **Fields**: `onset`, `offset`: times in seconds of the middles of its first and last frame; `first`, `last`: indices
@@ -40,7 +40,7 @@ class Touch(eqx.Module):
     length: float
 
 
-class Track(eqx.Module):
+class Track(Module):
     """Smoothed positions of a recording with F frames.
 
     **Fields**: `times`: (F,) in seconds; `position`: (F, d) in metres; `covariance`: (F, d, d) in m²; `velocity`:

@@ -18,9 +18,10 @@ from jeit.mesh import Body, Mesh
 from jeit.mesh.solid_body import as_body
 from jeit.protocol import Protocol
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
+from jeit_solvers.module import Module
 
 
-class Measurement(eqx.Module):
+class Measurement(Module):
     """Frames of measured (or simulated) voltages.
 
     Build a measurement with `screen`, which looks for bad channels, or with a reader (`jeit.data.read`).

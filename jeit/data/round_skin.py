@@ -20,9 +20,10 @@ from jeit.layout import ring
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 from jeit_solvers.engines import either_engine, namespace
+from jeit_solvers.module import Module
 
 
-class RoundSkin(eqx.Module):
+class RoundSkin(Module):
     """A round conductive sheet with electrodes along its edge, measured with the adjacent (neighbouring) protocol.
 
     The defaults are those of Chen et al. (2022): a film of 100 mm diameter, 16 electrodes, 208 voltages.

@@ -18,9 +18,10 @@ from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.taxels import Taxels, find_taxels
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh.geodesic import Triangles
+from jeit_solvers.module import Module
 
 
-class SkinResponse(eqx.Module):
+class SkinResponse(Module):
     """Response of a skin to touches.
 
     **Fields**: `layout`: the layout of its electrodes; `sensitivity`: its sensitivity map; `taxels`: its virtual
@@ -85,7 +86,7 @@ def number_of_taxels(grid: TouchGrid, num_taxels: int | None) -> int:
 _BLIND_SPOT_MARGIN = 1e-6
 
 
-class LayoutComparison(eqx.Module):
+class LayoutComparison(Module):
     """Sensitivity and virtual taxels of two skins, from `compare_layouts`.
 
     **Fields**: `skins`: the two skins; `responses`: the response of each; `margin` (metres), `places`, `contrast` and

@@ -20,13 +20,14 @@ from jeit.design.skin.touch_grid import touch_grid
 from jeit.layout import Layout
 from jeit.layout.surface_layout import check_layout, flat_layout
 from jeit.protocol import two_terminal
+from jeit_solvers.module import Module
 
 # Ratio of the number of nodes of the mesh for the final scores to that of the mesh used in the optimisation; number of
 # touched positions along a side in the optimisation, and for the final scores.
 _REFINEMENT_RATIO, _OPTIMISED_PLACES, _SCORED_PLACES = 4, 16, 24
 
 
-class ImprovedLayout(eqx.Module):
+class ImprovedLayout(Module):
     """Result of `improve_layout`: the optimised layout, with the scores of both layouts.
 
     **Fields**

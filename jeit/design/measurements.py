@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Literal
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,9 +14,10 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_key
 from jeit_solvers.dense import inverse_cholesky
 from jeit_solvers.engines import has_values
+from jeit_solvers.module import Module
 
 
-class Candidates(eqx.Module):
+class Candidates(Module):
     """Sensitivities of M candidate measurements, whitened by the noise and by the prior.
 
     **Fields**: `rows` (M, r): the whitened sensitivity f_i of each candidate; `weight` (r, r): the matrix V such that
@@ -120,7 +120,7 @@ Criterion = Literal["D", "A"]
 _MIN_GAIN = 1e-9
 
 
-class Selection(eqx.Module):
+class Selection(Module):
     """The chosen measurements, with their information and that of all candidates.
 
     **Fields**

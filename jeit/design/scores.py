@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -33,13 +32,14 @@ from jeit.forward import ForwardModel
 from jeit.forward.system import cell_conductivity, check_conductivity
 from jeit_solvers.dense import inverse_cholesky
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, undifferentiated
+from jeit_solvers.module import Module
 
 # Number k of matrix squarings: the largest eigenvalue of an r × r matrix has a relative error of at most ln(r) / 2^k,
 # however close the second largest is.
 _NUM_SQUARINGS = 10
 
 
-class TouchPrior(eqx.Module):
+class TouchPrior(Module):
     """Gaussian prior of the amplitudes of touches, with covariance SSᵀ.
 
     **Fields**: `factor`: S (n, r). Amplitudes are relative to the touches for which the voltages are computed.
@@ -73,7 +73,7 @@ class TouchPrior(eqx.Module):
         return cls(as_array(vectors[:, kept] * np.sqrt(values[kept])))
 
 
-class Scores(eqx.Module):
+class Scores(Module):
     """Scores of a layout. After `jax.vmap`, every array has a leading axis for the layouts.
 
     **Fields**

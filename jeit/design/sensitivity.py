@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
@@ -15,6 +14,7 @@ from jeit.design.skin.voltage_changes import touch_changes
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model
 from jeit_solvers.engines import either_engine, has_values, namespace
+from jeit_solvers.module import Module
 
 
 @either_engine
@@ -29,7 +29,7 @@ def _share_below(level, sensitivity: Float[Array, "*maps n"]) -> Float[Array, "*
     return (sensitivity < level).astype(sensitivity.dtype).mean(axis=-1)
 
 
-class SensitivityMap(eqx.Module):
+class SensitivityMap(Module):
     """Sensitivity Θ of a skin at n positions: the norm ‖Δv‖₂ of the voltage changes Δv due to a touch at the position
     (Park et al. 2022).
 

@@ -14,9 +14,10 @@ from jeit.arguments import check_key
 from jeit.design.defaults import NUM_TAXELS, THRESHOLD
 from jeit_solvers import KMeans, kmeans
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace
+from jeit_solvers.module import Module
 
 
-class Taxels(eqx.Module):
+class Taxels(Module):
     """The k virtual taxels of a layout, from touches at n positions; create them with `find_taxels`.
 
     **Fields**

@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 from jeit.arguments.checks import real_array
 from jeit.mesh import Body, Mesh, Refine
 from jeit_solvers.engines import as_array, has_values, namespace
+from jeit_solvers.module import Module
 
 
-class Contact(eqx.Module):
+class Contact(Module):
     """Contact integrals of a set of L electrodes on a mesh, divided by contact impedance.
 
     In the complete electrode model every electrode l adds the energy (1/z_l) ∫_l (u - U_l)². With P1 basis functions φ
@@ -50,7 +51,7 @@ class ElectrodePen(Protocol):
         """Draw an electrode without a size, or one whose shape is not visible from above."""
 
 
-class AbstractElectrodes(eqx.Module):
+class AbstractElectrodes(Module):
     """Base of all electrodes; they compute contact integrals on a mesh."""
 
     contact_impedance: eqx.AbstractVar[Float[Array, " L"]]

@@ -34,6 +34,7 @@ from jeit_solvers.engines import (
     on_host,
     sum_into,
 )
+from jeit_solvers.module import Module
 
 # Maximum number of entries of a block of the Jacobian, so that the block fits in the cache of a core.
 _BLOCK_ENTRIES = 250_000
@@ -43,7 +44,7 @@ _MIN_PARALLEL_BLOCKS = 20
 _CELLS_AT_ONCE = 4000
 
 
-class _BoundMethod(eqx.Module):
+class _BoundMethod(Module):
     """Bound method of a model that `jax.jit` accepts. JAX needs a hash of the function that it compiles; arrays have
     none, so the hash is that of the identity of the model."""
 
@@ -82,7 +83,7 @@ def compilable(function: Function) -> Function:
     return cast(Function, _CompilableMethod(function))
 
 
-class ForwardModel(eqx.Module):
+class ForwardModel(Module):
     """Electrode voltages of a body of given conductivity: ∇·(σ∇u) = 0 with the complete (or point) electrode model.
 
     Every method takes a conductivity: a scalar, one value per cell (m,), one per node (n,), or symmetric tensors (m, d,

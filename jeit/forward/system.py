@@ -33,6 +33,7 @@ from jeit_solvers import (
     quadratic_form,
 )
 from jeit_solvers.engines import Recent, gather, has_values, host, namespace, undifferentiated
+from jeit_solvers.module import Module
 
 
 def cell_conductivity(mesh: Mesh, conductivity) -> Inexact[Array, "m ..."]:
@@ -146,7 +147,7 @@ def field_gradients(mesh: Mesh, fields: Inexact[Array, "n p"]) -> Inexact[Array,
     )
 
 
-class System(eqx.Module):
+class System(Module):
     """Sparsity pattern of the system matrix, and the solvers of systems with this pattern.
 
     Made once for a mesh and a kind of electrode (`System.create`). It holds no physical quantities, so one system

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jeit.arguments.checks import Interval
 from jeit.image.segmentation import basins, shared_facets
 from jeit.mesh import Mesh, centroids, measures
+from jeit_solvers.module import Module
 
 if TYPE_CHECKING:
     from jeit.image.plane import TriangleSurface
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _SURFACE_COLUMNS, _SURFACE_ROWS = 48, 24
 
 
-class SolidForm(eqx.Module):
+class SolidForm(Module):
     """An ellipsoid, or an upright elliptic column.
 
     **Fields**: `centre` in metres; `axes`: three semi-axes as rows, in metres; the last one of a column points to its
@@ -56,7 +56,7 @@ class SolidForm(eqx.Module):
 _LEAST_AREA = {2: 0.004, 3: 0.001}
 
 
-class Inclusion(eqx.Module):
+class Inclusion(Module):
     """A region of raised or lowered conductivity.
 
     **Fields**: `sign`: +1 for conductive, -1 for resistive; `centroid` in metres, weighted by the change; `area` in m²

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,12 +15,13 @@ from jaxtyping import Array, Float, Int
 
 from jeit.arguments import brief, page, picture
 from jeit_solvers.engines import has_values
+from jeit_solvers.module import Module
 
 # Pixels above this fraction of the maximum belong to the target.
 _TARGET_LEVEL = 0.25
 
 
-class FiguresOfMerit(eqx.Module):
+class FiguresOfMerit(Module):
     """GREIT figures of merit of images x of one target each; every field has one value per target.
 
     The quarter-amplitude set Q consists of the pixels with x ≥ max(x) / 4, where x is positive for a change of the

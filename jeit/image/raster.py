@@ -9,9 +9,10 @@ from scipy.spatial import KDTree
 
 from jeit.mesh import Mesh, check_flat
 from jeit_solvers.engines import as_array, either_engine, namespace
+from jeit_solvers.module import Module
 
 
-class Raster(eqx.Module):
+class Raster(Module):
     """Grid of pixels with the cell that contains each pixel; made once for a mesh and used for every image on it.
 
     **Fields**: `cell`: (rows, columns) index of the cell that contains the centre of the pixel, or -1 outside the mesh;

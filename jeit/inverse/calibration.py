@@ -21,6 +21,7 @@ from jeit.inverse.linearisation import check_mask
 from jeit.inverse.nonlinear.problem import check_steps
 from jeit_solvers import Status, as_minimum, ended_number, symmetric_inverse
 from jeit_solvers.engines import as_array, has_values, on_device, on_host, undifferentiated
+from jeit_solvers.module import Module
 
 # Logarithm of the ratio of a contact impedance to the model's, beyond which it no longer changes the voltages.
 FARTHEST = 50.0
@@ -117,7 +118,7 @@ _TOLERANCE, _TOLERANCE_LARGE_MESH = 1e-8, 1e-4
 _LARGE_MESH_CELLS = 30_000
 
 
-class Calibration(eqx.Module):
+class Calibration(Module):
     """A forward model fitted to a reference frame.
 
     **Fields**: `model`: the model with fitted contact impedance; `conductivity`: uniform background (S/m; 2-D: S),

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Bool, Float, Int
@@ -23,11 +22,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jeit.protocol import Protocol
 from jeit_solvers import lower_cholesky, symmetric_inverse
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace
+from jeit_solvers.module import Module
 
 _RANK_TOLERANCE = 1e-9
 
 
-class Data(eqx.Module):
+class Data(Module):
     """Voltages of independent channels and their noise.
 
     **Fields**: `voltages` (r,): ŷ, volts; `weight` (r,): 1 / volts; `covariance`, `precision` (r, r): covariance of
@@ -47,7 +47,7 @@ class Data(eqx.Module):
         return lower_cholesky(self.precision).T @ rows
 
 
-class IndependentChannels(eqx.Module):
+class IndependentChannels(Module):
     """Channels that determine all others: v = `combination` (M, r) · v[`index` (r,)] for every body."""
 
     index: Int[Array, " r"]
@@ -81,7 +81,7 @@ class IndependentChannels(eqx.Module):
         return _compute_weighing(self.combination, noise)
 
 
-class Weighing(eqx.Module):
+class Weighing(Module):
     """Map from voltages to `Data`, which is the same for all frames of equal noise.
 
     **Fields**: `noise` (M,): standard deviations, volts; `estimator` (r, M): matrix with ŷ = estimator · y; `weight`,

@@ -29,9 +29,10 @@ from jeit.inverse.spectrum import Spectrum
 from jeit.protocol import Protocol
 from jeit_solvers import symmetric_inverse
 from jeit_solvers.engines import adjoint, as_array, has_values, namespace, on_host
+from jeit_solvers.module import Module
 
 
-class DirectProblem(eqx.Module):
+class DirectProblem(Module):
     """Whitened linear problem without an eigendecomposition; it has the methods of a `Spectrum` that compute images.
 
     **Fields**: `directions` (M, r): orthonormal combinations of the channels; `jacobian` (r, m): Jacobian J of the
@@ -65,7 +66,7 @@ class DirectProblem(eqx.Module):
 _RANK_TOLERANCE = 1e-12
 
 
-class Linearisation(eqx.Module):
+class Linearisation(Module):
     """Linear problem v = J x at a background conductivity for the channels in use, with rows divided by their noise.
 
     **Fields**: `spectrum`: the `Spectrum` of the problem, or a `DirectProblem` if it is traced (by a derivative,

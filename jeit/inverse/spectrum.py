@@ -24,12 +24,13 @@ from numpy.typing import ArrayLike
 
 from jeit_solvers import symmetric_eigen
 from jeit_solvers.engines import adjoint, either_engine, has_values, host, namespace
+from jeit_solvers.module import Module
 
 # Approximate number of cells over which means over the image are taken.
 _NUM_MEAN_CELLS = 10_000
 
 
-class Spectrum(eqx.Module):
+class Spectrum(Module):
     """Eigendecomposition of the data-space system, in the notation of `jeit.inverse.spectrum`.
 
     **Fields**: `basis` (M, k): QU; `eigenvalues` (k,): Λ; `directions` (M, r): D; `reduced` (r, m): G; `images` (m, r):

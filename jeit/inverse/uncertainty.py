@@ -33,12 +33,13 @@ from jeit.inverse.prior.penalties import AbstractNormal
 from jeit.mesh import measures
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_host
+from jeit_solvers.module import Module
 
 # Number of rows of the size of an image computed at a time.
 _ROWS_AT_ONCE = 32
 
 
-class Posterior(eqx.Module):
+class Posterior(Module):
     """Posterior of an image: a Gaussian distribution of its coefficients with mean ĉ, created by `posterior`.
 
     **Fields**: `inversion`: the problem; `coefficients` (n,): ĉ; `jacobian` (r, n): J at ĉ; `root` (r, r): W with

@@ -14,6 +14,7 @@ from jeit.electrodes.discs import SheetDiscs
 from jeit.electrodes.electrodes import as_electrode_values, as_positions
 from jeit.mesh import Domain
 from jeit_solvers.engines import has_values
+from jeit_solvers.module import Module
 
 
 def check_labels(labels: Sequence[str] | None, num_electrodes: int) -> tuple[str, ...]:
@@ -43,7 +44,7 @@ SMALLEST, LARGEST = 1e-3, 5.0  # m
 _ROUNDING = 1e-9  # m
 
 
-class Layout(eqx.Module):
+class Layout(Module):
     """Round electrodes on a flat skin: a design that can be compared, optimised, and written to a file for a laser
     cutter.
 

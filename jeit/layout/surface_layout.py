@@ -19,6 +19,7 @@ from jeit.layout.names import check_count
 from jeit.mesh import Mesh
 from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit_solvers.engines import as_array, has_values
+from jeit_solvers.module import Module
 
 # Minimum number of nodes per position: a coarser surface is refined by halving its triangles.
 _MIN_NODES_PER_POSITION = 30
@@ -100,7 +101,7 @@ def _initial_nodes(geodesics: Geodesics, usable: np.ndarray, weight: np.ndarray,
 _ROUNDING = 1e-9  # m
 
 
-class SurfaceLayout(eqx.Module):
+class SurfaceLayout(Module):
     """Round electrodes on a surface in space: the counterpart of `Layout` for a curved skin.
 
     **Fields**

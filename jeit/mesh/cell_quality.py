@@ -6,7 +6,6 @@ import re
 from itertools import pairwise
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -14,9 +13,10 @@ from scipy.spatial import KDTree
 
 from jeit.files import check_memory
 from jeit.mesh.mesh import Mesh
+from jeit_solvers.module import Module
 
 
-class Quality(eqx.Module):
+class Quality(Module):
     """Shape measures of a mesh, as NumPy arrays with one entry per cell.
 
     **Fields**: `smallest_angle` (m,): the smallest angle of a triangle, or the smallest angle between two faces of a

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
@@ -12,9 +11,10 @@ from numpy.typing import ArrayLike
 from jeit.arguments import brief, page, picture
 from jeit.mesh import checks, topology
 from jeit_solvers.engines import as_array, has_values
+from jeit_solvers.module import Module
 
 
-class Mesh(eqx.Module):
+class Mesh(Module):
     """A conforming mesh of triangles in the plane or in space (2-D), or of tetrahedra (3-D).
 
     Create one with functions such as `jeit.mesh.disk` or `jeit.mesh.read`, or from arrays with `Mesh.create`, which

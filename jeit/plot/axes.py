@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -13,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import ScaledTranslation
 
 from jeit.arguments import check_kind, describe, is_number
+from jeit_solvers.module import Module
 
 INK = "#26292e"
 SOFT = "#8b9098"
@@ -128,7 +128,7 @@ def _round_down(length: float) -> float:
     return max(step * decade for step in (1, 2, 5) if step * decade <= length * (1 + 1e-9))
 
 
-class ColourScale(eqx.Module):
+class ColourScale(Module):
     """Map from values to colours.
 
     **Fields**
@@ -180,7 +180,7 @@ class ColourScale(eqx.Module):
         return FittedScale(factor, label, {"cmap": colours, "vmin": low, "vmax": high}, self)
 
 
-class FittedScale(eqx.Module):
+class FittedScale(Module):
     """A colour scale fitted to values. **Fields**: `factor`: conversion of values to the unit of the colour bar;
     `label`: of the colour bar; `keywords`: arguments of matplotlib functions; `scale`: the original scale."""
 

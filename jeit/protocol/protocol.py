@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import brief, did_you_mean
 from jeit.protocol.reciprocity import reciprocal_channel_pairs
 from jeit_solvers.engines import as_array, either_engine, has_values
+from jeit_solvers.module import Module
 
 
 def check_patterns(patterns, pattern_kind: str) -> None:
@@ -159,7 +160,7 @@ def _select_rows(patterns, index):
     return patterns[index]
 
 
-class Protocol(eqx.Module):
+class Protocol(Module):
     """Drive patterns, measurement patterns, and channels that combine them.
 
     Channel `k` measures `measurement[measurement_index[k]] @ U`, where `U` (L,) are the electrode potentials in volts

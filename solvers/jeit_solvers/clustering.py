@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit_solvers.engines import has_values, in_turn
+from jeit_solvers.module import Module
 
 
-class KMeans(eqx.Module):
+class KMeans(Module):
     """Result of k-means.
 
     **Fields**: `centres`: (k, d) means of the clusters; `labels`: (n,) cluster of each point; `inertia`: sum of the
@@ -99,7 +100,7 @@ def _kmeans(points, key, stop: tuple[Any, Any], num_clusters: int, restarts: int
     )
 
 
-class _State(eqx.Module):
+class _State(Module):
     """State of Lloyd's algorithm: `labels` of the nearest centres, at the squared `distance` (n,)."""
 
     centres: Float[Array, "k d"]

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -25,6 +24,7 @@ from jeit.acoustic.signal.recording import Taps
 from jeit.acoustic.surface import AbstractSurface, make_surface
 from jeit.arguments import check_kind, describe, is_number
 from jeit_solvers.engines import as_array, host, on_device
+from jeit_solvers.module import Module
 
 # Value of `decay` that selects the decay model by cross-validation.
 AUTO = "auto"
@@ -41,7 +41,7 @@ _LEAST_SHARE = 0.5
 PLACE_ERROR = 2e-3
 
 
-class CalibrationFit(eqx.Module):
+class CalibrationFit(Module):
     """A calibration, with the T taps to which it was fitted.
 
     - `calibration`: the fitted calibration.

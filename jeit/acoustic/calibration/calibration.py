@@ -21,6 +21,7 @@ from jeit.arguments import describe
 from jeit.files import read_json, written_whole
 from jeit.mesh import Polygon
 from jeit_solvers.engines import as_array, on_host
+from jeit_solvers.module import Module
 
 if TYPE_CHECKING:
     from jeit.acoustic.calibration.calibration_tables import CalibrationTable, SurfaceTable
@@ -34,7 +35,7 @@ _CURVE = ("origin", "axes", "normal", "knots", "weights", "affine")
 _LARGEST = 2**24
 
 
-class Calibration(eqx.Module):
+class Calibration(Module):
     """A calibrated array of microphones.
 
     - `microphone_array`: positions of the microphones, surface, decay models and noise.

@@ -24,6 +24,7 @@ from jeit.acoustic.calibration.decay_fit import DecayProblem, fit_strengths, fit
 from jeit.acoustic.decay import AbstractDecay
 from jeit.acoustic.noise import LEAST_RELATIVE, IntensityNoise, noise_from_negative_powers
 from jeit_solvers.engines import host, on_host, slopes
+from jeit_solvers.module import Module
 
 # Residuals larger than this number of standard deviations are excluded from the noise estimate.
 _OUTLIER_DEVIATIONS = 4.0
@@ -120,7 +121,7 @@ _MOST_DISPLACEMENT = 4.0
 _UNDETERMINED_ERROR = 0.5
 
 
-class TapFit(eqx.Module):
+class TapFit(Module):
     """State of the fit of M microphones to T taps.
 
     - `kind`: class of the decay model.

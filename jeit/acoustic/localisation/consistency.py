@@ -16,7 +16,6 @@ that differ between frames), `cost`, `expand`, `start`, and, for candidate posit
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -35,9 +34,10 @@ from jeit_solvers import (
     symmetric_small,
 )
 from jeit_solvers.engines import kept, namespace, set_at, slopes, undifferentiated
+from jeit_solvers.module import Module
 
 
-class Consistency(eqx.Module):
+class Consistency(Module):
     """Consistency loss of F frames.
 
     **Fields**: `power`: intensities (M, F) divided by the highest intensity of the frame; `loudest`: index (F,) of the

@@ -12,7 +12,6 @@ over the microphones in use. It is minimised by Fisher scoring. The Fisher matri
 
 from __future__ import annotations
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
@@ -21,9 +20,10 @@ from jeit.acoustic.microphones import MicrophoneArray, check_array
 from jeit.acoustic.surface import to_space
 from jeit_solvers import inverse_small, symmetric_small
 from jeit_solvers.engines import either_engine, kept, namespace, slopes
+from jeit_solvers.module import Module
 
 
-class Likelihood(eqx.Module):
+class Likelihood(Module):
     """Negative log-likelihood of F frames.
 
     **Fields**: `power`: intensities (M, F) minus the floor; `level`: levels y (M, F); `use`: mask (M, F) of the

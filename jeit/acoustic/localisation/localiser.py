@@ -32,6 +32,7 @@ from jeit_solvers.engines import (
     scan,
     undifferentiated,
 )
+from jeit_solvers.module import Module
 
 METHODS = {"likelihood": Likelihood, "consistency": Consistency}
 # Approximate number of positions of the coarse grid over the bounding box of the outline.
@@ -43,7 +44,7 @@ _CHUNK, _CHUNK_OF_MAPS = 1024, 32
 _SCREENED_AT = 0.2
 
 
-class SourceEstimate(eqx.Module):
+class SourceEstimate(Module):
     """Estimated sources of F frames.
 
     - `position`: (F, d) in metres, on the surface and within its outline.
@@ -66,7 +67,7 @@ class SourceEstimate(eqx.Module):
     converged: Bool[Array, " F"]
 
 
-class Localiser(eqx.Module):
+class Localiser(Module):
     """Estimator of source positions from intensities. Create it with `Localiser.create`, and call it with intensities.
 
     **Fields**: `microphone_array`: model of the array; `coarse`: coarse grid; `pixels`: raster of the maps, if any;

@@ -9,6 +9,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jeit_solvers.module import Module
+
 # Number of frames up to which a computation with NumPy is faster than compiling it.
 FEW_FRAMES = 1024
 
@@ -25,7 +27,7 @@ class LocationStatus(StrEnum):
     UNUSABLE = "unusable"
 
 
-class Locations(eqx.Module):
+class Locations(Module):
     """Positions and status of F frames, from M microphones.
 
     - `times`: (F,) middle of each frame in seconds.

@@ -9,13 +9,14 @@ from numpy.typing import ArrayLike
 
 from jeit.acoustic.surface import chart_grid
 from jeit_solvers.engines import as_array, namespace, set_at
+from jeit_solvers.module import Module
 
 # Condition for a minimisation from the second valley: its value is less than this factor times the value of the best
 # valley, plus this offset. On rasters with more than this number of pixels, only the best valley is used.
 _WORTH_FACTOR, _WORTH_OFFSET, _MOST_PIXELS = 1.5, 8.0, 2000
 
 
-class Pixels(eqx.Module):
+class Pixels(Module):
     """A raster of P pixels over the bounding box of an outline.
 
     **Fields**: `chart`: chart coordinates (2, P) of the pixels' centres in metres; `inside`: mask (P,) of the pixels

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,12 +14,13 @@ from jeit.acoustic.microphones import MicrophoneArray
 from jeit.acoustic.surface import bounding_box, longer_side, to_space
 from jeit_solvers import inverse_small, minimise_small
 from jeit_solvers.engines import at_once, has_values, namespace, on_device, on_host, scan
+from jeit_solvers.module import Module
 
 # Approximate number of grid positions, all pairs of which are screened; number of pairs that are refined.
 _PLACES, _STARTS = 150, 3
 
 
-class TwoSources(eqx.Module):
+class TwoSources(Module):
     """Estimated pairs of sources of F frames.
 
     **Fields**: `position`: (F, 2, d) in metres, the stronger source first; `covariance`: (F, 2, d, d) in m²;

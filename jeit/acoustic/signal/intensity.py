@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 import scipy.fft
 from jaxtyping import Bool, Float
@@ -28,6 +27,7 @@ from scipy.special import gammainc, gammaincinv
 from jeit.acoustic.signal.faults import intensity_faults, sample_faults, window_faults
 from jeit.acoustic.signal.recording import Intensities, Recording, Taps
 from jeit.arguments import check_kind
+from jeit_solvers.module import Module
 
 # Minimum number of frequency bins in the band.
 _FEWEST_BINS = 4.0
@@ -148,7 +148,7 @@ def noise_correlation(grid: WindowGrid, windows: int) -> Float[np.ndarray, "F F"
 _AUDIBLE_SHARE = 0.5
 
 
-class IntensitySettings(eqx.Module):
+class IntensitySettings(Module):
     """Frequency band and windows in which intensities are computed.
 
     **Fields**: `low`, `high`: limits of the band in Hz; `window`: length of a window in seconds; `hop`: time between

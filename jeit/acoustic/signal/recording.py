@@ -33,6 +33,7 @@ from jeit.acoustic.signal.faults import intensity_faults
 from jeit.arguments.extras import optional
 from jeit.files import check_memory, need, npz_arrays, read_as, reason, written_whole
 from jeit.mesh.topology import check_loop
+from jeit_solvers.module import Module
 
 # Bytes of memory needed per byte of a file with eight bits per sample.
 _IN_MEMORY = 16
@@ -124,7 +125,7 @@ _UNKNOWN_FORMAT = "neither an NPZ nor a sound file"
 _LOUDEST = 1e15
 
 
-class Recording(eqx.Module):
+class Recording(Module):
     """Simultaneous samples of M microphones.
 
     - `samples`: (M, S), in any unit (volts, counts, fractions of full scale). NaN and infinite samples are kept;
@@ -156,7 +157,7 @@ class Recording(eqx.Module):
         self.rate, self.full_scale, self.name = sampling_rate(rate), check_full_scale(full_scale), name
 
 
-class Intensities(eqx.Module):
+class Intensities(Module):
     """Band power of M microphones in F time windows.
 
     - `times`: (F,) middle of each window in seconds.
@@ -236,7 +237,7 @@ class Intensities(eqx.Module):
         self.usable, self.name, self.notes = given & np.isfinite(self.power), name, tuple(notes)
 
 
-class Taps(eqx.Module):
+class Taps(Module):
     """T touches at known positions, for calibration; d = 2 or 3.
 
     - `microphones`: (M, d) positions of the microphones in metres.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,12 +27,13 @@ from jeit.acoustic.simulate.synthesis import (
     transform_size,
 )
 from jeit.arguments.checks import check_not_negative
+from jeit_solvers.module import Module
 
 # Number of samples computed at once: 32 MB.
 PIECE = 2**22
 
 
-class CalibrationTaps(eqx.Module):
+class CalibrationTaps(Module):
     """Recordings of taps at known positions.
 
     **Fields**: `samples`: recorded samples (T, M, S); `rate`: sampling rate in Hz; `positions`: positions of the taps

@@ -8,6 +8,7 @@ import numpy as np
 from jeit.arguments import check_metres
 from jeit.arguments.checks import check_not_negative
 from jeit.layout.layout import LARGEST
+from jeit_solvers.module import Module
 
 # Time between two slots of a multiplexer in seconds, and number of slots. Eight 4:1 multiplexers switch simultaneously
 # every 25 µs, so each microphone is sampled every 100 µs (Park 2022, text S3).
@@ -15,7 +16,7 @@ STEP = 25e-6
 SLOTS = 4
 
 
-class MicrophoneModel(eqx.Module):
+class MicrophoneModel(Module):
     """Properties of the microphones under a skin, and their variation between microphones.
 
     **Fields**
@@ -46,7 +47,7 @@ class MicrophoneModel(eqx.Module):
             raise ValueError(f"snr_db must be finite, in decibels; it is {self.snr_db}.")
 
 
-class Readout(eqx.Module):
+class Readout(Module):
     """Readout of the microphones: analogue filters, multiplexers, and sampling.
 
     **Fields**

@@ -17,6 +17,7 @@ from jeit.acoustic.simulate.touches import NOMINAL_SPEED
 from jeit.acoustic.simulate.wind_sound import TURBULENCE, room_sound, wind
 from jeit.arguments import check_key, check_kind, check_name, describe
 from jeit.arguments.checks import check_positive
+from jeit_solvers.module import Module
 
 # Standard deviation of the logarithm of a trait between the clips of one person; and standard deviation of `slope`,
 # which varies linearly, between people. Between the clips of one person, `slope` varies half as much.
@@ -79,7 +80,7 @@ _MARGIN, _SLOWEST = 0.02, 0.1
 _SHORTEST = 0.01
 
 
-class SoundingPerson(eqx.Module):
+class SoundingPerson(Module):
     """Traits of one person.
 
     **Fields**: `medians`: for each modality, dictionary of the person's traits by name, in SI units.

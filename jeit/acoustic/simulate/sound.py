@@ -26,6 +26,7 @@ from jeit.acoustic.simulate.synthesis import (
     transform_size,
 )
 from jeit.arguments.checks import check_positive
+from jeit_solvers.module import Module
 
 # Time in seconds between the positions of a moving source. The source is at rest during each Hann-weighted block of two
 # hops; blocks overlap by half, and their weights sum to one. In 10 ms, a fast stroke of 0.5 m/s moves by 5 mm, much
@@ -33,7 +34,7 @@ from jeit.arguments.checks import check_positive
 HOP = 0.01
 
 
-class SimulatedSound(eqx.Module):
+class SimulatedSound(Module):
     """Samples of all channels during a touch, and the true source.
 
     **Fields**: `samples`: (M, S), in the unit of source strength; `rate`: sampling rate in Hz; `position`: positions

@@ -9,7 +9,6 @@ Park et al., Science Robotics 7, eabm7187 (2022). See `jeit.acoustic.simulate.pr
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,9 +19,10 @@ from jeit.acoustic.simulate.microphones import MicrophoneModel, Readout, microph
 from jeit.arguments import check_key, check_kind, check_metres
 from jeit.arguments.checks import check_not_negative, check_positive
 from jeit.layout.layout import LARGEST
+from jeit_solvers.module import Module
 
 
-class Elastomer(eqx.Module):
+class Elastomer(Module):
     """A soft rubber, in which a touch radiates mainly shear waves of speed √(shear modulus / density).
 
     **Fields**: `shear_modulus`: shear modulus in Pa; `density`: density in kg/m³; `attenuation`: attenuation in nepers
@@ -73,7 +73,7 @@ class Elastomer(eqx.Module):
         return 2 * jnp.pi * frequencies / self.wave_speed + dispersion
 
 
-class ElastomerLayer(eqx.Module):
+class ElastomerLayer(Module):
     """A rectangular layer of an elastomer, centred at the origin.
 
     **Fields**: `width`, `height`, `thickness`: dimensions in metres; `material`: the elastomer; `reflection`: amplitude
@@ -136,7 +136,7 @@ class ElastomerLayer(eqx.Module):
         return place
 
 
-class SoundingSkin(eqx.Module):
+class SoundingSkin(Module):
     """An elastomer layer with microphones under its surface.
 
     The unit of samples is arbitrary: a source of strength 1 has a mean square of 1 at a nominal microphone directly

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from jeit.acoustic.simulate.propagation import band_filter, noise_power, source_
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin
 from jeit.arguments import check_kind
 from jeit.arguments.checks import check_positive
+from jeit_solvers.module import Module
 
 # Duration in seconds for which the source's filter rings before and after a burst, since it has zero phase: about the
 # inverse of its lowest frequency.
@@ -86,7 +86,7 @@ def sample_times(skin: SoundingSkin, duration: float) -> Float[np.ndarray, " S"]
 ONSET = 0.02
 
 
-class Burst(eqx.Module):
+class Burst(Module):
     """Envelope of a tap, which rises fast and then decays.
 
     **Fields**: `strength`: root mean square over `length`; `length`: duration in seconds. Raises `ValueError` for

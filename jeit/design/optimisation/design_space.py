@@ -15,9 +15,10 @@ from jeit.design.skin.skin import Skin, longer_side
 from jeit.layout import SurfaceLayout
 from jeit.mesh import Domain
 from jeit_solvers import Status, scipy_lbfgsb
+from jeit_solvers.module import Module
 
 
-class Constraints(eqx.Module):
+class Constraints(Module):
     """Constraints on disc electrodes: each disc lies wholly inside `outline` and wholly outside every domain of
     `keep_out`, the centres are at least `minimum_spacing` metres apart, and no two discs overlap.
 
@@ -63,7 +64,7 @@ class Constraints(eqx.Module):
         }
 
 
-class DesignSpace(eqx.Module):
+class DesignSpace(Module):
     """The layouts allowed in an optimisation, and the quantities that are varied.
 
     **Fields**

@@ -24,6 +24,7 @@ from jeit.design.scores import Scores
 from jeit.design.skin.skin import Skin, check_skin
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh import Domain
+from jeit_solvers.module import Module
 
 # Stages of the optimisation: weight of the penalty, and fraction of all steps after which the stage ends.
 _PENALTY_STAGES = ((1e2, 0.5), (1e3, 0.8), (1e4, 1.0))
@@ -37,7 +38,7 @@ _MIN_IMPROVEMENT = 1e-9
 _NUM_DRAWS = 20_000
 
 
-class Optimisation(eqx.Module):
+class Optimisation(Module):
     """Result of `optimise_layout` from S starts.
 
     **Fields**
@@ -135,7 +136,7 @@ def optimise_layout(
     )
 
 
-class _LayoutSearch(eqx.Module):
+class _LayoutSearch(Module):
     """The optimisation from S starts, and its result."""
 
     skin: Skin

@@ -22,12 +22,13 @@ from jeit.electrodes import SurfaceDiscs
 from jeit.layout import SurfaceLayout
 from jeit.mesh.geodesic import Triangles
 from jeit_solvers.engines import as_array
+from jeit_solvers.module import Module
 
 # Maximum and minimum step length, as fractions of the mean spacing of the electrodes.
 _LONGEST, _SHORTEST = 0.3, 1e-3
 
 
-class SurfaceOptimisation(eqx.Module):
+class SurfaceOptimisation(Module):
     """Result of `optimise_surface_layout`.
 
     **Fields**: `layout`: the best layout; `value`: its score; `start_value`: score of the given layout; `history` (T,):

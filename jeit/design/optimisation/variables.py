@@ -19,6 +19,7 @@ from jeit.design.skin.sheet_touches import SheetTouches
 from jeit.design.skin.skin import Skin, check_skin
 from jeit.electrodes import SheetDiscs
 from jeit.mesh import Domain
+from jeit_solvers.module import Module
 
 Symmetry = Literal["mirror-x", "mirror-y", "rotate-2", "rotate-4"]
 _IMAGES = {
@@ -40,7 +41,7 @@ class Varied(NamedTuple):
     thickness: Float[Array, ""]
 
 
-class Range(eqx.Module):
+class Range(Module):
     """Logarithmic scale for k positive values between `least` (k,) and `least` · exp(`span`)."""
 
     least: Float[np.ndarray, " k"]
@@ -64,7 +65,7 @@ class Range(eqx.Module):
         return jnp.asarray(self.least) * jnp.exp(self.span * variables)
 
 
-class Variables(eqx.Module):
+class Variables(Module):
     """Mapping from variables between 0 and 1 to the parameters `Varied`. The variables describe G generators; the other
     electrodes are their images under the symmetry.
 
@@ -203,7 +204,7 @@ def balanced_score(scores: Scores) -> Float[Array, ""]:
     return jnp.log(scores.soft_worst) - jnp.log(scores.mean_variance)
 
 
-class Objective(eqx.Module):
+class Objective(Module):
     """Objective of a layout optimisation: a function of the `Scores` of a layout, which is maximised.
 
     **Fields**: `touches`: touches of the skin, as from `Skin.sheet_touches`; `prior`, `noise` (volts) and

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import abc
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
 from jeit.design.defaults import BALL_DIAMETER, DEPTH, DEVIATION
 from jeit.mesh.outline.domain import check_length
 from jeit_solvers.engines import either_engine, namespace
+from jeit_solvers.module import Module
 
 
-class AbstractIndentation(eqx.Module):
+class AbstractIndentation(Module):
     """Base class of indentations: to define a new indentation, subclass it."""
 
     @abc.abstractmethod

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
@@ -16,6 +15,7 @@ from jeit.forward.system import cell_conductivity, check_conductivity
 from jeit.forward.transfer import fields_and_inverse
 from jeit_solvers import NearInverse, Strips, over_cores
 from jeit_solvers.engines import on_device
+from jeit_solvers.module import Module
 
 # Number of touches per call of a compiled program, and ratios of successive sizes to which the numbers of nodes and of
 # cells are padded. One program is compiled for each size, and the cost of a touch grows with the square of its number
@@ -23,7 +23,7 @@ from jeit_solvers.engines import on_device
 _TOUCHES_PER_CALL, _NODE_SIZE_RATIO, _CELL_SIZE_RATIO = 2 * EXACT_AT_ONCE, 2**0.5, 2.0
 
 
-class RestingSkin(eqx.Module):
+class RestingSkin(Module):
     """An untouched skin, with the entries of its inverse system matrix for all pairs of nodes that may be touched.
 
     **Fields**

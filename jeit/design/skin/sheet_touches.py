@@ -14,9 +14,10 @@ from jeit.design.skin.touched_cells import TouchedCells, touched_cells
 from jeit.mesh import Mesh, centroids
 from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit_solvers.engines import gather, host, namespace, sum_into
+from jeit_solvers.module import Module
 
 
-class SheetTouches(eqx.Module):
+class SheetTouches(Module):
     """Touches of a sheet at n positions, with derivatives with respect to the positions; create them with
     `sheet_touches`.
 

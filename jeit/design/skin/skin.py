@@ -29,6 +29,7 @@ from jeit.mesh.generate.unstructured import MOST_POINTS
 from jeit.mesh.geodesic import Triangles
 from jeit.protocol import Protocol
 from jeit_solvers.engines import host
+from jeit_solvers.module import Module
 
 # Number of nodes of a plane mesh, multiplied by (cell size)² / area: 1.155 for equilateral cells, and slightly more due
 # to the nodes on the edge.
@@ -41,7 +42,7 @@ _MAX_CELL_RATIO = 1.5
 _MAX_LAYER_RATIO = 3.0
 
 
-class Skin(eqx.Module):
+class Skin(Module):
     """A tactile skin: disc electrodes in a sheet, or on the bottom of a layer that is touched on its top.
 
     With a `SurfaceLayout` the sheet or the layer is curved, and touched positions are points (n, 3) on its surface.

@@ -11,9 +11,10 @@ from jeit.design.defaults import PLACES
 from jeit.layout import spread
 from jeit.mesh import Domain
 from jeit.mesh.geodesic import Triangles
+from jeit_solvers.module import Module
 
 
-class TouchGrid(eqx.Module):
+class TouchGrid(Module):
     """Grid of touched positions: the centres of equal rectangles that cover a skin.
 
     **Fields**

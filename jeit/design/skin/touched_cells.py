@@ -17,9 +17,10 @@ from jeit.forward import ForwardModel
 from jeit.mesh import Mesh
 from jeit_solvers import Strips
 from jeit_solvers.engines import as_array, host
+from jeit_solvers.module import Module
 
 
-class TouchedCells(eqx.Module):
+class TouchedCells(Module):
     """Changed cells of n touches: each touch changes the conductivity of up to c cells from σ to σ (1 + change).
 
     **Fields**
@@ -131,7 +132,7 @@ def _check_values(contrast: float, edge: float) -> None:
 _TOUCHES_AT_ONCE, _PADDING_MULTIPLE = 64, 16
 
 
-class TouchedNodes(eqx.Module):
+class TouchedNodes(Module):
     """Nodes of the cells that n touches change.
 
     **Fields**

@@ -30,9 +30,10 @@ from jeit.forward import ForwardModel
 from jeit.layout import Layout, SurfaceLayout
 from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit.protocol import Protocol
+from jeit_solvers.module import Module
 
 
-class _SharedData(eqx.Module):
+class _SharedData(Module):
     """Data shared by all points of one shape.
 
     **Fields**: `model`: the forward model; `touched`: the touched cells on a skin of `thickness` metres; `touches`: the
@@ -49,7 +50,7 @@ class _SharedData(eqx.Module):
     key: Array
 
 
-class _PointData(eqx.Module):
+class _PointData(Module):
     """Data that differ between points of one shape. `conductivity` is that of the forward model, S/m (2-D: S), and
     `noise` is in volts. In a batch of k points, every array has a leading axis of length k."""
 

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jeit_solvers.engines import as_array
+from jeit_solvers.module import Module
 
 RULE = "noise-figure"
 """Default rule that chooses λ, for linear images and for nonlinear problems linearised at the background."""
@@ -21,7 +22,7 @@ EDGE_PRICE = 300.0
 """Default λ of total variation: penalty of an edge as long as the body is wide, per unit of log σ."""
 
 
-class Choice(eqx.Module):
+class Choice(Module):
     """A hyperparameter λ that was chosen by a rule from a grid of candidates, or given.
 
     **Fields**: `hyperparameter`: λ; `candidates` (K,): values of λ evaluated, ascending; `criterion` (K,): criterion of

@@ -22,9 +22,10 @@ from jeit.forward import ForwardModel
 from jeit.inverse.prior.bases import Regions
 from jeit.mesh import Mesh
 from jeit_solvers.engines import has_values, namespace
+from jeit_solvers.module import Module
 
 
-class AbstractUnknown(eqx.Module):
+class AbstractUnknown(Module):
     """Base of all unknowns, which consist of `size` values with prior standard deviation `deviation`."""
 
     deviation: eqx.AbstractVar[Float[Array, " k"]]
@@ -160,7 +161,7 @@ def _check_deviation(name: str, deviation, num_values: int) -> Float[Array, " k"
 _MIN_CONDUCTIVITY_RATIO = 1e-6
 
 
-class AbstractLink(eqx.Module):
+class AbstractLink(Module):
     """Base of all links σ(x) between the estimated quantity x and conductivity σ, which are increasing and smooth."""
 
     @abc.abstractmethod
@@ -293,7 +294,7 @@ def as_parametrisation(parametrisation: "Parametrisation | None") -> "Parametris
     return parametrisation
 
 
-class Parametrisation(eqx.Module):
+class Parametrisation(Module):
     """Parametrisation of an image: the quantities that are estimated.
 
     - `link`: scale on which the prior acts, `Log()` by default.

@@ -38,6 +38,7 @@ from jeit.inverse.prior.bases import AbstractBasis, DenseBasis
 from jeit.inverse.prior.penalties import AbstractPenalty
 from jeit_solvers import QuadraticModel, as_minimum, symmetric_eigen, symmetric_inverse
 from jeit_solvers.engines import either_engine, has_values, host, namespace, on_device, on_host
+from jeit_solvers.module import Module
 
 # Relative distance within which a coefficient counts as being at a bound; solvers scale coefficients and bounds, which
 # causes rounding errors.
@@ -187,7 +188,7 @@ def _expected_variance(strength, persistence: float):
     return np.where(half > 0, fresh / (half + root), (root - half) / strength)
 
 
-class Inversion(eqx.Module):
+class Inversion(Module):
     """Minimisation of ½ rᵀ G r + penalty(c) over c, with r = w (v(σ) - ŷ) and σ = link(x₀ + S c).
 
     **Fields**: `model`: forward model of the independent channels; `data`: holds ŷ, w and G; `link`; `reference` (m,):

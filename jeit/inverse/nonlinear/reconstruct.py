@@ -33,9 +33,10 @@ from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit.inverse.spectrum import Spectrum
 from jeit_solvers import Status
 from jeit_solvers.engines import as_array, either_engine, has_values, namespace, on_device, on_host
+from jeit_solvers.module import Module
 
 
-class Reconstruction(eqx.Module):
+class Reconstruction(Module):
     """Result of `reconstruct`.
 
     **Fields**: `conductivity` (m,): S/m (2-D: S); `voltages` (M,): predicted voltages; `misfit`: root mean square of

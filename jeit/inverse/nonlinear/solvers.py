@@ -19,6 +19,7 @@ from jeit.arguments import check_kind, check_name, counted
 from jeit.inverse.nonlinear.problem import Inversion, as_solution, check_steps, check_tolerance
 from jeit_solvers import BoundedMinimum, Descent, Status, ended, ended_number, lbfgsb, projected_gradient
 from jeit_solvers.engines import as_array, has_values, on_host, undifferentiated
+from jeit_solvers.module import Module
 
 _Setting = TypeVar("_Setting")
 
@@ -50,7 +51,7 @@ class Solution(NamedTuple):
     reason: str
 
 
-class AbstractSolver(eqx.Module):
+class AbstractSolver(Module):
     """Base of all solvers of `reconstruct` and `Imager`. A new solver is a subclass with `minimise` and an entry in
     `SOLVERS`."""
 

@@ -19,9 +19,10 @@ from jaxtyping import Array, Float, Int
 
 from jeit.mesh import Mesh, centroids, measures
 from jeit_solvers.engines import gather, host, namespace, sum_into
+from jeit_solvers.module import Module
 
 
-class AbstractBasis(eqx.Module):
+class AbstractBasis(Module):
     """Base of all bases S (m, n)."""
 
     @property
@@ -195,7 +196,7 @@ class NodalBasis(AbstractBasis):
         raise ValueError("regions: images of nodes have none; leave them out.")
 
 
-class Regions(eqx.Module):
+class Regions(Module):
     """Regions of cells that share one value, such as pixels of a grid or layers of a skin.
 
     **Fields**: `label` (m,): number of each cell's region, from 0, or -1 if the cell is held at the background;

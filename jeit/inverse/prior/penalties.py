@@ -27,13 +27,14 @@ from jeit_solvers import (
     ridge_model,
 )
 from jeit_solvers.engines import host, namespace
+from jeit_solvers.module import Module
 
 # Multiple of the identity, relative to the largest entry, added to a precision that has a null space before it is
 # inverted approximately.
 _DIAGONAL_SHIFT = 1e-6
 
 
-class AbstractPenalty(eqx.Module):
+class AbstractPenalty(Module):
     """Base of all penalties of coefficients c; those of further unknowns come last."""
 
     @property
@@ -143,7 +144,7 @@ class QuadraticForm(AbstractPenalty):
         raise ValueError("A QuadraticForm is minimised by bounded solvers only.")
 
 
-class AbstractNormal(eqx.Module):
+class AbstractNormal(Module):
     """Base of normal distributions of coefficients c (n,); those of further unknowns come last."""
 
     @abc.abstractmethod

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,6 +40,7 @@ from jeit_solvers import (
     solve,
 )
 from jeit_solvers.engines import has_values, host, on_host
+from jeit_solvers.module import Module
 
 _PRIOR_EXAMPLES = (
     "an object of jeit.inverse: Noser(), Gaussian(length in metres), Laplace(), Tikhonov(), TotalVariation()"
@@ -64,7 +64,7 @@ _LARGE_MESH_CELLS, _MIN_SIGNAL = 30_000, 1e-12
 _DIAGONAL_TERM = 1e-6
 
 
-class AbstractPrior(eqx.Module):
+class AbstractPrior(Module):
     """Base of all priors on an image of one value per cell.
 
     A new quadratic prior is a subclass with `covariance_product`, `precision` and `basis`. A prior whose energy is not

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -19,6 +18,7 @@ from jeit.arguments import check_name
 from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantities, polarisation
 from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import Mesh, measures
+from jeit_solvers.module import Module
 
 # Difference of log evidence above which only the likelier of two descriptions is reported (ellipsoid or column, one
 # material or several); maximum number of steps when an alternative is fitted; tolerance of that fit.
@@ -163,7 +163,7 @@ class EllipsoidPrior(BodyPrior):
         return contrast, self.contrast_spread * contrast
 
 
-class Ellipsoid(eqx.Module):
+class Ellipsoid(Module):
     """Ellipsoid or column found in a solid.
 
     **Fields**: `sign`: +1 if more conductive than the bath, -1 if less; `centre` (3,): metres; `axes` (3, 3): half axes

@@ -30,6 +30,7 @@ from jeit.inverse.shapes.quantities import Accuracy, include_deviation, with_qua
 from jeit.inverse.shapes.star import Star, StarPrior, Stars
 from jeit.mesh import check_flat
 from jeit_solvers.engines import as_array
+from jeit_solvers.module import Module
 
 if TYPE_CHECKING:
     from jeit.inverse.shapes.finer import FinerModel
@@ -55,7 +56,7 @@ _MIN_EVIDENCE_GAIN = 2.0
 Body = Star | Ellipsoid
 
 
-class FinerImage(eqx.Module):
+class FinerImage(Module):
     """Conductivity on a refined mesh.
 
     **Fields**: `model`: forward model on the refined mesh, with the same electrodes and a protocol of independent
@@ -66,7 +67,7 @@ class FinerImage(eqx.Module):
     conductivity: Float[Array, " c"]
 
 
-class ShapeReconstruction(eqx.Module):
+class ShapeReconstruction(Module):
     """Result of `reconstruct_shapes`.
 
     **Fields**: `bodies`: `Star`s in a sheet, `Ellipsoid`s in a solid, in descending order of `rise`; `conductivity`

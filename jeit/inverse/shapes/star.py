@@ -10,12 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float
 
 from jeit.inverse.shapes.bodies import TINY, Bodies, BodyPrior, Covered, Quantities
 from jeit.mesh import Mesh, measures
+from jeit_solvers.module import Module
 
 # Barycentric weights of the six points at which a cell is sampled.
 _SAMPLES = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4], [2.5, 2.5, 1], [2.5, 1, 2.5], [1, 2.5, 2.5]]) / 6
@@ -68,7 +68,7 @@ class StarPrior(BodyPrior):
         return contrast, self.weak_spread * contrast
 
 
-class Star(eqx.Module):
+class Star(Module):
     """Body with a star-shaped outline, found in a sheet.
 
     **Fields**: `sign`: +1 if more conductive than the bath, -1 if less; `centre` (2,): centre of the star, metres;

@@ -30,6 +30,7 @@ from jeit.inverse.nonlinear.solvers import AbstractSolver, GaussNewton, as_solve
 from jeit.inverse.prior.matern import smooth_prior
 from jeit.inverse.prior.priors import AbstractPrior, check_prior
 from jeit_solvers.engines import as_array
+from jeit_solvers.module import Module
 
 FRAME_STEPS = 4
 """Default maximum number of iterations per frame."""
@@ -46,7 +47,7 @@ def check_memory(memory) -> None:
         raise ValueError(f"memory must be a number of frames, or 0 for none; it is {describe(memory)}.")
 
 
-class FrameEstimate(eqx.Module):
+class FrameEstimate(Module):
     """Result of an iterative `Imager` for one frame.
 
     **Fields**: `conductivity` (m,): S/m (2-D: S); `coefficients` (n,): coefficients of the image, from which the next
@@ -62,7 +63,7 @@ class FrameEstimate(eqx.Module):
     converged: Bool[Array, ""]
 
 
-class LinearMap(eqx.Module):
+class LinearMap(Module):
     """Linear image σ = `level` (m,) + `matrix` (m, k) · `estimator` (k, M) · voltages (M,), S/m (2-D: S).
 
     k is the number of independent channels or of the prior's shapes, whichever is smaller. With a memory, `carry`
@@ -76,7 +77,7 @@ class LinearMap(eqx.Module):
     carry: Float[Array, "k k"]
 
 
-class Imager(eqx.Module):
+class Imager(Module):
     """Imager for the frames of one sensor, created by `Imager.create`; `stream` passes frames to it and handles faulty
     ones.
 

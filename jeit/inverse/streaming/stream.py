@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterable, Iterator
 from enum import StrEnum
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from jeit.arguments import check_kind, counted
 from jeit.inverse.nonlinear.solvers import counted_iterations
 from jeit.inverse.streaming.imager import Imager
 from jeit_solvers import Status
+from jeit_solvers.module import Module
 
 # Relative difference from an undisturbed frame above which a frame is faulty or from another sensor.
 _LARGEST_DIFFERENCE = 0.5
@@ -179,7 +179,7 @@ class FrameCheck:
         return values, rest, FrameStatus.PARTIAL, f"Left out: {channels} at the ends of the range, saturated."
 
 
-class FrameImage(eqx.Module):
+class FrameImage(Module):
     """Result for one frame of a stream.
 
     **Fields**: `number`: number of the frame, from 0; `conductivity` (m,): S/m (2-D: S), a NumPy array, None for a

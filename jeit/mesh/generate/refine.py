@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
@@ -15,6 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from jeit.mesh.generate.curve import Curve, Size, within
+from jeit_solvers.module import Module
 
 # Factor between successive trial numbers of nodes, and maximum number of nodes tried.
 _TRIAL_FACTOR, _MAX_TRIAL_NODES = 1.1, 2e6
@@ -56,7 +56,7 @@ def nodes_of_solid(asked: int | None, in_plane: Callable[[int], int]) -> Iterato
 _USER_SIZE_GROWTH = 0.45
 
 
-class Refine(eqx.Module):
+class Refine(Module):
     """Smaller cells near given points, or along the whole outline.
 
     At a distance r from the nearest of `points`, the edges of cells have lengths of at most h + growth · max(r −

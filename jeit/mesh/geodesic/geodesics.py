@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
@@ -23,6 +22,7 @@ from scipy.spatial import KDTree
 
 from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
 from jeit.mesh.mesh import Mesh
+from jeit_solvers.module import Module
 
 # Minimum relative decrease of a distance that is propagated, and number of sources processed together, which limits the
 # memory for distances (s, n).
@@ -49,7 +49,7 @@ class _Corners(NamedTuple):
     y: np.ndarray
 
 
-class Geodesics(eqx.Module):
+class Geodesics(Module):
     """Geodesic distances on a surface; created by `Geodesics.create`.
 
     **Fields**: `surface`: the triangles; `corners`: their corners; `curvature` (n,): Gaussian curvature at the nodes,

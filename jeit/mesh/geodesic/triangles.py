@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from jeit.mesh.mesh import Mesh
+from jeit_solvers.module import Module
 
 # Number of triangles, by nearest centroids, among which the nearest triangle is searched.
 _CANDIDATES = 16
 
 
-class SurfacePlaces(eqx.Module):
+class SurfacePlaces(Module):
     """p points on a surface.
 
     **Fields**: `triangle` (p,): index of the triangle; `weights` (p, 3): barycentric coordinates in it; `points` (p,
@@ -32,7 +32,7 @@ class SurfacePlaces(eqx.Module):
         return np.einsum("pk,pk...->p...", self.weights, corners)
 
 
-class Triangles(eqx.Module):
+class Triangles(Module):
     """Triangles in space.
 
     **Fields**: `points` (n, 3) metres; `cells` (m, 3), counter-clockwise as seen from outside.

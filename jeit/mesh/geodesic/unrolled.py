@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 
-import equinox as eqx
 import numpy as np
 import scipy.sparse
 from jaxtyping import Float, Int
@@ -21,13 +20,14 @@ from scipy.sparse.linalg import factorized
 
 from jeit.mesh.geodesic.triangles import SurfacePlaces, Triangles
 from jeit.mesh.mesh import Mesh
+from jeit_solvers.module import Module
 
 _RIGID_ITERATIONS = 60
 # Minimum slope of a coordinate in space, in metres per metre on the flat surface, for its use as the upward direction.
 _MIN_UPWARD_SLOPE = 0.3
 
 
-class Unrolled(eqx.Module):
+class Unrolled(Module):
     """A surface flattened into the plane; created by `unroll`.
 
     **Fields**: `surface`: the triangles in space; `cells` (m, 3): the triangles as indices of flat nodes, in which

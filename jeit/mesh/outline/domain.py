@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 from typing import Any, Protocol
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -16,9 +15,10 @@ from jeit.mesh.checks import warn_large
 from jeit.mesh.generate.refine import Refinement
 from jeit.mesh.mesh import Mesh
 from jeit_solvers.engines import has_values
+from jeit_solvers.module import Module
 
 
-class Body(eqx.Module):
+class Body(Module):
     """Base of all bodies: plane outlines (`Domain`), solids above an outline (`Solid`), and given meshes
     (`OwnMesh`)."""
 

@@ -10,9 +10,10 @@ from scipy import sparse
 from jeit.arguments import check_kind, describe, is_number
 from jeit.mesh import Mesh, check_flat
 from jeit.touch.contacts.image_noise import ImageNoise
+from jeit_solvers.module import Module
 
 
-class Contact(eqx.Module):
+class Contact(Module):
     """A contact in an image.
 
     **Fields**: `centroid`: (x, y), or (x, y, z) on a surface in space, metres; `area`: area of the region, m²; `peak`:
@@ -30,7 +31,7 @@ class Contact(eqx.Module):
     deviation: float
 
 
-class AbstractFinder(eqx.Module):
+class AbstractFinder(Module):
     """Finds contacts in images on one mesh; everything that does not depend on the image is computed in advance.
 
     **Fields**: `smoothing` (m, m): matrix that smooths images first; `sign`: 1 if touched skin conducts better, -1 if

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -11,6 +10,7 @@ from scipy import sparse
 
 from jeit.arguments import check_kind, counted, real_array
 from jeit.inverse.linear.one_step import LinearReconstruction
+from jeit_solvers.module import Module
 
 # Minimum number of frames for estimating the standard deviation.
 _LEAST_FRAMES = 10
@@ -21,7 +21,7 @@ _DEVIATION_PER_MEDIAN, _CLIP_AT, _CLIPPED_DEVIATION = 1.4826, 3.0, 1.0136
 _ROUNDS = 20
 
 
-class ImageNoise(eqx.Module):
+class ImageNoise(Module):
     """Noise of linear images.
 
     **Fields**: `deviation` (m,): standard deviation of every cell, in the unit of the image; `factor` (r, m): matrix

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -21,6 +20,7 @@ from scipy.optimize import least_squares
 
 from jeit.arguments import check_kind, check_metres, describe, real_array
 from jeit.touch.contacts.finder import Contact
+from jeit_solvers.module import Module
 
 # Minimum number of contacts: one for each parameter s, b, c and F½, and four degrees of freedom for the scatter.
 _FEWEST = 8
@@ -30,7 +30,7 @@ _HIGHEST = 0.98
 _FARTHEST, _NARROWEST = 10.0, 1e-3
 
 
-class Load(eqx.Module):
+class Load(Module):
     """Estimated load of a contact.
 
     **Fields**: `force`: the load, newtons; `deviation`: its standard deviation, newtons.
@@ -40,7 +40,7 @@ class Load(eqx.Module):
     deviation: float
 
 
-class LoadCalibration(eqx.Module):
+class LoadCalibration(Module):
     """Fitted relation between peaks and loads.
 
     **Fields**: `centre` (2,), `radius`: centre and radius of the skin, metres; `parameters` (4,): log s, b, c and log

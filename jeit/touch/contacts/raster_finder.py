@@ -29,6 +29,7 @@ from jeit.touch.contacts.finder import (
     signed_image,
 )
 from jeit.touch.contacts.image_noise import ImageNoise
+from jeit_solvers.module import Module
 
 # Width in pixels of the band along a contact's edge in which cells may join or leave the contact.
 _EDGE = 15
@@ -36,7 +37,7 @@ _EDGE = 15
 _MOST_PIXELS = 4096
 
 
-class RasterStages(eqx.Module):
+class RasterStages(Module):
     """Results of the steps of `RasterFinder`; arrays are (rows, columns), with row 0 at the top.
 
     **Fields**: `region`: change on the pixels of the skin, NaN beside the skin; `grey`: grey levels, 0 to 255;

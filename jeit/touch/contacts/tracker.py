@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from jeit.arguments import check_kind, check_metres, describe, is_number, real_array
 from jeit.touch.contacts.finder import Contact
+from jeit_solvers.module import Module
 
 # Fraction of a contact's prediction error that corrects the velocity: one half averages the noise of two frames.
 _VELOCITY_GAIN = 0.5
@@ -18,7 +18,7 @@ _VELOCITY_GAIN = 0.5
 _HIDDEN_GAPS = 4
 
 
-class TouchPath(eqx.Module):
+class TouchPath(Module):
     """Path of one touch.
 
     **Fields**: `number`: position in order of onset; `times` (T,): times of the frames in which the touch was seen,
@@ -48,7 +48,7 @@ class TouchPath(eqx.Module):
         return float(np.linalg.norm(np.diff(self.position, axis=0), axis=1).sum())
 
 
-class _TrackedTouch(eqx.Module):
+class _TrackedTouch(Module):
     """State of a touch that is being tracked.
 
     **Fields**: `number`: position in order of onset; `time`: time of the last frame, seconds; `place`: position at that
@@ -74,7 +74,7 @@ class _TrackedTouch(eqx.Module):
         return TouchPath(self.number, np.array(times), *map(np.array, columns))
 
 
-class ContactTracker(eqx.Module):
+class ContactTracker(Module):
     """State of the tracking of touches.
 
     `tracker.follow(time, contacts)` returns the state after the next frame; this one is not changed. Contacts are

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.mesh import Mesh, centroids, check_flat, measures
+from jeit_solvers.module import Module
 
 # Minimum number of untouched frames for estimating the standard deviation of their peaks.
 _LEAST_FRAMES = 10
@@ -22,7 +22,7 @@ _LEAST_FRAMES = 10
 _ABOVE = 5.0
 
 
-class ChangeCourse(eqx.Module):
+class ChangeCourse(Module):
     """Time course of T images of the change x_e of elements e, in the unit of the images.
 
     **Fields**: `seconds` (T,): times; `peak` (T,): P = max_e x_e; `least` (T,): min_e x_e; `half_share` (T,): fraction
@@ -58,7 +58,7 @@ class ChangeCourse(eqx.Module):
 _COLUMNS = ("seconds", "peak", "least", "half_share", "mean", "area", "centroid")
 
 
-class TouchLevel(eqx.Module):
+class TouchLevel(Module):
     """Level of the maximum change in an image above which the skin is touched.
 
     **Fields**: `level`: in the unit of the images; `centres` (m, 2): centroids of the mesh's elements, metres; `areas`
@@ -156,7 +156,7 @@ def check_seconds(seconds: Float[np.ndarray, " F"], num_frames: int) -> Float[np
 _GAP, _LEAST, _ROUNDING = 0.1, 2, 1e-9
 
 
-class StreamTouch(eqx.Module):
+class StreamTouch(Module):
     """One touch of a stream.
 
     **Fields**: `course`: time course from the first to the last frame above the level; `lost`: number of unusable
@@ -190,7 +190,7 @@ class StreamTouch(eqx.Module):
         return not (self.begun_before or self.cut_off)
 
 
-class TouchStream(eqx.Module):
+class TouchStream(Module):
     """State of the segmentation of a stream of images into touches.
 
     `stream.follow(second, image)` returns the state after the next frame; this one is not changed. A touch has ended

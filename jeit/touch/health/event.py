@@ -11,10 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import ndtr
+
+from jeit_solvers.module import Module
 
 
 class EventKind(StrEnum):
@@ -52,7 +53,7 @@ class EventStatus(StrEnum):
     """The change has disappeared: it was mended, or was a press held for an unusually long time."""
 
 
-class HealthEvent(eqx.Module):
+class HealthEvent(Module):
     """An event in the state of a skin.
 
     **Fields**: `number`: position in order of detection; `kind`; `status`; `time`: when it began; `noticed`: when it

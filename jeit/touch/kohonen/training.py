@@ -18,13 +18,13 @@ between, only the distances are updated, and in the tuning phase only those of t
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jeit.arguments import describe, is_number, real_array
+from jeit_solvers.module import Module
 
 # Number of frames after which the weights are moved, in the ordering and in the tuning phase.
 _ORDERING_FRAMES, _TUNING_FRAMES = 16, 64
@@ -33,7 +33,7 @@ _ORDERING_FRAMES, _TUNING_FRAMES = 16, 64
 _IN_BOUNDS = "promise_in_bounds"
 
 
-class Schedule(eqx.Module):
+class Schedule(Module):
     """Schedule of a map's training.
 
     **Fields**: `ordering` and `tuning`: number of frames shown in each phase; `rate`: the rate ε at the first and the

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 
 from jeit.touch.training import Objective, Plan, TrainingResult, fit
+from jeit_solvers.module import Module
 
 # For the two layers: sizes of kernels and of pools, in pixels, and numbers of channels.
 _KERNELS, _POOLS, _CHANNELS = (5, 3), (3, 2), (32, 64)
@@ -35,7 +36,7 @@ each image in an epoch, as in the paper."""
 _AT_ONCE = 32
 
 
-class ModalityNetwork(eqx.Module):
+class ModalityNetwork(Module):
     """Weights of the network, in single precision.
 
     `first` (5, 5, 1, 32) and `second` (3, 3, 32, 64): kernels of the two convolutions; `gain`, `shift`, running `mean`

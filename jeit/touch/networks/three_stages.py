@@ -15,8 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jeit_solvers.module import Module
 
-class Dense(eqx.Module):
+
+class Dense(Module):
     """Dense layer x W + b for a batch x (b, i)."""
 
     weight: Float[Array, "i o"]
@@ -32,7 +34,7 @@ class Dense(eqx.Module):
         return values @ self.weight + self.bias
 
 
-class Convolution(eqx.Module):
+class Convolution(Module):
     """3 × 3 convolution of images padded with zeros, at every `stride`-th pixel."""
 
     weight: Float[Array, "3 3 i o"]
@@ -72,7 +74,7 @@ class Convolution(eqx.Module):
         return whole.reshape(number, 2 * rows, 2 * columns, -1) + self.bias
 
 
-class Chain(eqx.Module):
+class Chain(Module):
     """Layers in sequence, with exponential linear units between them.
 
     If a key is given, a fraction `dropout` of the values is dropped before each layer but the first.
@@ -124,7 +126,7 @@ _CHANNELS, _CODE = (16, 32, 64), 128
 _NOISE = 0.02
 
 
-class VoltageAutoencoder(eqx.Module):
+class VoltageAutoencoder(Module):
     """Autoencoder of standardised changes (b, M) with 84 latent values."""
 
     encoder: Chain
@@ -142,7 +144,7 @@ class VoltageAutoencoder(eqx.Module):
         return self.decoder(jax.nn.elu(self.encoder(changes, first)), second)
 
 
-class DepthEncoder(eqx.Module):
+class DepthEncoder(Module):
     """Encoder of depth maps (b, rows, columns) to 128 values."""
 
     layers: tuple[Convolution, ...]
@@ -163,7 +165,7 @@ class DepthEncoder(eqx.Module):
         return self.last(image.reshape(len(maps), -1))
 
 
-class DepthDecoder(eqx.Module):
+class DepthDecoder(Module):
     """Decoder of 128 values to depth maps (b, rows, columns)."""
 
     first: Dense
@@ -186,7 +188,7 @@ class DepthDecoder(eqx.Module):
         return image[..., 0]
 
 
-class DepthAutoencoder(eqx.Module):
+class DepthAutoencoder(Module):
     """Autoencoder of depth maps with a code of 128 values."""
 
     encoder: DepthEncoder
@@ -204,7 +206,7 @@ class DepthAutoencoder(eqx.Module):
         return self.decoder(jax.nn.elu(self.encoder(maps)))
 
 
-class ThreeStages(eqx.Module):
+class ThreeStages(Module):
     """Network of three stages: relative changes (b, M) → 84 latent values → 128 values → depth maps (b, rows, columns).
 
     **Fields**: `mean`, `deviation` (M,): mean and standard deviation of the changes in the training set, with noise;

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from jeit.touch.networks.linear_channels import LinearChannels, depth_from_strength, round_relative, strength
 from jeit.touch.networks.three_stages import Convolution, channels_to_pixels, repeat_pixels
+from jeit_solvers.module import Module
 
 _WIDE, _NARROW = 24, 16
 # Prior: standard deviation of a pixel's strength; its correlation length, divided by the skin's longer side. Linear
@@ -24,7 +25,7 @@ _WIDE, _NARROW = 24, 16
 _DEVIATION, _LENGTH, _TIMES, _DRIFT = 0.15, 0.04, (8.0, 1.5), 0.05
 
 
-class Refinement(eqx.Module):
+class Refinement(Module):
     """Convolutional U-net that computes, from images (b, rows, columns, i), corrections of maps with twice the rows and
     columns."""
 
@@ -62,7 +63,7 @@ class Refinement(eqx.Module):
         return channels_to_pixels(self.last(fine))
 
 
-class Unrolled(eqx.Module):
+class Unrolled(Module):
     """Network from relative changes (b, M) to depth maps (b, rows, columns), divided by the skin's thickness.
 
     **Fields**: `operator` (M, P): response of the channels to the pixels; `imagers` (M, p, k): transposed matrices of

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit_solvers.engines import has_values, namespace, replace_at
+from jeit_solvers.module import Module
 
 
 class Status(StrEnum):
@@ -76,7 +77,7 @@ def ended_number(result: optx.RESULTS) -> Int[Array, ""]:
 Objective = Callable[[Float[Array, " n"]], Float[Array, ""]]
 
 
-class BoundedMinimum(eqx.Module):
+class BoundedMinimum(Module):
     """Result of a minimisation with bounds. **Fields**: `x`: (n,) the minimum; `steps`: number of steps; `converged`:
     whether a step along the projected gradient would change no coordinate by more than the tolerance."""
 
@@ -168,7 +169,7 @@ _SUFFICIENT_DECREASE = 1e-4
 _ROUNDING_FACTOR = 100.0
 
 
-class DescentState(eqx.Module):
+class DescentState(Module):
     """State of a `Descent`: the next trial point, on a line from the last accepted point."""
 
     trial: Float[Array, " n"]

@@ -11,13 +11,13 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jeit_solvers.engines import complex_slope, host, namespace, set_at, slopes, while_loop
+from jeit_solvers.module import Module
 
 # Signature of a function of x (n, F), and of data whose last axis is F, that returns the value (F,), the gradient (n,
 # F), and a positive definite model (n, n, F) of the Hessian, for instance the Gauss-Newton or Fisher matrix.
@@ -32,7 +32,7 @@ _STEPS_OF_WHOLE_BATCH = 8
 _DIFFERENCE_STEP = 1e-6
 
 
-class Minimum(eqx.Module):
+class Minimum(Module):
     """Result of the batch. **Fields**: `x`: (n, F) minima; `value`: (F,); `converged`: (F,); `steps`: maximum number of
     steps of any function."""
 
@@ -109,7 +109,7 @@ def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
     return xp.stack([solve_small(matrix, column) for column in identity])
 
 
-class _State(eqx.Module):
+class _State(Module):
     """State of each function in a batch."""
 
     x: Array

@@ -25,11 +25,12 @@ from jaxtyping import Array, Bool, Inexact, Int
 from scipy.sparse import csr_array
 
 from jeit_solvers.dense import symmetric_inverse
+from jeit_solvers.module import Module
 from jeit_solvers.sparse.operator import SparseSymmetric
 from jeit_solvers.sparse.pattern import SparsityPattern
 
 
-class Strips(eqx.Module):
+class Strips(Module):
     """Partition of the unknowns of a matrix into strips, each coupled only to its two neighbours, for `near_inverse`.
     The selected unknowns, between which the inverse is computed, come first in each strip.
 
@@ -84,7 +85,7 @@ class Strips(eqx.Module):
         return spread[:, : self.selected_per_strip].reshape(-1, *shape[1:])
 
 
-class NearInverse(eqx.Module):
+class NearInverse(Module):
     """Entries of the inverse G = A⁻¹ between places that are at most a few strips apart. **Fields**: `band`: (strips,
     selected unknowns, columns) blocks G_ij with j ≥ i, because G is symmetric; `left`, `right`: (p, r) factors of a
     matrix left rightᵀ that is added to G."""

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Int
 from scipy.sparse import csr_array
 
+from jeit_solvers.module import Module
 from jeit_solvers.sparse.dissection import nested_dissection
 from jeit_solvers.sparse.index_store import IndexLayout, IndexStore, PaddedSum, Slot
 from jeit_solvers.sparse.pattern import SparsityPattern
@@ -173,7 +174,7 @@ class Stage(NamedTuple):
     above: Slot
 
 
-class FactorisationPlan(eqx.Module):
+class FactorisationPlan(Module):
     """Order of elimination and index maps of a sparsity pattern for `factorise` and `solve`; made by `analyse`.
 
     The index maps are one leaf of the pytree; pass a plan to a jitted function as an argument.

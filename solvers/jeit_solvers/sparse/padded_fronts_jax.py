@@ -10,7 +10,6 @@ import functools
 import operator
 from functools import partial
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from jaxtyping import Array, Bool, Inexact, Int
 from jeit_solvers.cores import on_cores, parts_for_cores
 from jeit_solvers.dense import inverse_cholesky
 from jeit_solvers.engines import differentiable_batches, gather_or_zero, has_values, in_turn, namespace, one_by_one
+from jeit_solvers.module import Module
 from jeit_solvers.sparse.index_store import IndexLayout
 from jeit_solvers.sparse.padded_fronts import FactorisationPlan, Stage
 
@@ -27,7 +27,7 @@ from jeit_solvers.sparse.padded_fronts import FactorisationPlan, Stage
 _MIN_PARALLEL_ENTRIES, _UPDATED_ENTRIES = 200_000, 100_000
 
 
-class Factor(eqx.Module):
+class Factor(Module):
     """A factorised matrix A = L L^T: two arrays for every stage of its plan.
 
     **Fields**: `inverses`: (batch, pivots, pivots) inverses of the diagonal blocks of L; `lowers`: (batch, border,

@@ -13,10 +13,11 @@ from jaxtyping import Array, Inexact, Int
 from scipy.sparse import coo_array, csr_array, issparse
 
 from jeit_solvers.engines import namespace
+from jeit_solvers.module import Module
 from jeit_solvers.sparse.index_store import IndexLayout, IndexStore, PaddedSum, Slot
 
 
-class SparsityPattern(eqx.Module):
+class SparsityPattern(Module):
     """Positions of the entries of a symmetric (n, n) matrix that may be non-zero: its lower triangle, diagonal
     included.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -14,9 +13,10 @@ from jeit.arguments import check_kind, check_metres, real_array
 from jeit.design.skin.indentation import AbstractIndentation, Hemisphere
 from jeit.mesh.outline.domain import check_length
 from jeit_solvers.engines import host
+from jeit_solvers.module import Module
 
 
-class AbstractIndenter(eqx.Module):
+class AbstractIndenter(Module):
     """Base class of rigid bodies that are pressed straight down, described in their own frame."""
 
     @abc.abstractmethod

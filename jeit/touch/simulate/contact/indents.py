@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -23,12 +22,13 @@ from jeit.touch.simulate.contact.press import Press
 from jeit.touch.simulate.contact.pressed_skin import PressedSkin
 from jeit.touch.simulate.contact.samples import lattice
 from jeit_solvers.engines import as_array
+from jeit_solvers.module import Module
 
 # Number of random places drawn at once for each place needed, of which those on the skin are used.
 _TRIES = 20
 
 
-class PressDraws(eqx.Module):
+class PressDraws(Module):
     """Distribution of random touches. All draws are independent and uniform, except for the load, whose logarithm is
     uniform; the angle of the indenter is uniform, too.
 
@@ -119,7 +119,7 @@ _LATTICE, _LEAST = 2, 1e-3
 _FLOOR = 1e-3
 
 
-class Indent(eqx.Module):
+class Indent(Module):
     """An `indenter` pressed to a `depth` in metres, with its origin at `position` (x, y) in metres, rotated by `angle`
     in radians."""
 
@@ -142,7 +142,7 @@ class Indent(eqx.Module):
         return np.maximum(self.depth - self.indenter.gap(local), 0.0)
 
 
-class IndentDraws(eqx.Module):
+class IndentDraws(Module):
     """Distribution of random touches of one to `at_once` indents, as `PressDraws`, but with a minimum and maximum
     `depth` in metres instead of a load; the logarithm of the depth is uniform."""
 

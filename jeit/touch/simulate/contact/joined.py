@@ -16,7 +16,6 @@ this model.
 
 from __future__ import annotations
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -30,13 +29,14 @@ from jeit.mesh import measures
 from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indenter
 from jeit_solvers import FactorisationPlan, SparsityPattern, analyse, factorise, quadratic_form
 from jeit_solvers.engines import host, on_host
+from jeit_solvers.module import Module
 
 # Minimum conductance between the sheets, relative to σ₂ divided by the area of the skin, which fixes the potential of
 # an upper sheet without contact.
 _LEAST = 1e-9
 
 
-class TwoSheets(eqx.Module):
+class TwoSheets(Module):
     """Model of two sheets on the same mesh. The system of 2n unknowns, for n nodes, is factorised at every call.
 
     **Fields**: `model`: forward model of the lower sheet; `pattern`, `plan`: sparsity pattern and factorisation plan of

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
@@ -19,6 +18,7 @@ from jeit.touch.simulate.contact.press import (
     contact_window,
     raster,
 )
+from jeit_solvers.module import Module
 
 # Number of pixels along a side of the raster on which the contact is located, and of the raster on which the load is
 # balanced.
@@ -128,7 +128,7 @@ def check_modulus(modulus) -> None:
         raise ValueError(f"modulus must be positive, in pascals (1e6 for a soft rubber); it is {describe(modulus)}.")
 
 
-class Material(eqx.Module):
+class Material(Module):
     """Material of a skin, in SI units. To change values: `dataclasses.replace(material("velostat"), noise=0.0)`.
 
     - `conductivity`: S/m, and `thickness`: metres, of the conductor at rest.

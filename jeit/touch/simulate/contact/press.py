@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
@@ -13,9 +12,10 @@ from scipy.ndimage import map_coordinates
 from jeit.arguments import check_kind, describe, is_number, real_array
 from jeit.touch.simulate.contact.indenters import AbstractIndenter, check_indenter
 from jeit.touch.simulate.contact.joined import check_angle, check_position
+from jeit_solvers.module import Module
 
 
-class AbstractPressure(eqx.Module):
+class AbstractPressure(Module):
     """Pressure in the frame of the indenter that causes it.
 
     **Fields**: `load`: newtons; `approach`: distance that the indenter has moved since its first contact, metres;
@@ -31,7 +31,7 @@ class AbstractPressure(eqx.Module):
         """Pressure in pascals at `points` (…, 2), metres."""
 
 
-class AbstractSupport(eqx.Module):
+class AbstractSupport(Module):
     """Base class of supports: the mechanical response of a skin to a press."""
 
     @abc.abstractmethod
@@ -125,7 +125,7 @@ def check_support(name: str, value) -> None:
     check_kind(name, value, AbstractSupport, "a support, such as Foundation(1e6, 3e-3) or HalfSpace(1e6)")
 
 
-class Press(eqx.Module):
+class Press(Module):
     """An `indenter` under a `load` in newtons, with its origin at `position` (x, y) in metres, rotated by `angle` in
     radians.
 
@@ -147,7 +147,7 @@ class Press(eqx.Module):
         self.position, self.angle = check_position(position, in_space=True), check_angle(angle)
 
 
-class MovingPress(eqx.Module):
+class MovingPress(Module):
     """A press over time, with one value for each of T frames; constant values may be given once.
 
     **Fields**: `indenter`; `load`: (T,) newtons, 0 while lifted; `position`: (T, 2) metres, or (T, 3) on a curved skin;

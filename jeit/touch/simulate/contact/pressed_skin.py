@@ -40,6 +40,7 @@ from jeit.touch.simulate.contact.materials import Material
 from jeit.touch.simulate.contact.press import MovingPress, Press, motions_of, touches_of
 from jeit.touch.simulate.contact.samples import Samples
 from jeit_solvers.engines import as_array
+from jeit_solvers.module import Module
 
 
 def standard_normal(key: Array, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
@@ -117,7 +118,7 @@ _AT_ONCE, _CELLS, _APART = 1024, (128, 512, 2048), 3.0
 _LEAST = 1e-6
 
 
-class PressedSkin(eqx.Module):
+class PressedSkin(Module):
     """A sheet or layer of a material that is pressed. Voltages are exact; they are computed by low-rank updates of one
     factorisation.
 

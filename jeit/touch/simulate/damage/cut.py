@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -15,12 +14,13 @@ from jeit.arguments import check_key, check_kind, check_metres, describe, is_num
 from jeit.forward.system import check_conductivity
 from jeit.mesh import Domain, Mesh, Refine, centroids, check_flat, measures
 from jeit.touch.simulate.contact import Material
+from jeit_solvers.module import Module
 
 # Maximum number of random cuts that are tried; minimum and maximum angle of a bend, in radians.
 _TRIES, _LEAST_BEND, _MOST_BEND = 400, 0.35, 1.2
 
 
-class Cut(eqx.Module):
+class Cut(Module):
     """A cut in a skin.
 
     **Fields**: `path`: (k, 2) vertices in metres; `depth`: depth of the cut as a share of the thickness, 1 for a cut

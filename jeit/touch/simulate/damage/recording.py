@@ -15,6 +15,7 @@ from jeit.arguments import check_key, check_kind, check_name, describe, is_numbe
 from jeit.forward import ForwardModel
 from jeit.forward.model import check_model, select_channels
 from jeit.touch.simulate.contact import MovingPress, PressedSkin
+from jeit_solvers.module import Module
 
 FaultKind = Literal["dead", "loose", "torn"]
 FAULTS: tuple[FaultKind, ...] = ("dead", "loose", "torn")
@@ -28,7 +29,7 @@ _LOOSE, _FLUCTUATION_TIME, _LEVELS = (10.0, 1000.0), 0.5, 7
 _STRAY = 0.02
 
 
-class ElectrodeFault(eqx.Module):
+class ElectrodeFault(Module):
     """A fault of an electrode.
 
     - `electrode`: its number, from 0.
@@ -126,7 +127,7 @@ def check_fault(name: str, value) -> None:
     check_kind(name, value, ElectrodeFault, 'an ElectrodeFault(3, "dead")')
 
 
-class Mishap(eqx.Module):
+class Mishap(Module):
     """A change of a skin during a recording.
 
     **Fields**: `time`: when it happens, seconds; `skin`: the skin from then on, with the same channels and gains, or

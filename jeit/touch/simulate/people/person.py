@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -22,6 +21,7 @@ from jeit.mesh import Domain
 from jeit.touch.simulate.contact.indenters import Disc
 from jeit.touch.simulate.contact.joined import JoinedIndenters, PlacedIndenter
 from jeit.touch.simulate.contact.press import MovingPress
+from jeit_solvers.module import Module
 
 TRAITS = ("force", "radius", "duration", "speed", "path")
 """Parameters of a touch: force, N; radius of a disc with the area of the contact, m; duration, s; and, for moving
@@ -166,7 +166,7 @@ def _random_path(rng: np.random.Generator, outline: Domain, length: float) -> tu
 _LEAST_SIDE = 0.06
 
 
-class Person(eqx.Module):
+class Person(Module):
     """A simulated person. **Fields**: `medians`: (6, 5), median of each of the `TRAITS` (columns) in touches of this
     person, for each of the `GESTURES` (rows), in SI units."""
 
