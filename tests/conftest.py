@@ -67,6 +67,14 @@ def _compiled_code_goes_before_memory_maps_do():
         jax.clear_caches()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _figures_are_closed():
+    """Matplotlib warns of more than twenty that are open."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
+
+
 @pytest.fixture(scope="session")
 def data_folder() -> Path:
     """The folder of measured data (kit4, ktc2023, tank6cm); skips the test where there is none."""

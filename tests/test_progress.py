@@ -66,6 +66,7 @@ def test_presses_are_counted(model):
     assert told[-1] == "voltages: 5 of 5"
 
 
+@pytest.mark.slow
 def test_taps_and_their_calibration_tell_their_steps():
     skin, told, steps = SoundingSkin(KEY), [], []
     taps = calibration_taps(skin, KEY, microphone_grid(5), repeats=1, duration=0.08, progress=told.append)

@@ -154,10 +154,10 @@ def _recognise(file: Path, description: str | Path | None, like: Measurement | N
             f"it can, and writes a description. Known: {kit4.DESCRIPTION}; {ktc2023.DESCRIPTION}; {eidors.DESCRIPTION}."
         )
     ending = file.suffix.lower()
-    if known := [one for one in FORMATS.values() if ending in one.endings]:
+    if known := [name for name, one in FORMATS.items() if ending in one.endings]:
         raise ValueError(
-            f"{file.name}: its content is that of no file ending in '{ending}' ("
-            f"{'; '.join(one.reader.DESCRIPTION for one in known)}). Is its start damaged, or is it of another program?"
+            f"{file.name}: its content is that of no known kind of file ending in '{ending}' ({', '.join(known)}). Is "
+            "its start damaged, or is it of another program?"
         )
     with file.open("rb") as content:
         head = content.read(_HEAD)

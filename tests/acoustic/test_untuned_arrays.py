@@ -24,6 +24,7 @@ def steep():
     return taken, judged, plainly_located(array)
 
 
+@pytest.mark.slow
 def test_a_steep_array_is_located(steep):
     """By the law of both factors, several times as well as by a plain fit of a / (r² + b); its ellipses hold most."""
     _, found, plain = steep
@@ -35,12 +36,14 @@ def test_a_steep_array_is_located(steep):
     assert taken.silence == 0
 
 
+@pytest.mark.slow
 def test_the_papers_law_alone_is_not_refused(steep):
     """And does as well as the plain fit, at least."""
     _, found, plain = steep
     assert found["inverse-square"].median < 1.1 * plain.median
 
 
+@pytest.mark.slow
 def test_the_fit_says_which_law_and_why(steep):
     fit = steep[0]
     names, off = zip(*fit.left_out, strict=True)

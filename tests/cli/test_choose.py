@@ -52,6 +52,7 @@ def test_every_rule_in_table_picture_and_report(tank, run, tmp_path):
     assert imaged.reconstruction.choice.note == ""
 
 
+@pytest.mark.slow
 def test_every_image_has_a_scale_and_few_marks(tank):
     """A bar each, from end to end of its own values, in a unit; and no marks where they would lie over each other."""
     settings = ImagingSettings(num_points=250, contact="fixed")

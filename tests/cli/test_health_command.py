@@ -167,7 +167,7 @@ def test_what_speaks_against_it_is_said(files, run, tmp_path):
     [
         ("hurt.csv", "fewer.csv", (), "has 40 channels, and"),
         ("hurt.csv", "short.csv", (), "5 frames are too few"),
-        ("hurt.csv", "constant.csv", (), "all are constant"),
+        ("hurt.csv", "constant.csv", (), "every channel lacks readings or is constant"),
         ("empty.csv", "healthy.csv", (), "holds no numbers"),
         ("nothing.csv", "healthy.csv", (), "there is no such file"),
         ("timed.npz", "healthy.csv", (), "--rate: only one of the recordings says"),

@@ -111,6 +111,7 @@ def test_a_large_error_of_the_models_is_noted(folder, off, tmp_path, capsys):
     assert miss > 2
 
 
+@pytest.mark.slow
 def test_another_decay_model_is_advised_where_one_was_asked_for(folder, off, tmp_path, capsys):
     """Of intensities off by a third; of exact ones the best law is named, and no error of it."""
     assert main(["calibrate-microphones", str(off), "-o", str(tmp_path / "one.json"), "--decay", "exponential"]) == 0

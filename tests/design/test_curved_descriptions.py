@@ -210,7 +210,8 @@ def test_gaps_are_along_the_surface(described):
         described(narrow, read_study)
 
 
-@pytest.mark.parametrize("exact", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["exact", "linear"])
+@pytest.mark.slow
+@pytest.mark.parametrize("exact", [True, False], ids=["exact", "linear"])
 def test_a_study_is_run_and_drawn_unrolled(described, tmp_path, exact):
     pytest.importorskip("xarray")
     coarse = STUDY.replace("inner-8", "inner-4").replace("diameter_mm = 10", "diameter_mm = 24")

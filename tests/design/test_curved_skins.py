@@ -302,7 +302,7 @@ def test_refuses_skins_that_cannot_be():
         skin_protocol(layout),
         shell(layout.surface, 5e-3),
     )
-    with pytest.raises(ValueError, match="SurfaceDiscs live on a surface in space"):
+    with pytest.raises(ValueError, match="SurfaceDiscs need a mesh that is a surface in space"):
         ForwardModel(solid, discs, protocol)
     inward = Skin.create(layout, thickness=6e-3, num_layers=3)
     assert inward.touched_face == "inner"

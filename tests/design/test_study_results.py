@@ -37,6 +37,7 @@ pytest.importorskip("zarr")
 MESH, GRID = rectangle(0.1, 0.08, cell_size=8e-3), touch_grid(Rectangle(0.1, 0.08), 6, 5)
 
 
+@pytest.mark.slow
 def test_results_are_those_of_one_map_at_a_time(study, whole_store):
     """Of the nearest pairs of each layout."""
     data = open_results(study, whole_store)

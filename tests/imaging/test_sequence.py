@@ -45,6 +45,7 @@ def chest():
     return measured(model, 0.3 * (1 + changes), domain, times, 1)
 
 
+@pytest.mark.slow
 def test_breathing_is_told_by_frequency_amplitude_and_phase(chest):
     found = image_sequence(chest, settings=ImagingSettings(num_points=500))
     series, mesh = found.series, found.series.mesh

@@ -181,6 +181,7 @@ def test_a_ball_over_the_wall_ends_there(coarse):
     np.testing.assert_allclose(body.centroid, [0.05 - 3 / 8 * 0.03, 0, 0.05], atol=5e-4)
 
 
+@pytest.mark.slow
 def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, fine, monkeypatch):
     """On a mesh fewer, and on coarser ones, than by default: with those, of a resistive ball, in
     test_fitted_ellipsoids.py."""

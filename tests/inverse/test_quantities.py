@@ -69,6 +69,7 @@ def test_a_fitted_body_has_its_quantities_and_wider_ones_where_the_model_is_in_d
     assert widths[1] > 1.2 * widths[0]
 
 
+@pytest.mark.slow
 def test_errors_of_the_mesh_and_of_the_size_widen_intervals(monkeypatch):
     """By 0.3 of log σ, where the data leave far less, by 5 % of each length, and by 10 % of each strength."""
     model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)

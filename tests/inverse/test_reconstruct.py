@@ -138,6 +138,7 @@ def test_solvers_of_optimistix_say_that_steps_were_too_few(tiny):
     assert reconstruct(model, voltages, 1.0, solver=few, **options).status == "step limit"
 
 
+@pytest.mark.slow
 def test_solvers_of_optimistix_that_stand_still_for_rounding_have_converged(tiny):
     """Tolerances at the root of a number's precision are reached or not by luck; one step is no such luck. The image is
     that of Gauss-Newton."""

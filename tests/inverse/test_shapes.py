@@ -105,6 +105,7 @@ def test_bodies_are_found_and_ghosts_left_out(found):
     assert float(found.misfit) < 1
 
 
+@pytest.mark.slow
 def test_neighbours_that_merge_are_told_apart(model, fine):
     """Two disks of plastic, from one start between them."""
     places = np.array([[0.03, 0.03], [0.03, -0.02]])

@@ -128,6 +128,7 @@ def test_derivative_with_all_unknowns():
     assert np.polyfit(np.log(steps), np.log(errors), 1)[0] == pytest.approx(2, abs=0.1)
 
 
+@pytest.mark.slow
 def test_what_is_estimated_by_logarithms_is_given_as_itself():
     """Contact impedances in ohm·m and a factor; deviations in the same units: those of the logarithms times them."""
     number = 5  # and few nodes: unknowns are compiled for seconds

@@ -132,10 +132,10 @@ def network():
     skin = Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=8e-3)
     plain = Unrolled(skin.model.protocol.num_measurements, SHAPE, key=jax.random.key(0))
     places, sensed = image_places(skin, SHAPE[1], SHAPE[0]), LinearChannels.from_skin(skin, SHAPE)
-    linear = plain.of_skin(sensed, places, skin.layout.centres, 1.5e-3)
+    linear = plain.adapted_to_skin(sensed, places, skin.layout.centres, 1.5e-3)
     near = np.linalg.norm(places - [0.02, 0.03], axis=-1).ravel() < 0.012
     change = np.stack([share * sensed.operator @ near for share in (0.0, 0.3, 0.6)])
-    return ImageNetwork.of_skin(linear, skin, 1.5e-3, SHAPE), 1.0 + change
+    return ImageNetwork.from_skin(linear, skin, 1.5e-3, SHAPE), 1.0 + change
 
 
 def test_depths_are_those_of_the_stream(network):

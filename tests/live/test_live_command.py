@@ -68,6 +68,7 @@ def files(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_demonstration_shows_the_rod(served, run):
     """Within 10 mm of where it is, in linear images."""
     status, output, error = run("live", "demo", "--method", "one-step", "--num-points", 800, "--no-browser")
