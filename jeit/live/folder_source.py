@@ -20,7 +20,7 @@ _LOOK, _MULTIPLE, _PATIENCE = 0.02, 4.0, 2.0
 
 class WatchedFolder(AbstractSource):
     """The frames in files that appear in a folder, in the order of their names; files that were there before are left
-    out.
+    out, unless a `rate`, frames/s, is given.
 
     A file is read once it has kept its size from one look to the next. `description`, `reference`: as `description`
     and `like` of `jeit.data.read`. A file that cannot be read is delivered as text, to be refused.
@@ -35,10 +35,12 @@ class WatchedFolder(AbstractSource):
     ):
         super().__init__(str(folder))
         self.folder, self.description, self.reference, self.rate = folder, description, reference, rate
-        self._seen = set(self._sizes())
+        self._seen = set() if rate is not None else set(self._sizes())
         self._pending: dict[str, tuple[int, float]] = {}
         if self._seen:
-            self.say(f"Left out: {counted(len(self._seen), 'file')} that were in the folder before.")
+            self.say(
+                f"Left out: {counted(len(self._seen), 'file')} that were in the folder before; --rate plays them, too."
+            )
 
     def __iter__(self) -> Iterator[LiveFrame]:
         self.begun = time.monotonic()

@@ -16,6 +16,7 @@ from jeit.data import Measurement, load_description, read, read_frame_recording
 from jeit.data.description import Description
 from jeit.imaging.stream_preparation import StreamSettings, described_reference, frames_of
 from jeit.live.pictures import AbstractView, LiveFrame
+from jeit.live.quality import change_during
 from jeit.live.sources import CONNECTED, AbstractSource, PlayedRecording, open_source
 from jeit.live.views.conductivity import ConductivityView
 
@@ -141,10 +142,16 @@ def _first_frames(source: AbstractSource, seconds: float) -> tuple[Float[np.ndar
         if frame.second - begun >= seconds or len(rows) >= _MOST:
             break
     try:
-        return _enough(rows, seconds), _Continued(source, coming)
+        still = _enough(rows, seconds)
     except ValueError:
         source.close()
         raise
+    if (change := change_during(still)) is not None:
+        source.say(
+            f"The sensor changed by {100 * change:.2g} % in the first {seconds:g} s, which are the reference: take a "
+            "new one while nothing touches the sensor."
+        )
+    return still, _Continued(source, coming)
 
 
 def _enough(rows: list[np.ndarray], seconds: float) -> Float[np.ndarray, "N M"]:

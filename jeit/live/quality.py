@@ -21,6 +21,9 @@ _LOOKS = 40
 # electrode is dead if the second share of its readings is lost, those of dead electrodes aside. It drifts if the median
 # relative difference of its readings exceeds the third number, and the fourth times that of all others.
 _LOST, _MOST_LOST, _DRIFTED, _APART = 0.5, 0.7, 0.05, 3.0
+# Parts of the frames of a reference whose means are compared, and fewest frames of a part; ratio of the deviation of
+# these means to what noise explains from which the sensor was disturbed meanwhile.
+_PARTS, _FEWEST_OF_A_PART, _DISTURBED = 4, 2, 4.0
 # Factor by which a frame rate must change to be reported, and looks for which it must last.
 _RATE_CHANGE, _LASTING = 1.4, 3
 
@@ -35,6 +38,22 @@ class Quality:
     reciprocity: float | None = None
     dead: Sequence[int] = ()
     drifting: Sequence[int] = ()
+
+
+@np.errstate(all="ignore")  # readings of faulty frames may overflow
+def change_during(frames: Float[np.ndarray, "N M"]) -> float | None:
+    """Change of a sensor while frames (N, M) were taken, relative to their mean: the largest difference of the mean of
+    a quarter of them from that of all. None if noise, which is estimated from successive frames, explains it or is as
+    large in a frame, and for fewer than eight frames."""
+    frames = np.asarray(frames, float)[:, np.isfinite(frames).all(axis=0)]
+    if len(frames) < _PARTS * _FEWEST_OF_A_PART or not frames.size:
+        return None
+    away = np.array([part.mean(axis=0) for part in np.array_split(frames, _PARTS)]) - frames.mean(axis=0)
+    noise = (np.diff(frames, axis=0) ** 2).mean(axis=0).sum() / 2
+    # A change within the noise of a frame, such as a slow drift in thousands of frames, does no harm.
+    if not (away**2).sum() > (_PARTS - 1) * noise * max(_DISTURBED**2 * _PARTS / len(frames), 1.0):
+        return None
+    return float(np.sqrt((away**2).sum(axis=1).max()) / np.linalg.norm(frames.mean(axis=0)))
 
 
 class QualityWatch:

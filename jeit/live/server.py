@@ -66,6 +66,11 @@ def serve(
             server.run(sockets=[listening])
 
 
+def check_port(host: str, port: int) -> None:
+    """Raise `OSError` if a page cannot be served at `host` and `port`, with what to do."""
+    _listen(host, port).close()
+
+
 def _stop_at_end(hub: Hub, server: object) -> None:
     hub.ended.wait()
     server.should_exit = True  # pyright: ignore[reportAttributeAccessIssue]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,7 +16,7 @@ from jeit.arguments import counted
 from jeit.data import Measurement
 from jeit.inverse.streaming.stream import FrameStatus
 from jeit.live.pictures import AbstractView, LiveFrame, Picture, Scene
-from jeit.live.quality import Quality, QualityWatch, RateWatch
+from jeit.live.quality import Quality, QualityWatch, RateWatch, change_during
 from jeit.live.recording import Recorder
 from jeit.live.sources import ENDED, MESSAGES, AbstractSource
 
@@ -77,6 +77,7 @@ class Session:
         self._closed = threading.Event()
         self._read = self._imaged = self._dropped = self._refused = 0
         self._reasons: dict[str, list] = {}
+        self._statuses: Counter[FrameStatus] = Counter()
         self._latencies: deque[float] = deque(maxlen=_LATENCIES)
         self._arrivals: deque[float] = deque(maxlen=4096)
         self._messages: deque[tuple[float, str]] = deque(maxlen=MESSAGES)
@@ -198,6 +199,7 @@ class Session:
                 "dropped": self._dropped,
                 "refused": self._refused,
                 "reasons": dict(self._reasons.values()),
+                "statuses": {str(status): count for status, count in self._statuses.items()},
             }
             quality, ended = self._quality, self._ended
         median, high = np.quantile(latencies, (0.5, 0.99)).tolist() if latencies.size else (None, None)
@@ -326,6 +328,12 @@ class Session:
             frames, self._reference = self._reference, None
         if frames is None:
             return
+        if (change := change_during(frames)) is not None:
+            self.say(
+                f"The old reference stays: the sensor changed by {100 * change:.2g} % while the new one was taken. "
+                "Take it while nothing touches the sensor."
+            )
+            return
         try:
             self.view.set_reference(frames)
         except ValueError as error:
@@ -348,8 +356,10 @@ class Session:
             else:
                 self._imaged += 1
                 self._latencies.append(result.latency)
-            if result.picture.reason:
+            if result.picture.status == FrameStatus.REFUSED:
                 self._count(result.picture.reason)
+            else:
+                self._statuses[result.picture.status] += 1
             self._changed.notify_all()
         for event in result.picture.events:
             self.say(event)

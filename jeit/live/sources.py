@@ -99,8 +99,8 @@ def open_source(
     """The source that a text names.
 
     - "-": lines on standard input. "serial:PORT@BAUD": lines of a serial device. "tcp:HOST:PORT": lines of a server.
-    - a folder: files that an instrument writes into it, a frame or more in each; a file: a recording, played at its own
-      rate.
+    - a folder: files that an instrument writes into it, a frame or more in each; those that are there already are
+      left out, unless a `rate` is given. A file: a recording, played at its own rate.
     - "demo": a simulated tank in which a rod goes round; "demo:skin": a simulated skin that is stroked.
 
     `rate`: frames/s of a recording or of lines that have all arrived already. `description`, `reference`: what numbers

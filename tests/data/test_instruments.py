@@ -400,7 +400,11 @@ DAMAGED = {
         "of no known kind of file ending in '.get'",
     ),
     "get of noise": (written(lambda path: path.write_bytes(NOISE), "a.get"), None, "is it of another program"),
-    "eit of text": (written(lambda path: path.write_text("hello\n")), None, "of no known kind of file ending in '.eit' \\(sciospec"),
+    "eit of text": (
+        written(lambda path: path.write_text("hello\n")),
+        None,
+        "of no known kind of file ending in '.eit' \\(sciospec",
+    ),
     "a table that is no text": (written(lambda path: path.write_bytes(NOISE), "a.csv"), None, "is not a text file"),
     "an archive cut off": (
         written(lambda path: np.savez(path, voltages=np.ones((2, 40))), "a.npz"),

@@ -96,6 +96,29 @@ def test_a_file_is_played_against_its_reference(served, run, files):
     assert len(served.session.scene.channels) == CHANNELS
 
 
+def test_where_nothing_is_imaged_the_status_says_so(served, run, files):
+    np.savetxt(files / "short.csv", np.ones((3, 7)), delimiter=",")
+    lines = (files / "short.csv").open()
+    given = ("live", "-", "--reference", files / "rest.npz", "--rate", 500, "--until-end", "--method", "one-step")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdin", lines)
+        status, _, error = run(*given)
+    lines.close()
+    assert (status, "3 frames, and none could be imaged: The frame is" in error) == (1, True)
+
+
+def test_what_stands_in_the_way_is_found_before_anything_is_prepared(run, files):
+    (files / "taken").write_text("")
+    given = ("live", files / "frames.csv", "--reference", files / "rest.npz")
+    status, _, error = run(*given, "--output", files / "taken" / "below")
+    assert (status, "--output: no folder" in error, "is in the way" in error) == (1, True, True)
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        status, _, error = run(*given, "--port", other.getsockname()[1])
+    assert (status, "is taken or not allowed: choose another" in error) == (1, True)
+
+
 def test_the_first_frames_are_the_reference(served, run, files, monkeypatch):
     """Of lines on standard input that a description says the meaning of; what is no frame among them is left out."""
     lines = "\n".join(" ".join(map(repr, row)) for row in noisy(60).tolist())

@@ -5,7 +5,7 @@ import pytest
 from small_sensor import CHANNELS, NOISE, PROTOCOL, measured, noisy, rest
 
 from jeit.live.pictures import LiveFrame
-from jeit.live.quality import Quality, QualityWatch, RateWatch
+from jeit.live.quality import Quality, QualityWatch, RateWatch, change_during
 
 
 def looked(frames, watch=None, times=1):
@@ -89,3 +89,22 @@ def test_a_rate_that_doubles_is_reported_once():
     watch = RateWatch()
     said = [watch(rate) for rate in (0, 59, 61, 60, 60, 90, 60, 119, 120, 121, 120, 118, 0)]
     assert [one for one in said if one] == ["The frame rate has changed from 60 to 121 frames a second."]
+
+
+@pytest.mark.parametrize("number", [8, 30, 300])
+def test_noise_is_no_change(number):
+    """Of a hundred references, none; a motion of ten times the noise is found, and its size is that of its parts."""
+    random = np.random.default_rng(number)
+    usual = 1 + random.random(CHANNELS)
+    for _ in range(100):
+        assert change_during(usual * (1 + 1e-3 * random.normal(size=(number, CHANNELS)))) is None
+    if number == 8:
+        return
+    course = np.sin(2 * np.pi * np.arange(number) / number)[:, None] * (np.arange(CHANNELS) < 5)
+    moved = usual * (1 + 1e-3 * random.normal(size=(number, CHANNELS)) + 0.05 * course)
+    found = change_during(moved)
+    assert found is not None
+    assert 0.3 < found / (0.05 * np.linalg.norm(usual[:5]) / np.linalg.norm(usual)) < 1
+    assert change_during(moved[:7]) is None
+    drifted = usual * (1 + 1e-3 * random.normal(size=(3000, CHANNELS)) + 2e-3 * np.linspace(0, 1, 3000)[:, None])
+    assert change_during(drifted) is None

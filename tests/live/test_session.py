@@ -210,6 +210,16 @@ def test_a_reference_that_a_view_refuses_is_reported():
             session.take_reference(0)
 
 
+def test_a_reference_that_is_taken_while_the_sensor_changes_is_refused():
+    moved = noisy(30) * (1 + 0.02 * np.linspace(0, 1, 30)[:, None])
+    view = Blank()
+    with Session(Given(list(moved), pause=1e-3), view) as session:
+        session.take_reference(20)
+        session.wait()
+        assert view.references == []
+        assert any("The old reference stays: the sensor changed by" in one for one in texts(session))
+
+
 def test_frames_of_another_number_of_channels_are_reported_once():
     values = [*noisy(5), *(np.zeros(CHANNELS + 3) for _ in range(9)), np.zeros(3), *noisy(5)]
     with Session(Given(values), Blank(), reference=measured()) as session:

@@ -212,6 +212,14 @@ def test_files_that_appear_in_a_folder_are_frames(tmp_path, monkeypatch):
     assert "broken.csv" in reading.texts[0]
 
 
+def test_files_that_are_there_are_played_at_a_rate(tmp_path):
+    for number in range(3):
+        (tmp_path / f"frame{number}.csv").write_bytes(line(FRAMES[number]))
+    with Reading(open_source(str(tmp_path), reference=measured(), rate=1000)) as reading:
+        reading.wait(lambda: len(reading.frames) == 3)
+    np.testing.assert_array_equal(reading.numbers, FRAMES[:3])
+
+
 def test_a_file_is_read_once_it_keeps_its_size(tmp_path):
     source = open_source(str(tmp_path), reference=measured())
     assert isinstance(source, WatchedFolder)

@@ -109,12 +109,13 @@ def live(
     or depth (--model), or the loss map of microphones (--calibration). The page takes a new reference, records, marks
     events, pauses and steps back. Ctrl-C ends it.
     """
+    from jeit.arguments import counted
     from jeit.arguments.extras import need_extra
     from jeit.cli.console import Steps, plain_console
     from jeit.imaging.stream_preparation import StreamSettings
     from jeit.live.preparation import prepare
     from jeit.live.recording import Recorder
-    from jeit.live.server import serve
+    from jeit.live.server import check_port, serve
     from jeit.live.session import Session
 
     need_extra("live", "a page in the browser")
@@ -135,6 +136,8 @@ def live(
     with naming_options(_NAMES):
         settings = StreamSettings(**given)
     console = plain_console()
+    check_port(host, port)
+    _check_folder(output)
     with Steps(console, quiet=quiet) as step, naming_options(_OPTIONS):
         step("read")
         # A reference for a model is plain frames, as `jeit touch predict` reads them.
@@ -153,6 +156,9 @@ def live(
             untouched=untouched,
             progress=step,
         )
+    if not quiet:
+        for _, note in ready.source.messages.copy():
+            console.print(f"  note: {note}", soft_wrap=True)
     recorder = Recorder(output, reference=ready.reference)
     if record:
         recorder.start()
@@ -168,6 +174,9 @@ def live(
         state = session.state()
     if not quiet:
         _say(console, state)
+    if until_end and not state["imaged"]:
+        first = next(iter(state["reasons"]), "the source ended before the first")
+        raise ValueError(f"{counted(state['read'], 'frame')}, and none could be imaged: {first}")
     if terminated:
         raise typer.Exit(128 + signal.SIGTERM)
 
@@ -191,6 +200,8 @@ def _terminated() -> Iterator[list[int]]:
         signal.signal(signal.SIGTERM, earlier)
 
 
+# Reasons of refused frames that are printed.
+_SHOWN = 8
 _NAMES = {"solver": "--method", "max_steps": "--steps"}
 _OPTIONS = {
     "source": "SOURCE",
@@ -201,6 +212,13 @@ _OPTIONS = {
     "calibration": "--calibration",
     "untouched": "--untouched",
 }
+
+
+def _check_folder(output: Path) -> None:
+    """Raise `ValueError` if no folder can be made at `output`; none is made before a recording begins."""
+    there = next(one for one in (output.absolute(), *output.absolute().parents) if one.exists())
+    if not (there.is_dir() and os.access(there, os.W_OK)):
+        raise ValueError(f"--output: no folder '{output}' can be made or written to; '{there}' is in the way.")
 
 
 def _check_use(given: dict, model: Path | None, calibration: Path | None, contacts: bool) -> None:
@@ -239,5 +257,11 @@ def _say(console, state: dict) -> None:
     if state["latency_median"] is not None:
         median, high = 1e3 * state["latency_median"], 1e3 * state["latency_99"]
         console.print(f"latency to the picture: median {median:.1f} ms, 99 % within {high:.1f} ms")
-    for reason, number in sorted(state["reasons"].items(), key=lambda one: -one[1])[:5]:
+    for status in ("partial", "unchanged", "step limit"):
+        if state["statuses"].get(status):
+            console.print(f"  {state['statuses'][status]} {status}")
+    reasons = sorted(state["reasons"].items(), key=lambda one: -one[1])
+    for reason, number in reasons[:_SHOWN]:
         console.print(f"  {number} × {reason}", soft_wrap=True)
+    if len(reasons) > _SHOWN:
+        console.print(f"  {len(reasons) - _SHOWN} more reasons")
