@@ -357,6 +357,21 @@ def test_regions_and_channels_are_followed(serving, open_page):
     assert page.locator("#regions-trace").is_hidden()
 
 
+@pytest.mark.parametrize("width", [400, 1280])
+def test_picture_is_saved_after_the_cross_was_moved(serving, open_page, width):
+    """The words under the image change as the cross goes, but no button moves from under the mouse."""
+    session = StandIn()
+    page = open_page(serving(session), width)
+    page.wait_for_selector("#image[data-number]")
+    page.click("#pause")
+    page.focus("#image")
+    page.keyboard.press("ArrowLeft")
+    assert until(lambda: text(page, "readout").startswith("x −2.0 mm"))
+    with page.expect_download(timeout=10_000):
+        page.click("#save")
+    assert until(lambda: "Saved jeit-" in text(page, "banner"))
+
+
 def test_what_is_wrong_is_shown(serving, open_page):
     """Refused frames with reasons, dead electrodes in colour, a disk that is full, a device that is gone."""
     session = StandIn(None)
