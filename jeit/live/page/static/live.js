@@ -355,7 +355,7 @@ if (!film.possible) element("film").title = "This browser makes no films.";
 element("film").onclick = () => film.toggle();
 element("save").onclick = () => {
   view.draw();
-  savePicture(view.canvas, (saved) => note(`Saved ${saved}.`));
+  savePicture(view.canvas, (saved) => note(saved ? `Saved ${saved}.` : "The browser could not make the picture."));
 };
 
 // ---- keys ----
