@@ -372,6 +372,29 @@ def test_picture_is_saved_after_the_cross_was_moved(serving, open_page, width):
     assert until(lambda: "Saved jeit-" in text(page, "banner"))
 
 
+def test_straight_drags_and_clicks(serving, open_page):
+    """A straight drag follows a rectangle, a click beside the body nothing; after Escape the arrows step again."""
+    session = StandIn()
+    page = open_page(serving(session))
+    page.wait_for_selector("#image[data-number]")
+    box = page.locator("#image").bounding_box()
+    x, y = box["x"] + box["width"] * 0.45, box["y"] + box["height"] * 0.5
+    for right, down in ((60, 40), (60, 0), (0, -60)):
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + right, y + down, steps=5)
+        page.mouse.up()
+    assert until(lambda: text(page, "regions").split() == ["A", "×", "B", "×", "C", "×"])
+    page.mouse.click(box["x"] + 12, box["y"] + 60)
+    assert until(lambda: text(page, "banner").startswith("No region"))
+    assert text(page, "regions").split() == ["A", "×", "B", "×", "C", "×"]
+    page.keyboard.press("ArrowLeft")
+    assert text(page, "pause") == "Pause"
+    page.keyboard.press("Escape")
+    page.keyboard.press("ArrowLeft")
+    assert text(page, "pause") == "Go on"
+
+
 def test_what_is_wrong_is_shown(serving, open_page):
     """Refused frames with reasons, dead electrodes in colour, a disk that is full, a device that is gone."""
     session = StandIn(None)

@@ -301,7 +301,12 @@ function addRegion(points) {
     note(`${MOST_REGIONS} regions are followed already: remove one first.`);
     return;
   }
-  view.regions.push({ name: "ABCDE"[colour], colour, points });
+  const region = { name: "ABCDE"[colour], colour, points };
+  if (view.shown && Number.isNaN(mean(region, view.shown, view.scene.extent))) {
+    note("No region: nothing of the image lies in it.");
+    return;
+  }
+  view.regions.push(region);
   showRegions();
 }
 
