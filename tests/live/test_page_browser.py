@@ -395,6 +395,21 @@ def test_straight_drags_and_clicks(serving, open_page):
     assert text(page, "pause") == "Go on"
 
 
+def test_failed_recording_is_said_over_the_image(serving, open_page):
+    """A recording that cannot begin is named in the banner when it fails, and not again when the page is opened."""
+    session = StandIn()
+    address = serving(session)
+    page = open_page(address)
+    page.wait_for_selector("#image[data-number]")
+    assert until(lambda: text(page, "connection") == "connected")
+    failure = "The recording cannot begin: Read-only file system"
+    session.extra["messages"] = [{"second": 3.0, "text": failure}]
+    assert until(lambda: text(page, "banner") == failure)
+    other = open_page(address)
+    assert until(lambda: failure in text(other, "messages"))
+    assert other.locator("#banner").is_hidden()
+
+
 def test_what_is_wrong_is_shown(serving, open_page):
     """Refused frames with reasons, dead electrodes in colour, a disk that is full, a device that is gone."""
     session = StandIn(None)
