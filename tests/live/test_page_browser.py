@@ -410,6 +410,19 @@ def test_failed_recording_is_said_over_the_image(serving, open_page):
     assert other.locator("#banner").is_hidden()
 
 
+def test_numbers_have_no_caret(serving, open_page):
+    """Small and large numbers have an exponent as programs write it, with the true minus sign."""
+    page = open_page(serving(StandIn()))
+    numbers = [-6.97e-4, 1.234e7, -0.5, 1e-7]
+    read = """async (numbers) => {
+      const { short, round } = await import(new URL("numbers.js", location.href));
+      return numbers.map((number) => [short(number), round(number)]).flat();
+    }"""
+    assert page.evaluate(read, numbers) == [
+        "−6.97e−4", "−0.000697", "1.23e7", "12300000", "−0.500", "−0.5", "1.00e−7", "1e−7",
+    ]  # fmt: skip
+
+
 def test_what_is_wrong_is_shown(serving, open_page):
     """Refused frames with reasons, dead electrodes in colour, a disk that is full, a device that is gone."""
     session = StandIn(None)

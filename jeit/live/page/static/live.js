@@ -239,7 +239,7 @@ element("fit").onclick = () => {
 element("limit").onchange = ({ target }) => {
   if (!view.scale) return;
   const { factor } = unitFor(view.scale.highest, view.scene.unit);
-  const typed = target.value.replace("−", "-").replace(",", ".").trim();
+  const typed = target.value.replaceAll("−", "-").replace(",", ".").trim();
   if (!typed || !view.scale.keep(Number(typed) / factor)) note("Colour scale: type a number above its lowest value.");
   target.blur();
   showLimits();
@@ -357,7 +357,9 @@ function showValue() {
   const value = view.valueAt(page.place);
   const { factor, unit } = unitFor(Math.max(Math.abs(view.scale.highest), Math.abs(view.scale.lowest)), view.scene.unit);
   const [x, y] = page.place.map((metres) => (1000 * metres).toFixed(1).replace("-", "−"));
-  write("readout", `x ${x} mm, y ${y} mm: ${Number.isNaN(value) ? "outside" : `${short(value * factor)} ${unit}`}`);
+  const text = `x ${x} mm, y ${y} mm: ${Number.isNaN(value) ? "outside" : `${short(value * factor)} ${unit}`}`;
+  const label = view.labelAt(page.place);
+  write("readout", /^[+-]\d+ %$/.test(label) ? `${text}; marker: ${label.replace("-", "−")} of background` : text);
 }
 
 // ---- pictures and films ----
