@@ -357,6 +357,72 @@ def test_regions_and_channels_are_followed(serving, open_page):
     assert page.locator("#regions-trace").is_hidden()
 
 
+@pytest.mark.parametrize("width", [400, 1280])
+def test_picture_is_saved_after_the_cross_was_moved(serving, open_page, width):
+    """The words under the image change as the cross goes, but no button moves from under the mouse."""
+    session = StandIn()
+    page = open_page(serving(session), width)
+    page.wait_for_selector("#image[data-number]")
+    page.click("#pause")
+    page.focus("#image")
+    page.keyboard.press("ArrowLeft")
+    assert until(lambda: text(page, "readout").startswith("x −2.0 mm"))
+    with page.expect_download(timeout=10_000):
+        page.click("#save")
+    assert until(lambda: "Saved jeit-" in text(page, "banner"))
+
+
+def test_straight_drags_and_clicks(serving, open_page):
+    """A straight drag follows a rectangle, a click beside the body nothing; after Escape the arrows step again."""
+    session = StandIn()
+    page = open_page(serving(session))
+    page.wait_for_selector("#image[data-number]")
+    box = page.locator("#image").bounding_box()
+    x, y = box["x"] + box["width"] * 0.45, box["y"] + box["height"] * 0.5
+    for right, down in ((60, 40), (60, 0), (0, -60)):
+        page.mouse.move(x, y)
+        page.mouse.down()
+        page.mouse.move(x + right, y + down, steps=5)
+        page.mouse.up()
+    assert until(lambda: text(page, "regions").split() == ["A", "×", "B", "×", "C", "×"])
+    page.mouse.click(box["x"] + 12, box["y"] + 60)
+    assert until(lambda: text(page, "banner").startswith("No region"))
+    assert text(page, "regions").split() == ["A", "×", "B", "×", "C", "×"]
+    page.keyboard.press("ArrowLeft")
+    assert text(page, "pause") == "Pause"
+    page.keyboard.press("Escape")
+    page.keyboard.press("ArrowLeft")
+    assert text(page, "pause") == "Go on"
+
+
+def test_failed_recording_is_said_over_the_image(serving, open_page):
+    """A recording that cannot begin is named in the banner when it fails, and not again when the page is opened."""
+    session = StandIn()
+    address = serving(session)
+    page = open_page(address)
+    page.wait_for_selector("#image[data-number]")
+    assert until(lambda: text(page, "connection") == "connected")
+    failure = "The recording cannot begin: Read-only file system"
+    session.extra["messages"] = [{"second": 3.0, "text": failure}]
+    assert until(lambda: text(page, "banner") == failure)
+    other = open_page(address)
+    assert until(lambda: failure in text(other, "messages"))
+    assert other.locator("#banner").is_hidden()
+
+
+def test_numbers_have_no_caret(serving, open_page):
+    """Small and large numbers have an exponent as programs write it, with the true minus sign."""
+    page = open_page(serving(StandIn()))
+    numbers = [-6.97e-4, 1.234e7, -0.5, 1e-7]
+    read = """async (numbers) => {
+      const { short, round } = await import(new URL("numbers.js", location.href));
+      return numbers.map((number) => [short(number), round(number)]).flat();
+    }"""
+    assert page.evaluate(read, numbers) == [
+        "−6.97e−4", "−0.000697", "1.23e7", "12300000", "−0.500", "−0.5", "1.00e−7", "1e−7",
+    ]  # fmt: skip
+
+
 def test_what_is_wrong_is_shown(serving, open_page):
     """Refused frames with reasons, dead electrodes in colour, a disk that is full, a device that is gone."""
     session = StandIn(None)

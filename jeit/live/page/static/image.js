@@ -115,6 +115,13 @@ export class ImageView {
     return column >= 0 && column < columns && row >= 0 && row < rows ? shown.pixels[row * columns + column] : NaN;
   }
 
+  // Label of the marker shown at a place of the body, or "".
+  labelAt(place) {
+    const [left, top] = this.toCanvas(place);
+    const near = ([x, y]) => Math.hypot(this.toCanvas([x, y])[0] - left, this.toCanvas([x, y])[1] - top) < 12;
+    return this.picture?.markers.find(near)?.[2] ?? "";
+  }
+
   draw() {
     const { pen, scene, inks } = this;
     pen.fillStyle = inks?.paper ?? "#ffffff";
@@ -336,7 +343,7 @@ export class ImageView {
       pen.lineWidth = 2;
       pen.strokeStyle = inks.paper;
       pen.stroke();
-      if (label) this.halo(label, at[0] + 10, at[1] - 10, inks.ink);
+      if (label) this.halo(label.replace(/^-(?=\d)/, "−"), at[0] + 10, at[1] - 10, inks.ink);
     }
   }
 

@@ -12,10 +12,12 @@ import { Traces } from "./traces.js";
 const TRACE_PERIOD = 80;
 const MINUTE = 60;
 const MOST_CHANNELS = 5;
+// How the session's answers to Record begin when nothing is recorded.
+const FAILED = ["The recording cannot begin", "There is nowhere to record to"];
 
 const view = new ImageView(element("image"));
 const traces = { regions: new Traces(element("regions-trace")), channels: new Traces(element("channels-trace")) };
-const page = { paused: false, newest: null, latest: null, shown: null, rate: 0, hidden: false, tracedAt: 0, said: "" };
+const page = { paused: false, newest: null, latest: null, shown: null, rate: 0, hidden: false, tracedAt: 0, said: "", told: null };
 const channels = [];
 
 // ---- drawing: the newest picture once a screen, and then its number reported ----
@@ -66,8 +68,8 @@ function drawTraces() {
 function showBanner() {
   let text = "";
   if (page.lost) text = page.lost;
-  else if (view.stale()) text = `Refused: ${view.picture.reason}`;
   else if (page.note && performance.now() < page.noteUntil) text = page.note;
+  else if (view.stale()) text = `Refused: ${view.picture.reason}`;
   if (text !== page.said) {
     page.said = text;
     write("banner", text).hidden = !text;
@@ -75,11 +77,19 @@ function showBanner() {
 }
 
 // A sentence over the image for some seconds.
-function note(text) {
+function note(text, seconds = 4) {
   page.note = text;
-  page.noteUntil = performance.now() + 4000;
+  page.noteUntil = performance.now() + 1000 * seconds;
   redraw();
-  setTimeout(showBanner, 4100);
+  setTimeout(showBanner, 1000 * seconds + 100);
+}
+
+// Why a recording could not begin, once; `told` is null until the messages of before are known.
+function noteFailure(messages) {
+  const failed = messages.filter(({ text }) => FAILED.some((beginning) => text.startsWith(beginning)));
+  const newest = failed.at(-1)?.second ?? -Infinity;
+  if (page.told !== null && newest > page.told) note(failed.at(-1).text, 8);
+  page.told = newest;
 }
 
 document.addEventListener("visibilitychange", () => {
@@ -120,6 +130,7 @@ const connection = new Connection({
     redraw();
   },
   scene(scene) {
+    page.told = null;
     write("title", scene.title);
     document.title = `${scene.title} – jeit live`;
     view.setScene(scene);
@@ -132,6 +143,7 @@ const connection = new Connection({
   state(state) {
     page.rate = state.rate;
     showState(state);
+    noteFailure(state.messages);
     view.setHealth(state.dead, state.drifting);
     const marks = state.messages.filter(({ text }) => text.startsWith("Event")).map(({ second }) => second);
     traces.regions.events = traces.channels.events = marks;
@@ -227,7 +239,7 @@ element("fit").onclick = () => {
 element("limit").onchange = ({ target }) => {
   if (!view.scale) return;
   const { factor } = unitFor(view.scale.highest, view.scene.unit);
-  const typed = target.value.replace("−", "-").replace(",", ".").trim();
+  const typed = target.value.replaceAll("−", "-").replace(",", ".").trim();
   if (!typed || !view.scale.keep(Number(typed) / factor)) note("Colour scale: type a number above its lowest value.");
   target.blur();
   showLimits();
@@ -301,7 +313,12 @@ function addRegion(points) {
     note(`${MOST_REGIONS} regions are followed already: remove one first.`);
     return;
   }
-  view.regions.push({ name: "ABCDE"[colour], colour, points });
+  const region = { name: "ABCDE"[colour], colour, points };
+  if (view.shown && Number.isNaN(mean(region, view.shown, view.scene.extent))) {
+    note("No region: nothing of the image lies in it.");
+    return;
+  }
+  view.regions.push(region);
   showRegions();
 }
 
@@ -340,7 +357,9 @@ function showValue() {
   const value = view.valueAt(page.place);
   const { factor, unit } = unitFor(Math.max(Math.abs(view.scale.highest), Math.abs(view.scale.lowest)), view.scene.unit);
   const [x, y] = page.place.map((metres) => (1000 * metres).toFixed(1).replace("-", "−"));
-  write("readout", `x ${x} mm, y ${y} mm: ${Number.isNaN(value) ? "outside" : `${short(value * factor)} ${unit}`}`);
+  const text = `x ${x} mm, y ${y} mm: ${Number.isNaN(value) ? "outside" : `${short(value * factor)} ${unit}`}`;
+  const label = view.labelAt(page.place);
+  write("readout", /^[+-]\d+ %$/.test(label) ? `${text}; marker: ${label.replace("-", "−")} of background` : text);
 }
 
 // ---- pictures and films ----
@@ -355,7 +374,7 @@ if (!film.possible) element("film").title = "This browser makes no films.";
 element("film").onclick = () => film.toggle();
 element("save").onclick = () => {
   view.draw();
-  savePicture(view.canvas, (saved) => note(`Saved ${saved}.`));
+  savePicture(view.canvas, (saved) => note(saved ? `Saved ${saved}.` : "The browser could not make the picture."));
 };
 
 // ---- keys ----

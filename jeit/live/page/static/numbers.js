@@ -14,13 +14,16 @@ export function unitFor(size, unit) {
   return { factor: 10 ** -power, unit: `10${digits}${unit ? " " + unit : ""}` };
 }
 
+// With the true minus sign, and no plus in an exponent.
+const signed = (text) => text.replace("e+", "e").replaceAll("-", "−");
+
 export function short(value, digits = 3) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   if (value === 0) return "0";
   const size = Math.abs(value);
-  if (size >= 1e5 || size < 1e-3) return value.toExponential(digits - 1).replace("e", "·10^").replace("^+", "^");
+  if (size >= 1e5 || size < 1e-3) return signed(value.toExponential(digits - 1));
   const decimals = Math.max(0, digits - 1 - Math.floor(Math.log10(size) + 1e-9));
-  return value.toFixed(decimals).replace("-", "−");
+  return signed(value.toFixed(decimals));
 }
 
 export const percent = (value) => (value === null || value === undefined ? "–" : `${short(100 * value, 2)} %`);
@@ -39,7 +42,7 @@ export function round125(size) {
 }
 
 // A round number as text, such as a tick of an axis.
-export const round = (value) => String(Number(value.toPrecision(3))).replace("-", "−");
+export const round = (value) => signed(String(Number(value.toPrecision(3))));
 
 // At most `most` round numbers from the lowest to the highest.
 export function ticks(lowest, highest, most = 5) {

@@ -10,6 +10,9 @@ export function write(id, text) {
   return target;
 }
 
+// A number and its percent sign stay on one line.
+const unbroken = (text) => text.replaceAll(" %", "\u00a0%");
+
 // Replace the lines of a list, if they are others than before.
 export function list(id, lines, make = null) {
   const target = element(id);
@@ -19,7 +22,7 @@ export function list(id, lines, make = null) {
   target.replaceChildren(...lines.map((line) => {
     const item = document.createElement("li");
     if (make) make(item, line);
-    else item.textContent = line;
+    else item.textContent = unbroken(line);
     return item;
   }));
 }
@@ -45,7 +48,7 @@ export function showState(state) {
   list("messages", state.messages.slice().reverse(), (item, { second, text }) => {
     const time = document.createElement("time");
     time.textContent = `${second.toFixed(1)} s`;
-    item.append(time, text);
+    item.append(time, unbroken(text));
   });
   showRecording(state.recording);
 }

@@ -2,6 +2,8 @@
 
 export const MOST_REGIONS = 5;
 const LEAST_DRAG = 8;
+// A drag that encloses less than this part of the square of its length is taken for the diagonal of a rectangle.
+const STRAIGHT = 0.05;
 
 function inside(points, x, y) {
   let within = false;
@@ -45,6 +47,21 @@ export function mean(region, picture, [left, right, lower, upper]) {
   return count ? sum / count : NaN;
 }
 
+// Area of a polygon.
+function area(points) {
+  return Math.abs(points.reduce((sum, [x, y], at) => {
+    const [nextX, nextY] = points[(at + 1) % points.length];
+    return sum + (x * nextY - nextX * y) / 2;
+  }, 0));
+}
+
+// The rectangle between two places, no side shorter than `least`.
+function rectangle([ax, ay], [bx, by], least) {
+  const [x, y] = [(ax + bx) / 2, (ay + by) / 2];
+  const [right, up] = [Math.max(least, Math.abs(bx - ax)) / 2, Math.max(least, Math.abs(by - ay)) / 2];
+  return [[x - right, y - up], [x + right, y - up], [x + right, y + up], [x - right, y + up]];
+}
+
 // Let the user draw regions on the image. `add` is given the points of a region; `point` a place, or null.
 export function drawWith(view, { add, point, redraw }) {
   const { canvas } = view;
@@ -71,11 +88,13 @@ export function drawWith(view, { add, point, redraw }) {
   });
   canvas.addEventListener("pointerup", (event) => {
     if (!start) return;
-    const reach = Math.max(...view.lasso.map((one) => {
-      const [x, y] = view.toCanvas(one);
-      return Math.hypot(x - start[0], y - start[1]);
-    }));
-    add(reach < LEAST_DRAG ? circle(view.toBody(...place(event)), small()) : view.lasso);
+    const [first] = view.lasso;
+    const away = ([x, y]) => Math.hypot(x - first[0], y - first[1]);
+    const farthest = view.lasso.reduce((one, other) => (away(other) > away(one) ? other : one));
+    const reach = away(farthest);
+    if (reach * view.metre < LEAST_DRAG) add(circle(view.toBody(...place(event)), small()));
+    else if (area(view.lasso) < STRAIGHT * reach ** 2) add(rectangle(first, farthest, small()));
+    else add(view.lasso);
     start = view.lasso = null;
     redraw();
   });
@@ -104,6 +123,7 @@ export function drawWith(view, { add, point, redraw }) {
       add(circle(view.cross, small()));
     } else if (event.key === "Escape") {
       view.cross = null;
+      canvas.blur();
     } else {
       return;
     }

@@ -17,8 +17,9 @@ function download(blob, ending) {
   return link.download;
 }
 
+// `done` is given the name of the saved picture, or null where the browser makes none.
 export function savePicture(canvas, done) {
-  canvas.toBlob((blob) => done(download(blob, "png")), "image/png");
+  canvas.toBlob((blob) => done(blob && download(blob, "png")), "image/png");
 }
 
 // A film of the canvas, at most ten minutes; `changed` is given whether one is being made, and the name of a saved one.
