@@ -193,10 +193,10 @@ def _with_sound(source: str, calibration: str | Path, rate: float | None) -> tup
     known = Calibration.load(calibration)
     if not Path(source).is_file():
         return open_source(source, rate=rate), SoundView(known)
-    heard = calibrated_intensities(read_recording(source), known)
-    power = np.where(heard.usable, heard.power, np.nan)
-    view = SoundView(known, floor=heard.floor, freedom=heard.freedom)
-    return PlayedRecording(source, power, np.asarray(heard.times), rate), view
+    intensities = calibrated_intensities(read_recording(source), known)
+    power = np.where(intensities.usable, intensities.power, np.nan)
+    view = SoundView(known, floor=intensities.floor, freedom=intensities.freedom)
+    return PlayedRecording(source, power, np.asarray(intensities.times), rate), view
 
 
 def _with_model(

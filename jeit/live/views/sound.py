@@ -53,7 +53,7 @@ class SoundView(AbstractView):
         likely = method == _LIKELIHOOD
         (x_min, y_min), (x_max, y_max) = low.tolist(), high.tolist()
         self.scene = Scene(
-            title=f"Touches heard by {len(places)} microphones, {calibration.name}",
+            title=f"Touches located by {len(places)} microphones, {calibration.name}",
             quantity="distance from the most likely place" if likely else "loss",
             unit="σ" if likely else "",
             diverging=False,
@@ -73,8 +73,8 @@ class SoundView(AbstractView):
             reason = f"The frame is {kind}, not {len(self._silence)} intensities."
             return Picture(None, status=FrameStatus.REFUSED, reason=reason)
         try:
-            heard = self._intensities(values - self._silence, frame.second)
-            found = locate(heard, self.calibration, method=self.method, gain_drift=0.0, compiled=False)
+            intensities = self._intensities(values - self._silence, frame.second)
+            found = locate(intensities, self.calibration, method=self.method, gain_drift=0.0, compiled=False)
         except ValueError as error:
             return Picture(None, status=FrameStatus.REFUSED, reason=str(error))
         status = found.status[0]
@@ -82,7 +82,7 @@ class SoundView(AbstractView):
             return Picture(None, status=FrameStatus.REFUSED, reason="Fewer than three microphones can be used.")
         if status == LocationStatus.NO_TOUCH:
             return Picture(None, status=FrameStatus.UNCHANGED)
-        loss = np.asarray(self._localiser.maps(heard.power, found.used))[0, ::-1]
+        loss = np.asarray(self._localiser.maps(intensities.power, found.used))[0, ::-1]
         if self.method == _LIKELIHOOD:
             loss = np.sqrt(2 * (loss - np.nanmin(loss)))
         reason = "" if status == LocationStatus.TOUCH else f"{status}: see the statuses of jeit locate.".capitalize()

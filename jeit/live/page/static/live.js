@@ -17,7 +17,7 @@ const FAILED = ["The recording cannot begin", "There is nowhere to record to"];
 
 const view = new ImageView(element("image"));
 const traces = { regions: new Traces(element("regions-trace")), channels: new Traces(element("channels-trace")) };
-const page = { paused: false, newest: null, latest: null, shown: null, rate: 0, hidden: false, tracedAt: 0, said: "", told: null };
+const page = { paused: false, newest: null, latest: null, shown: null, rate: 0, hidden: false, tracedAt: 0, said: "", failures: null };
 const channels = [];
 
 // ---- drawing: the newest picture once a screen, and then its number reported ----
@@ -84,12 +84,12 @@ function note(text, seconds = 4) {
   setTimeout(showBanner, 1000 * seconds + 100);
 }
 
-// Why a recording could not begin, once; `told` is null until the messages of before are known.
+// Why a recording could not begin, once; `failures` is null until the messages of before are known.
 function noteFailure(messages) {
   const failed = messages.filter(({ text }) => FAILED.some((beginning) => text.startsWith(beginning)));
   const newest = failed.at(-1)?.second ?? -Infinity;
-  if (page.told !== null && newest > page.told) note(failed.at(-1).text, 8);
-  page.told = newest;
+  if (page.failures !== null && newest > page.failures) note(failed.at(-1).text, 8);
+  page.failures = newest;
 }
 
 document.addEventListener("visibilitychange", () => {
@@ -130,7 +130,7 @@ const connection = new Connection({
     redraw();
   },
   scene(scene) {
-    page.told = null;
+    page.failures = null;
     write("title", scene.title);
     document.title = `${scene.title} – jeit live`;
     view.setScene(scene);
