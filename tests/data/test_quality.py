@@ -298,6 +298,18 @@ def test_spikes_in_single_channels_are_masked_and_named(driven, size, tank, setu
         assert filled.notes[-1].startswith("2 voltages replaced by what others determine")
 
 
+def test_a_channel_that_is_off_by_less_than_channels_change_is_kept(tank, setup):
+    """However precise the others are: an image takes it for noise."""
+    chosen = protocol.adjacent(16)
+    empty = data.screen(tank(chosen), chosen, **setup(16))
+    touched = tank(chosen, 0.05)
+    each = np.asarray(relative_noise(np.abs(tank(chosen))))
+    typical = np.sqrt(np.mean(((touched - tank(chosen)) / each) ** 2))
+    touched[17] += 0.3 * typical * each[17]
+    off = data.screen(touched, chosen, **setup(16))
+    assert mask_spikes(off, empty) is off
+
+
 def test_no_spike_is_found_where_channels_are_independent(tank, setup):
     """A light touch between two electrodes changes their channel alone."""
     chosen = protocol.two_terminal(8)

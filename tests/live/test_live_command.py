@@ -107,7 +107,8 @@ def test_where_nothing_is_imaged_the_status_says_so(served, run, files):
     assert (status, "3 frames, and none could be imaged: The frame is" in error) == (1, True)
 
 
-def test_what_stands_in_the_way_is_found_before_anything_is_prepared(run, files):
+def test_what_stands_in_the_way_is_found_before_anything_is_prepared(run, files, monkeypatch):
+    monkeypatch.setattr("jeit.live.preparation.prepare", None)
     (files / "taken").write_text("")
     given = ("live", files / "frames.csv", "--reference", files / "rest.npz")
     status, _, error = run(*given, "--output", files / "taken" / "below")
