@@ -114,11 +114,13 @@ def test_history_and_snapshots_tell_the_way(found):
 
 
 def test_same_arguments_same_layout(found):
-    heard = []
-    again = optimise_from_three(callback=lambda step, scores: heard.append((step, scores)))
-    np.testing.assert_array_equal(again.centres, found.centres)
-    np.testing.assert_array_equal(np.stack([scores for _, scores in heard], axis=1), found.history)
-    assert [step for step, _ in heard] == list(range(len(heard)))
+    """To the last bit on a processor; a graphics processor adds in another order each time."""
+    tolerance = 0.0 if jax.default_backend() == "cpu" else 1e-6
+    reported = []
+    again = optimise_from_three(callback=lambda step, scores: reported.append((step, scores)))
+    np.testing.assert_allclose(again.centres, found.centres, rtol=tolerance, atol=tolerance * 0.05)
+    np.testing.assert_allclose(np.stack([scores for _, scores in reported], axis=1), found.history, rtol=tolerance)
+    assert [step for step, _ in reported] == list(range(len(reported)))
 
 
 def test_symmetric_layouts_of_sizes_within_limits_are_what_is_searched():

@@ -240,6 +240,7 @@ def test_fronts_of_another_pattern_are_refused():
 
 def test_the_choice_follows_size_memory_and_device(monkeypatch):
     pattern, values, coordinates, vectors = problem(sparse_problems.box)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     small = choose_solver(pattern, coordinates)
     assert isinstance(small, SparseCholesky)
     assert small.reason.startswith("direct: a factorisation takes")
