@@ -17,7 +17,7 @@ from jeit.cli import main
 from jeit.cli.app import application
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 COMMANDS = {tuple(path.split()): function for path, function in command_line.commands(application())}
 
 
