@@ -1,4 +1,4 @@
-"""Public names of version 0.2 that have moved. They still work until the next version, with a `DeprecationWarning` that
+"""Public names of version 0.2 that have moved. They work until version 1.1, with a `DeprecationWarning` that
 names the new place."""
 
 from __future__ import annotations
@@ -108,5 +108,5 @@ def with_moved_names(page: str, find: Callable[[str], Any] | None = None) -> Cal
 def _forward(old: str, new: str) -> Any:
     home, _, name = new.rpartition(".")
     found = getattr(importlib.import_module(home), name)
-    warnings.warn(f"{old} is now {new}; the old name goes with the next version.", DeprecationWarning, stacklevel=3)
+    warnings.warn(f"{old} is now {new}; the old name is removed in version 1.1.", DeprecationWarning, stacklevel=3)
     return found
