@@ -12,7 +12,7 @@ from jeit.acoustic import Localiser, LocatedTouches
 from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
-from jeit.acoustic.localisation.pixels import brightness, fade
+from jeit.acoustic.localisation.pixels import fade, map_brightness
 from jeit.acoustic.tracking import Track
 from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
 
@@ -157,7 +157,7 @@ def _overlay_maps(touches: LocatedTouches) -> np.ndarray | None:
     image = np.zeros((_PIXELS, _PIXELS))
     for start in range(0, located.size, _FRAMES):
         some = located[start : start + _FRAMES]
-        bright = brightness(localiser.maps(intensities.power[some], use[some]), method=touches.method)
+        bright = map_brightness(localiser.maps(intensities.power[some], use[some]), method=touches.method)
         image = np.maximum(image, fade(bright, locations.times[some], at=times[-1], time_constant=time_constant))
     return image
 

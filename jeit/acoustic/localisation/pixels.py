@@ -73,7 +73,7 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
     return first, pixels.chart[:, other], second < _WORTH_FACTOR * least + _WORTH_OFFSET
 
 
-def brightness(
+def map_brightness(
     maps: ArrayLike, *, method: str = "likelihood", share: float = 0.02
 ) -> Float[np.ndarray, "F rows columns"]:
     """Convert maps to brightness: 1 at the best pixel of each map, decreasing to 0 with the value of the map, and 0
@@ -103,7 +103,9 @@ def brightness(
     return np.where(known, np.exp(-(flat - least) / scale), 0.0).reshape(values.shape)
 
 
-def overlay(images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3) -> Float[np.ndarray, "F rows columns"]:
+def overlay_images(
+    images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3
+) -> Float[np.ndarray, "F rows columns"]:
     """Overlay each frame with the frames before it, which fade as exp(−age / `time_constant`).
 
     `images` (F, rows, columns): brightness, zero where there is no touch; NaN counts as zero. `times` (F,): increasing
@@ -127,7 +129,7 @@ def overlay(images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3) 
 
 
 def fade(images: ArrayLike, times: ArrayLike, *, at: float, time_constant: float) -> Float[np.ndarray, "rows columns"]:
-    """Compute the last image (rows, columns) of an `overlay` only, as seen at the time `at` in seconds.
+    """Compute the last image (rows, columns) of `overlay_images` only, as seen at the time `at` in seconds.
 
     A long recording can be processed in parts: the image of the whole is the maximum of the images of its parts.
     """

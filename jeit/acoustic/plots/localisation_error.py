@@ -21,7 +21,7 @@ _STATISTICS = {
 }
 
 
-def plot_pairs(
+def plot_position_errors(
     true: ArrayLike,
     found: ArrayLike,
     microphones: ArrayLike,

@@ -42,7 +42,7 @@ _MAP_LABELS = {
 }
 
 
-class Marks(NamedTuple):
+class MapMarks(NamedTuple):
     """Positions to mark on a map.
 
     **Fields**: `truth`: true position (d,) in metres; `estimate`: estimated position (d,) in metres; `covariance`:
@@ -60,7 +60,7 @@ def plot_loss_map(
     *,
     microphones: ArrayLike | None = None,
     received: ArrayLike | None = None,
-    marks: Marks | None = None,
+    marks: MapMarks | None = None,
     method: str = "likelihood",
     title: str | None = None,
     colour_bar: bool = True,
@@ -74,10 +74,10 @@ def plot_loss_map(
     true and estimated position to mark. `method`: "likelihood" or "consistency". A likelihood map is drawn as
     √(2 (map − minimum)), the number of standard deviations by which a position is worse than the best; a map of the
     consistency loss (Park 2022) is drawn in decibels above its minimum. Raises `ValueError` for other methods, shapes
-    that disagree, and `marks` that are not `Marks`.
+    that disagree, and `marks` that are not `MapMarks`.
     """
     if marks is not None:
-        check_kind("marks", marks, Marks, "Marks, such as Marks(truth=(0.02, 0.01))")
+        check_kind("marks", marks, MapMarks, "MapMarks, such as MapMarks(truth=(0.02, 0.01))")
     pixels = np.asarray(values, float)
     if pixels.ndim != 2 or not np.isfinite(pixels).any():
         raise ValueError(f"values has shape {pixels.shape}; give (rows, columns) with at least one finite value.")
@@ -106,7 +106,7 @@ def plot_loss_map(
     return ax
 
 
-def _draw_marks(ax: Axes, view: View, marks: Marks) -> list[Line2D]:
+def _draw_marks(ax: Axes, view: View, marks: MapMarks) -> list[Line2D]:
     """Draw the marked positions and return their legend entries. Raises `ValueError` for shapes that do not match the
     surface, and for a covariance without an estimate."""
     if marks.covariance is not None and marks.estimate is None:

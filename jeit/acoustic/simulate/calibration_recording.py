@@ -46,7 +46,7 @@ class CalibrationTaps(Module):
     strengths: Float[np.ndarray, " T"]
 
 
-def calibration_taps(
+def simulate_calibration_taps(
     skin: SoundingSkin,
     key: Array,
     positions: ArrayLike,

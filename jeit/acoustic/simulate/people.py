@@ -10,11 +10,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, quiet, record
+from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, record, simulate_silence
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import ONSET, Burst, microphone_noise, sample_times
 from jeit.acoustic.simulate.touches import NOMINAL_SPEED
-from jeit.acoustic.simulate.wind_sound import TURBULENCE, room_sound, wind
+from jeit.acoustic.simulate.wind_sound import TURBULENCE, simulate_room_sound, simulate_wind
 from jeit.arguments import check_key, check_kind, check_name, describe
 from jeit.arguments.checks import check_positive
 from jeit_solvers.module import Module
@@ -184,7 +184,7 @@ def _simulate_wind(
     rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
 ) -> SimulatedSound:
     """Simulate an air jet at a random position."""
-    return wind(
+    return simulate_wind(
         skin, key, _random_position(rng, skin), slope=skin.spectral_slope, duration=duration, noise=False, **traits
     )
 
@@ -199,7 +199,7 @@ _SIMULATIONS: dict[str, Callable[..., SimulatedSound]] = {
 
 def _silence(skin: SoundingSkin, duration: float) -> SimulatedSound:
     """Simulate a recording without a touch and without noise."""
-    silence = quiet(skin, jax.random.key(0), duration=duration)
+    silence = simulate_silence(skin, jax.random.key(0), duration=duration)
     return SimulatedSound(
         np.zeros_like(silence.samples), skin.rate, np.zeros((0, 2)), np.zeros(0), silence.active, False
     )
@@ -248,7 +248,7 @@ class SoundClip:
         return self.touch.samples + 10 ** (decibels / 20) * self.noise
 
 
-def sound_clips(
+def simulate_sound_clips(
     key: Array,
     skin: SoundingSkin,
     people: Sequence[SoundingPerson],
@@ -286,5 +286,5 @@ def _clips(key, skin, people, each, modalities, duration) -> Iterator[SoundClip]
         touched, own, room, loud = jax.random.split(jax.random.fold_in(key, number), 4)
         touch = people[person].touch(touched, modality, skin, duration=duration)
         level = _ROOM + _ROOM_SPREAD * float(jax.random.normal(loud))
-        around = room_sound(skin, room, level_db=level, duration=duration).samples
+        around = simulate_room_sound(skin, room, level_db=level, duration=duration).samples
         yield SoundClip(touch, microphone_noise(skin, own, count) + around, modality, person)

@@ -22,7 +22,7 @@ from jeit.arguments.checks import check_positive
 NOMINAL_SPEED = 0.1
 
 
-def tap(
+def simulate_tap(
     skin: SoundingSkin,
     key: Array,
     position: ArrayLike,
@@ -51,7 +51,7 @@ def tap(
     return record(skin, key, _check_place(skin, position), envelope, noise)
 
 
-def pat(
+def simulate_pat(
     skin: SoundingSkin,
     key: Array,
     position: ArrayLike,
@@ -65,10 +65,10 @@ def pat(
     """Simulate firm taps of a hand at one `position` (2,) in metres, `interval` seconds apart; see `tap`."""
     check_positive("interval", interval)
     repeated = {"repeats": taps, "frequency": 1 / interval}
-    return tap(skin, key, position, burst=burst, **repeated, duration=duration, noise=noise)
+    return simulate_tap(skin, key, position, burst=burst, **repeated, duration=duration, noise=noise)
 
 
-def tickle(
+def simulate_tickle(
     skin: SoundingSkin,
     key: Array,
     position: ArrayLike,
@@ -84,7 +84,7 @@ def tickle(
     Each tap is half way between the previous tap and a random position within `radius` metres of `position`; positions
     outside the skin are moved to its edge. The strengths are log-normal with the median `burst.strength` and the
     standard deviation 0.3 of the logarithm. Each tap is delayed by a random part of up to a quarter of the interval.
-    Raises `ValueError` as `tap` does.
+    Raises `ValueError` as `simulate_tap` does.
     """
     check_skin_and_key(skin, key)
     middle = _check_place(skin, position)[0]
@@ -108,7 +108,7 @@ def tickle(
     return record(skin, rest, places[blocks], burst.envelope(times, onsets, strengths), noise)
 
 
-def stroke(
+def simulate_stroke(
     skin: SoundingSkin,
     key: Array,
     path: ArrayLike,

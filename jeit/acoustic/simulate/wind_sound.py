@@ -28,7 +28,7 @@ _PLACES, _FREQUENCIES = 64, 160
 TURBULENCE = 5 / 3
 
 
-def wind(
+def simulate_wind(
     skin: SoundingSkin,
     key: Array,
     position: ArrayLike,
@@ -71,7 +71,7 @@ def wind(
     return SimulatedSound(samples, skin.rate, np.tile(middle, (len(kept), 1)), kept, strength * loud, noise)
 
 
-def room_sound(
+def simulate_room_sound(
     skin: SoundingSkin, key: Array, *, level_db: float = 0.0, slope: float = 1.0, duration: float = 1.0
 ) -> SimulatedSound:
     """Simulate the sound of a room: the same signal for all microphones, multiplied by their gains.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, real_array
 from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap, checked_frames, learn_weights
-from jeit.touch.kohonen.training import Schedule
+from jeit.touch.kohonen.training import MapSchedule
 
 # Maximum number of frames of which all pairs are compared; number of neighbours of each frame.
 _COMPARED, _NEIGHBOURS = 2000, 12
@@ -69,7 +69,7 @@ def learning_curves(
     side. Raises `ValueError` as `SelfOrganisingMap.fit` does.
     """
     radius = max(shape) / 2
-    schedules = [Schedule(steps, 0, (float(rate), float(rate)), (radius, radius)) for rate in rates]
+    schedules = [MapSchedule(steps, 0, (float(rate), float(rate)), (radius, radius)) for rate in rates]
     return learn_weights(checked_frames(frames), [key], shape, schedules)[1]
 
 

@@ -33,7 +33,7 @@ _ORDERING_FRAMES, _TUNING_FRAMES = 16, 64
 _IN_BOUNDS = "promise_in_bounds"
 
 
-class Schedule(Module):
+class MapSchedule(Module):
     """Schedule of a map's training.
 
     **Fields**: `ordering` and `tuning`: number of frames shown in each phase; `rate`: the rate ε at the first and the

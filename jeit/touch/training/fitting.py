@@ -1,4 +1,4 @@
-"""`fit`: train a network by Adam with early stopping on held-out rows, with checkpoints to resume from."""
+"""`fit_network`: train a network by Adam with early stopping on held-out rows, with checkpoints to resume from."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from jeit.touch.training.model_file import Checkpoint, Course, State
 _CHECKPOINT_BATCHES, _AT_ONCE = 32, 256
 
 
-class Objective(NamedTuple):
+class TrainingObjective(NamedTuple):
     """The objective of a training; both functions are compiled.
 
     **Fields**: `loss(network, batch, key)`: returns the loss of a batch of rows, which is minimised, and the network,
@@ -39,7 +39,7 @@ class Objective(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """Settings of a training.
 
     **Fields**: `rate`: learning rate of Adam, which is multiplied by `decay` after every `decay_epochs` epochs;
@@ -85,12 +85,12 @@ class TrainingResult:
     reason: str
 
 
-def fit(
+def fit_network(
     network: Any,
-    objective: Objective,
+    objective: TrainingObjective,
     training: Any,
     validation: Any,
-    plan: Plan | None = None,
+    plan: TrainingPlan | None = None,
     *,
     key: Array,
     checkpoint: str | Path | None = None,
@@ -107,8 +107,8 @@ def fit(
     """
     need_extra("learn", "training")
     check_key(key)
-    check_kind("objective", objective, Objective, "an Objective(loss, held_out)")
-    plan = Plan() if plan is None else plan
+    check_kind("objective", objective, TrainingObjective, "a TrainingObjective(loss, held_out)")
+    plan = TrainingPlan() if plan is None else plan
     rows = training if _are_rows(training) else ArrayRows(training)
     held = ArrayRows(validation, "validation")
     held_out_arrays = jax.tree.map(jnp.asarray, held.arrays)
@@ -150,7 +150,7 @@ def fit(
 class _CompiledTraining:
     """Compiled functions of one training, and methods that apply them to the state of the training."""
 
-    def __init__(self, network, objective: Objective, plan: Plan, order: BatchOrder, key: Array):
+    def __init__(self, network, objective: TrainingObjective, plan: TrainingPlan, order: BatchOrder, key: Array):
         import optax
 
         steps = plan.decay_epochs * order.batches_per_epoch
@@ -221,7 +221,7 @@ class _CompiledTraining:
         return State(state.step, course, state.moving, state.optimiser, best, jnp.zeros(()))
 
 
-def _end_reason(state: State, plan: Plan, last_batch: int) -> str | None:
+def _end_reason(state: State, plan: TrainingPlan, last_batch: int) -> str | None:
     """Return the reason why the training has ended, or None if it has not."""
     looks = len(state.course.validation)
     if looks and looks - 1 - state.course.best >= plan.patience:
@@ -229,7 +229,7 @@ def _end_reason(state: State, plan: Plan, last_batch: int) -> str | None:
     return f"{plan.epochs} epochs done" if state.step >= last_batch else None
 
 
-def _describe_progress(state: State, plan: Plan, batches_per_epoch: int) -> str:
+def _describe_progress(state: State, plan: TrainingPlan, batches_per_epoch: int) -> str:
     own = state.course
     return (
         f"epoch {state.step / batches_per_epoch:.3g} of {plan.epochs}: {own.training[-1]:.4g}, held out "

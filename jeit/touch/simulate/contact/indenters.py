@@ -29,7 +29,7 @@ class AbstractIndenter(Module):
         """Distance in metres from the frame's origin beyond which the body does not extend."""
 
 
-class Disc(AbstractIndenter):
+class DiscIndenter(AbstractIndenter):
     """The flat end of a cylinder with `diameter` in metres, such as of a weight."""
 
     diameter: float
@@ -49,7 +49,7 @@ class Disc(AbstractIndenter):
         return self.diameter / 2
 
 
-class Ring(AbstractIndenter):
+class RingIndenter(AbstractIndenter):
     """The flat end of a tube with `outer_diameter` and `inner_diameter` in metres."""
 
     outer_diameter: float
@@ -77,7 +77,7 @@ class Ring(AbstractIndenter):
         return self.outer_diameter / 2
 
 
-class Bar(AbstractIndenter):
+class BarIndenter(AbstractIndenter):
     """A flat rectangle, such as the face of a cube or the edge of a ruler, with `length` along x and `width` along y in
     metres."""
 
@@ -100,7 +100,7 @@ class Bar(AbstractIndenter):
         return float(np.hypot(self.length, self.width) / 2)
 
 
-class Prism(AbstractIndenter):
+class PrismIndenter(AbstractIndenter):
     """A prism that touches with an edge along x, like a roof upside down: `length` of the edge, `width` and `height` of
     the triangular section, all in metres."""
 
@@ -126,7 +126,7 @@ class Prism(AbstractIndenter):
         return float(np.hypot(self.length, self.width) / 2)
 
 
-class Revolved(AbstractIndenter):
+class RevolvedIndenter(AbstractIndenter):
     """A rigid body of revolution with the profile of an `indentation` of `jeit.design`, such as `Bell()`; its depth in
     the skin follows from the load."""
 
@@ -150,13 +150,13 @@ class Revolved(AbstractIndenter):
         return float(self.indentation.reach)
 
 
-def ball(diameter: float) -> Revolved:
+def ball_indenter(diameter: float) -> RevolvedIndenter:
     """The lower half of a ball with `diameter` in metres. Raises `ValueError` for a diameter that is not positive."""
     check_metres("diameter", diameter)
-    return Revolved(Hemisphere(diameter / 2, diameter))
+    return RevolvedIndenter(Hemisphere(diameter / 2, diameter))
 
 
-class DepthMap(AbstractIndenter):
+class DepthMapIndenter(AbstractIndenter):
     """An indenter given by an image of its surface, centred at the origin and interpolated linearly between pixels.
 
     **Fields**: `height`: (rows, columns), height of the surface towards the skin in metres, NaN where there is no
@@ -194,7 +194,7 @@ class DepthMap(AbstractIndenter):
 
 def check_indenter(name: str, value) -> None:
     """Check that the argument `name` is an indenter. Raises `ValueError` otherwise."""
-    check_kind(name, value, AbstractIndenter, "an indenter, such as Disc(0.02) or ball(0.015)")
+    check_kind(name, value, AbstractIndenter, "an indenter, such as DiscIndenter(0.02) or ball_indenter(0.015)")
 
 
 def _check_size(name: str, value, maximum: float = np.inf, limit: str = "") -> None:

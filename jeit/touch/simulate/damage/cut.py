@@ -171,7 +171,7 @@ def _orientation(first, second) -> np.ndarray:
 _HYSTERESIS_FACTOR = 1.5
 
 
-def mended(
+def mend_cut(
     mesh: Mesh, conductivity: ArrayLike, cut: Cut, material: Material, share: float = 1.0
 ) -> tuple[Float[np.ndarray, " m"], Material]:
     """Conductivity (m,) of a skin whose cut was repaired, S/m (2-D: S), and its material.
