@@ -100,8 +100,8 @@ class ForwardModel(Module):
       lineax solver. With "auto", `jeit_solvers.Multigrid` or `jeit_solvers.Pardiso`, methods run in NumPy where they
       can; with other values they are always compiled.
 
-    **Fields**: `mesh`, `electrodes`,
-    `protocol`; `system`: sparsity pattern and linear solver; `at_once`: whether methods run in NumPy where possible.
+    **Fields**: `mesh`, `electrodes`, `protocol`; `system`: sparsity pattern and linear solver; `at_once`: whether
+    methods run in NumPy where possible.
 
     **Example:**
 

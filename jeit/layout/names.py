@@ -212,8 +212,8 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
     - `outline`: outline of the skin, by default 200 × 200 mm about the origin.
     - `diameter`: diameter of the electrodes, metres.
 
-    Raises `ValueError` for an unknown name, for a skin that the layout does not exist for, and for electrodes that would
-    overlap.
+    Raises `ValueError` for an unknown name, for a skin that the layout does not exist for, and for electrodes that
+    would overlap.
 
     **Example:**
 
