@@ -1,8 +1,9 @@
 """The API reference: a page for every room and sub-room, with every public name, found by reading the source.
 
-A name is public where neither it nor a module it is in begins with an underscore. A room's page has what its
-`__init__` exports, then what else its modules define; a constant is shown where a room exports it. Each name is
-described once: where it is exported, in the outermost of the rooms that do; else beside its module.
+The public API is what `jeit`, its rooms (not their sub-rooms) and `jeit_solvers` export. Their pages have these names
+first; what else modules define without an underscore is shown below or on pages of its own, and marked as internal. A
+constant is shown where a room exports it. Each name is described once: where it is exported, in the outermost of the
+rooms that do; else beside its module.
 As a hook of mkdocs this adds the pages and their places in the menu; nothing is written into `docs/`.
 """
 
@@ -17,6 +18,23 @@ ROOT = Path(__file__).resolve().parents[2]
 TOPS = {"jeit": ROOT / "jeit", "jeit_solvers": ROOT / "solvers" / "jeit_solvers"}
 # The command line is described command by command, on a page of its own.
 _COMMANDS = re.compile(r"jeit\.cli|jeit\.\w+\.commands")
+# Rooms that other rooms use, and users do not.
+_INTERNAL = {"jeit.arguments", "jeit.cli", "jeit.files", "jeit.simulate", "jeit.start"}
+_PROMISE = """!!! info "What is public, and what may change"
+
+    The public API is what `jeit`, its rooms (such as `jeit.inverse`) and `jeit_solvers` export:
+    `from jeit.inverse import Matern`. It follows [semantic versioning](https://semver.org): until version 2.0 no public
+    name, parameter, method or field vanishes or changes its meaning, and what is to vanish gives a warning for at least
+    one minor version before. The [list of public names](../../reference/public-api.txt) is checked by a test.
+    All else is marked as internal and may change in any version, as may the text of messages and the last digits of
+    results.
+
+    Examples take the names of their page from its room, and begin with what the page says that they assume.
+"""
+_MARK = """!!! warning "Internal"
+
+    What is described {where} is not part of the public API and may change in any version.
+"""
 
 
 @dataclass(frozen=True)
@@ -44,6 +62,17 @@ class Package:
     def page(self) -> str:
         """Where its page stands in the site."""
         return f"api/{'/'.join(self.path.split('.'))}/index.md"
+
+
+def is_public(path: str) -> bool:
+    """Whether what a package exports is part of the public API."""
+    return path in TOPS or (path.startswith("jeit.") and path.count(".") == 1 and path not in _INTERNAL)
+
+
+def assumed(room: str) -> str:
+    """What the examples of a room's page assume, as Python."""
+    path = Path(__file__).parent / "assumed" / f"{room.rpartition('.')[2]}.py"
+    return path.read_text("utf-8") if path.exists() else ""
 
 
 def _first_sentence(text: str | None) -> str:
@@ -151,7 +180,12 @@ def described() -> dict[str, str]:
 
 def page(package: Package) -> str:
     """The page of a room, as Markdown for mkdocstrings."""
+    public = is_public(package.path)
     lines = [f"# {package.path} {{ #{package.path} }}", "", package.docstring, ""]
+    lines += [] if public else [_MARK.format(where="on this page")]
+    lines += [_PROMISE] if package.path == "jeit" else []
+    if assumed(package.path):
+        lines += ["Examples on this page assume:", "", "```python", assumed(package.path).rstrip(), "```", ""]
     own = [name for name in package.exports.values() if described()[name.home] == package.path]
     if package.exports:
         lines += ["| name | what it is |", "|---|---|"]
@@ -170,13 +204,16 @@ def page(package: Package) -> str:
             link = "/".join(one.path.split(".")[package.path.count(".") + 1 :])
             lines += [f"| [`{one.path}`]({link}/index.md) | {_first_sentence(one.docstring)} |"]
         lines += [""]
+    marked = not public
     for module, names in package.modules.items():
         rest = [one for one in names.values() if described()[one.home] == package.path and one not in own]
         if rest:
+            lines += [] if marked else ["## Internal modules", "", _MARK.format(where="from here on")]
+            marked = True
             docstring = ast.get_docstring(ast.parse(_file(module).read_text("utf-8"))) or ""
-            lines += [f"## {module} {{ #{module} }}", "", docstring, ""]
+            lines += [f"### {module} {{ #{module} }}", "", docstring, ""]
             for one in rest:
-                lines += [f"::: {one.home}", "    options:", "      heading_level: 3", ""]
+                lines += [f"::: {one.home}", "    options:", "      heading_level: 4", ""]
     return "\n".join(lines)
 
 
