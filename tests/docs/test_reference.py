@@ -16,27 +16,6 @@ ROOMS = [one for one in public_api.rooms() if one != "jeit"]  # which repeats na
 FENCE = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 # Names whose docstrings are still to be written, by room.
 KNOWN: dict[str, set[str]] = {
-    "jeit.acoustic": {
-        "Calibration",
-        "Intensities",
-        "IntensitySettings",
-        "Localiser",
-        "LocatedTouches",
-        "MicrophoneArray",
-        "Recording",
-        "Taps",
-        "calibrate_microphones",
-        "cramer_rao",
-        "intensities",
-        "locate",
-        "locate_touches",
-        "read_recording",
-        "read_taps",
-        "tap_intensities",
-        "track",
-        "write_recording",
-        "write_taps",
-    },
     "jeit.data": {
         "FrameRecording",
         "GestureSet",

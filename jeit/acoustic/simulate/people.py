@@ -84,6 +84,13 @@ class SoundingPerson(Module):
     """Traits of one person.
 
     **Fields**: `medians`: for each modality, dictionary of the person's traits by name, in SI units.
+
+    **Example:**
+
+    ```python
+    person = SoundingPerson.draw(key)
+    touch = person.touch(key, "stroke", skin, duration=2.0)
+    ```
     """
 
     medians: Mapping[str, Mapping[str, float]] = eqx.field(static=True)
@@ -257,12 +264,29 @@ def simulate_sound_clips(
     modalities: Sequence[str] = MODALITIES,
     duration: float = 2.9,
 ) -> Iterator[SoundClip]:
-    """Yield `each` clips of each modality by each person, ordered by person and modality. Clips are generated one at a
-    time, so that a large set need not fit into memory.
+    """Yield recordings of touches by several people, ordered by person and modality. Clips are generated one at a time,
+    so that a large set need not fit into memory.
 
     The noise consists of the microphones' noise and the room's sound, whose level in decibels relative to that noise is
-    normal with a mean of -6 dB. Every clip has its own random key. Raises `ValueError` for invalid arguments, and for
-    an empty list of people.
+    normal with a mean of -6 dB. Every clip has its own random key.
+
+    **Arguments:**
+
+    - `key`: random key.
+    - `skin`: the simulated skin.
+    - `people`: the people, as from `SoundingPerson.draw`.
+    - `each`: number of clips of each modality by each person.
+    - `modalities`: kinds of touch: "pat", "tickle", "stroke", "wind" and "none".
+    - `duration`: duration of a clip, seconds.
+
+    Raises `ValueError` for invalid arguments, and for an empty list of people.
+
+    **Example:**
+
+    ```python
+    people = [SoundingPerson.draw(key)]
+    clips = list(simulate_sound_clips(key, skin, people, 1, modalities=("pat", "stroke")))
+    ```
     """
     check_skin_and_key(skin, key)
     check_kind("people", people, (list, tuple), "a list of them, such as [SoundingPerson.draw(key)]")

@@ -57,7 +57,23 @@ class SimulatedSound(Module):
 
 
 def simulate_silence(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -> SimulatedSound:
-    """Simulate `duration` seconds of microphone noise without a source. Raises `ValueError` for an invalid duration."""
+    """Simulate the noise of the microphones without a source.
+
+    **Arguments:**
+
+    - `skin`: the simulated skin.
+    - `key`: random key.
+    - `duration`: duration of the recording, seconds.
+
+    Raises `ValueError` for an invalid duration.
+
+    **Example:**
+
+    ```python
+    sound = simulate_silence(skin, key, duration=2.0)
+    silence = Recording(sound.samples, sound.rate)
+    ```
+    """
     check_skin_and_key(skin, key)
     check_positive("duration", duration)
     times = sample_times(skin, duration)
