@@ -1,4 +1,4 @@
-from .body_mesh import FacePatches
+from .body_mesh import FacePatches, body_mesh
 from .boundary import BoundaryElectrodes
 from .discs import FaceDiscs, SheetDiscs, SurfaceDiscs
 from .electrode_shapes import CombinedElectrodes, ElectrodeShapes, shapes_of
@@ -18,6 +18,7 @@ __all__ = [
     "PointElectrodes",
     "SheetDiscs",
     "SurfaceDiscs",
+    "body_mesh",
     "electrodes_from_nodes",
     "plates",
     "shapes_of",

@@ -37,12 +37,26 @@ _NUM_RIM_POINTS = 16
 
 @size_checked()
 def body_mesh(body: Body, electrodes: AbstractElectrodes, num_points: int | None = None) -> Mesh:
-    """Mesh a body with about `num_points` nodes, with smaller cells at the electrodes: as their `refinement` says or,
-    for rectangular electrodes on solids, as `jeit.mesh.refined_at_electrodes` does.
+    """Mesh a body with smaller cells at the electrodes: as their `refinement` says or, for rectangular electrodes on
+    solids, with layers and rows of cells that end at the electrodes.
 
     The edges of rectangular electrodes on a box, and their upper and lower edges on the wall of another solid, coincide
-    with cell faces. A body that is given as a mesh is not remeshed. Raises `ValueError` if `num_points` is missing, or
-    if it is given for a body that is a mesh.
+    with cell faces. A body that is given as a mesh is not remeshed.
+
+    **Arguments:**
+
+    - `body`: an outline, a `Solid` or an `OwnMesh`.
+    - `electrodes`: the electrodes, with lengths in metres.
+    - `num_points`: number of nodes, approximately.
+
+    Raises `ValueError` if `num_points` is missing, or if it is given for a body that is a mesh.
+
+    **Example:**
+
+    ```python
+    from jeit.mesh import Disk
+    fine = body_mesh(Disk(0.1), BoundaryElectrodes(ring(0.1, 16), 0.01, 1e-3), num_points=400)
+    ```
     """
     if isinstance(body, OwnMesh):
         if num_points is not None:
@@ -190,6 +204,13 @@ class FacePatches(AbstractMovableElectrodes):
 
     **Fields**: `position` (L, 3): points on the surface, metres; `width`, `height` (L,): metres; `contact_impedance`
     (L,): ohm·m².
+
+    **Example:**
+
+    ```python
+    electrodes = FacePatches(ring(0.1, 8, height=0.05), width=0.04, height=0.05, contact_impedance=1e-4)
+    electrodes.check(tank)
+    ```
     """
 
     position: Float[Array, "L 3"]

@@ -39,6 +39,13 @@ class BoundaryElectrodes(AbstractMovableElectrodes):
     **Fields**: `position` (L, 2): metres, projected to the nearest boundary edge; `width` (L,): metres;
     `contact_impedance` (L,): ohm·m (for a sheet, the contact impedance in ohm·m² divided by the thickness of the
     sheet).
+
+    **Example:**
+
+    ```python
+    electrodes = BoundaryElectrodes(ring(0.1, 16), width=0.01, contact_impedance=1e-3)
+    electrodes.check(mesh)
+    ```
     """
 
     position: Float[Array, "L 2"]

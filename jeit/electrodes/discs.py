@@ -112,6 +112,13 @@ class SheetDiscs(AbstractDiscs, AbstractMovableElectrodes):
     integrals are differentiable in position and radius and converge to those of the sharp disc as the mesh is refined.
 
     **Fields**: `position` (L, 2): metres; `radius` (L,): metres; `contact_impedance` (L,): ohm·m².
+
+    **Example:**
+
+    ```python
+    electrodes = SheetDiscs([[-0.05, 0.0], [0.05, 0.0]], radius=0.02, contact_impedance=1e-4)
+    electrodes.check(sheet)
+    ```
     """
 
     position: Float[Array, "L 2"]
@@ -163,6 +170,13 @@ class FaceDiscs(AbstractDiscs, AbstractMovableElectrodes):
 
     **Fields**: `position` (L, 3): points on the surface, metres; `radius` (L,): metres; `contact_impedance` (L,):
     ohm·m².
+
+    **Example:**
+
+    ```python
+    electrodes = FaceDiscs([[-0.05, 0, 0.05], [0.05, 0, 0.05]], radius=0.02, contact_impedance=1e-4)
+    electrodes.check(solid)
+    ```
     """
 
     position: Float[Array, "L 3"]
@@ -340,6 +354,13 @@ class SurfaceDiscs(AbstractDiscs):
 
     **Fields**: `position` (L, 3): points on the surface, metres; `radius` (L,): metres; `contact_impedance` (L,):
     ohm·m².
+
+    **Example:**
+
+    ```python
+    electrodes = SurfaceDiscs([[0.04, 0, 0.05], [-0.04, 0, 0.05]], radius=0.015, contact_impedance=1e-4)
+    electrodes.check(sleeve)
+    ```
     """
 
     position: Float[Array, "L 3"]

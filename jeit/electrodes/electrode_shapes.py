@@ -26,6 +26,13 @@ class CombinedElectrodes(AbstractCompleteElectrodes):
     """Complete electrodes of several kinds, numbered consecutively from one kind to the next.
 
     **Fields**: `parts`: the electrodes of each kind, not including point electrodes.
+
+    **Example:**
+
+    ```python
+    rim = BoundaryElectrodes(ring(0.1, 8), 0.01, 1e-3)
+    both = CombinedElectrodes(rim, SheetDiscs([[0.0, 0.0]], 0.02, 1e-4))
+    ```
     """
 
     parts: tuple[AbstractElectrodes, ...]
@@ -100,6 +107,13 @@ class ElectrodeShapes:
     **Fields**: `corners` (q, d): corners of all polygons in turn, metres, in space counter-clockwise as seen from
     outside; a dot has a single corner; `sizes` (p,): number of corners of each polygon; `electrode` (p,): index of the
     electrode that each polygon belongs to.
+
+    **Example:**
+
+    ```python
+    shapes = shapes_of(mesh, BoundaryElectrodes(ring(0.1, 16), 0.01, 1e-3))
+    shapes.number, shapes.middles
+    ```
     """
 
     corners: Float[np.ndarray, "q d"]
@@ -123,7 +137,19 @@ class ElectrodeShapes:
 
 
 def shapes_of(mesh: Mesh, electrodes: AbstractElectrodes) -> ElectrodeShapes:
-    """Polygons of `electrodes` on `mesh`: a solid, a surface in space or a plane mesh."""
+    """Polygons that draw electrodes on a mesh.
+
+    **Arguments:**
+
+    - `mesh`: a solid, a surface in space or a plane mesh.
+    - `electrodes`: the electrodes on it.
+
+    **Example:**
+
+    ```python
+    shapes_of(solid, plates(solid, ["left", "right"], 0.01)).polygons
+    ```
+    """
     polygons: list[np.ndarray] = []
     owner: list[int] = []
     for number, of_one in enumerate(_all_polygons(mesh, electrodes)):

@@ -96,9 +96,16 @@ def _cross(a: Float[Array, "*q 2"], b: Float[Array, "*q 2"]) -> Float[Array, "*q
 class FacetElectrodes(AbstractCompleteElectrodes):
     """Complete electrodes that cover whole boundary facets of a mesh; exact.
 
-    **Fields**: `covers` (b, L): 1 where electrode l covers boundary facet f, otherwise 0; `contact_impedance` (L,):
-    ohm·m² (ohm·m in 2-D). Create them from facet indices, from tags (`plates`), or from nodes
-    (`electrodes_from_nodes`).
+    **Arguments:** `mesh`: the mesh; `facets`: for each electrode, the indices of its boundary facets;
+    `contact_impedance`: one number or (L,), ohm·m² (ohm·m in 2-D). **Fields**: `covers` (b, L): 1 where electrode l
+    covers boundary facet f, otherwise 0; `contact_impedance` (L,): ohm·m² (ohm·m in 2-D). Create them from facet
+    indices, from tags (`plates`), or from nodes (`electrodes_from_nodes`).
+
+    **Example:**
+
+    ```python
+    electrodes = FacetElectrodes(mesh, [[0, 1], [10, 11]], contact_impedance=1e-3)
+    ```
     """
 
     covers: Float[Array, "b L"]
@@ -180,10 +187,21 @@ class FacetElectrodes(AbstractCompleteElectrodes):
 
 
 def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> FacetElectrodes:
-    """Electrodes that cover whole tagged faces of a mesh, for example `plates(box(…), ["left", "right"], 0.01)`.
+    """Electrodes that cover whole tagged faces of a mesh.
 
-    `tags`: names in `mesh.tags`, one for each electrode. `contact_impedance`: ohm·m² (2-D: ohm·m), one number or (L,).
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `tags`: names in `mesh.tags`, one for each electrode.
+    - `contact_impedance`: one number or (L,), ohm·m² (2-D: ohm·m).
+
     Raises `ValueError` for an unknown name.
+
+    **Example:**
+
+    ```python
+    electrodes = plates(solid, ["left", "right"], 0.01)
+    ```
     """
     for tag in tags:
         if tag not in mesh.tags:
@@ -196,8 +214,22 @@ def plates(mesh: Mesh, tags: Sequence[str], contact_impedance: ArrayLike) -> Fac
 def electrodes_from_nodes(mesh: Mesh, nodes: Sequence, contact_impedance: ArrayLike) -> FacetElectrodes:
     """Complete electrodes given by nodes: each covers the boundary facets whose nodes all belong to it.
 
-    `nodes`: for each electrode, its node indices, counted from 0. `contact_impedance` as in `FacetElectrodes`. For
-    electrodes with one node each use `NodeElectrodes`. Raises `ValueError` if an electrode covers no facet.
+    For electrodes with one node each use `NodeElectrodes`.
+
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `nodes`: for each electrode, its node indices, counted from 0.
+    - `contact_impedance`: one number or (L,), ohm·m² (ohm·m in 2-D).
+
+    Raises `ValueError` if an electrode covers no facet.
+
+    **Example:**
+
+    ```python
+    ends = [sheet.facets[sheet.tags[side]].ravel() for side in ("left", "right")]
+    electrodes = electrodes_from_nodes(sheet, ends, 1e-3)
+    ```
     """
     if not has_values(mesh.facets):
         raise ValueError("electrodes_from_nodes needs a mesh with values, not one that is being traced.")

@@ -31,6 +31,13 @@ class PointElectrodes(AbstractPointElectrodes):
     potential of a point source is singular, so voltages at driven electrodes depend on the mesh.
 
     **Fields**: `position` (L, d): metres.
+
+    **Example:**
+
+    ```python
+    electrodes = PointElectrodes(ring(0.05, 8))
+    electrodes.check(mesh)
+    ```
     """
 
     position: Float[Array, "L d"]
@@ -98,6 +105,13 @@ class NodeElectrodes(AbstractPointElectrodes):
     """Point electrodes at nodes of a mesh, as in imported models; exact.
 
     **Fields**: `nodes` (L,): indices into `mesh.points`.
+
+    **Example:**
+
+    ```python
+    electrodes = NodeElectrodes([0, 5, 10, 15])
+    electrodes.num_electrodes
+    ```
     """
 
     nodes: Int[Array, " L"]

@@ -1,7 +1,8 @@
 from .bisection import bisect, cut
-from .cell_quality import quality
+from .cell_quality import Quality, quality
 from .files import read, write
 from .generate.refine import Refine
+from .geodesic import Geodesics, SurfacePlaces, Triangles, Unfolding, Unrolled, unfold, unroll
 from .geometry import centroids, check_flat, gradients, measures, normals
 from .gmsh import from_gmsh
 from .mesh import Mesh
@@ -15,12 +16,18 @@ __all__ = [
     "Body",
     "Disk",
     "Domain",
+    "Geodesics",
     "Mesh",
     "OwnMesh",
     "Polygon",
+    "Quality",
     "Rectangle",
     "Refine",
     "Solid",
+    "SurfacePlaces",
+    "Triangles",
+    "Unfolding",
+    "Unrolled",
     "bend",
     "bisect",
     "box",
@@ -45,5 +52,7 @@ __all__ = [
     "sphere",
     "surface_of",
     "tube",
+    "unfold",
+    "unroll",
     "write",
 ]

@@ -31,11 +31,23 @@ _BISECTION_STEPS = 30
 def bisect(mesh: Mesh, size: Callable[[Float[np.ndarray, "m k s"]], Float[np.ndarray, " m"]]) -> Mesh:
     """Refine a mesh until no cell's longest edge exceeds the length that `size` allows.
 
-    `size` takes the corners of cells (m, k, s), metres, and returns the maximum length of the longest edge of each cell
-    (m,), metres; infinity leaves a cell as it is. Neighbouring cells are divided as needed to keep the mesh conforming.
-    Tags are kept, and the boundary keeps its shape.
+    Neighbouring cells are divided as needed to keep the mesh conforming. Tags are kept, and the boundary keeps its
+    shape.
+
+    **Arguments:**
+
+    - `mesh`: the mesh to refine.
+    - `size`: function of the corners of cells (m, k, s), metres, that returns the maximum length of the longest edge of
+      each cell (m,), metres; infinity leaves a cell as it is.
 
     Raises `ValueError` if `size` does not return one positive number per cell, or asks for more than 2,000,000 nodes.
+
+    **Example:**
+
+    ```python
+    near = lambda corners: np.where(corners[..., 0].mean(axis=1) > 0.05, 0.01, np.inf)
+    bisect(mesh, near).num_cells
+    ```
     """
     return bisect_with_parents(mesh, size)[0]
 
@@ -74,10 +86,23 @@ def bisect_with_parents(mesh: Mesh, size: Callable[..., Float[np.ndarray, " m"]]
 def cut(mesh: Mesh, level: Callable[[Float[np.ndarray, "n s"]], Float[np.ndarray, " n"]]) -> Mesh:
     """Divide the cells of a mesh along the surface on which `level` is zero, so that no cell lies on both sides of it.
 
-    `level` takes points (n, s), metres, and returns one number per point (n,). Nodes near the surface are moved onto
-    it, except nodes of the boundary. Cells should be small relative to the body that the surface bounds (see `bisect`).
+    Nodes near the surface are moved onto it, except nodes of the boundary. Cells should be small relative to the body
+    that the surface bounds (see `bisect`).
+
+    **Arguments:**
+
+    - `mesh`: the mesh to divide.
+    - `level`: function of points (n, s), metres, that returns one number per point (n,), negative on one side of the
+      surface and positive on the other.
 
     Raises `ValueError` if `level` does not return one finite number per point.
+
+    **Example:**
+
+    ```python
+    circle = lambda points: np.hypot(points[:, 0], points[:, 1]) - 0.05
+    cut(mesh, circle).num_cells
+    ```
     """
     division, value = _move_nodes_onto(_SplitMesh.from_mesh(mesh), level)
     while True:

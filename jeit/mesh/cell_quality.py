@@ -19,10 +19,17 @@ from jeit_solvers.module import Module
 class Quality(Module):
     """Shape measures of a mesh, as NumPy arrays with one entry per cell.
 
-    **Fields**: `smallest_angle` (m,): the smallest angle of a triangle, or the smallest angle between two faces of a
-    tetrahedron, degrees; `radius_ratio` (m,): d times the radius of the inscribed circle or sphere divided by the
-    radius of the circumscribed one, from 0 for a flat cell to 1 for a regular one; `shortest_edge`, `longest_edge`
-    (m,): lengths in metres.
+    **Fields**: `dimension`: 2 for triangles, 3 for tetrahedra; `num_points`: number of nodes; `smallest_angle` (m,):
+    the smallest angle of a triangle, or the smallest angle between two faces of a tetrahedron, degrees; `radius_ratio`
+    (m,): d times the radius of the inscribed circle or sphere divided by the radius of the circumscribed one, from 0
+    for a flat cell to 1 for a regular one; `shortest_edge`, `longest_edge` (m,): lengths in metres.
+
+    **Example:**
+
+    ```python
+    found = quality(mesh)
+    found.smallest_angle.min(), found.radius_ratio.mean()
+    ```
     """
 
     dimension: int
@@ -42,7 +49,18 @@ class Quality(Module):
 
 
 def quality(mesh: Mesh) -> Quality:
-    """Compute shape measures of every cell of a mesh; see `Quality`."""
+    """Compute shape measures of every cell of a mesh.
+
+    **Arguments:**
+
+    - `mesh`: any mesh.
+
+    **Example:**
+
+    ```python
+    print(quality(mesh))
+    ```
+    """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     corners = points[cells]
     first, second = np.triu_indices(mesh.dimension + 1, 1)

@@ -211,16 +211,26 @@ def read(path: str | Path, *, scale: float = 1.0, trusted: bool = False) -> Mesh
     a surface in space from one of these formats or from a scan or CAD file (.stl, .obj; for .step see
     `jeit.mesh.from_gmsh`).
 
-    `scale` is the length of the file's unit in metres: 1e-3 for millimetres, 0.0254 for inches. Groups of boundary
-    facets (Gmsh's physical groups, or meshio's cell sets) become tags. Groups without boundary facets and nodes without
-    cells are omitted. A flat mesh in a plane z = constant becomes 2-D; other triangles become a surface in space. In
-    .stl and .obj files, coincident nodes are merged.
+    Groups of boundary facets (Gmsh's physical groups, or meshio's cell sets) become tags. Groups without boundary
+    facets and nodes without cells are omitted. A flat mesh in a plane z = constant becomes 2-D; other triangles become
+    a surface in space. In .stl and .obj files, coincident nodes are merged.
 
-    By default only the file itself is read, within the memory limit (environment variable JEIT_FILE_GB). If `trusted`,
-    all formats of meshio are read, without checks, including files that the file refers to.
+    **Arguments:**
+
+    - `path`: the file.
+    - `scale`: length of the file's unit in metres: 1e-3 for millimetres, 0.0254 for inches.
+    - `trusted`: whether to read all formats of meshio without checks, including files that the file refers to. By
+      default only the file itself is read, within the memory limit (environment variable JEIT_FILE_GB).
 
     Raises `FileNotFoundError` if the file does not exist, and `ValueError` if it is not a mesh file, refers to other
     files, contains cells other than linear triangles or tetrahedra, or a mesh that `Mesh.create` rejects.
+
+    **Example:**
+
+    ```python
+    write(mesh, "tank.msh")
+    tank = read("tank.msh")
+    ```
     """
     path = Path(path)
     if not path.is_file():
@@ -248,11 +258,25 @@ def write(
     cell_data: Mapping[str, ArrayLike] | None = None,
     point_data: Mapping[str, ArrayLike] | None = None,
 ) -> None:
-    """Write a mesh, with values per cell (m, …) and per node (n, …), in the format given by the file name's extension.
+    """Write a mesh with its tags, or with values on it, in the format given by the file name's extension.
 
     `.msh` files (Gmsh 2.2) keep the tags, as physical groups, and values per node, but not values per cell; other
-    formats keep both kinds of values, but not the tags. Plane meshes are written at z = 0. Raises `ValueError` for an
-    unknown format, and for data of the wrong length or complex data.
+    formats keep both kinds of values, but not the tags. Plane meshes are written at z = 0.
+
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `path`: the file; its extension gives the format.
+    - `cell_data`: values per cell (m, …), by name.
+    - `point_data`: values per node (n, …), by name.
+
+    Raises `ValueError` for an unknown format, and for data of the wrong length or complex data.
+
+    **Example:**
+
+    ```python
+    write(mesh, "tank.vtu", cell_data={"conductivity": np.ones(mesh.num_cells)})
+    ```
     """
     path = Path(path)
     points = np.asarray(mesh.points, dtype=float)

@@ -15,8 +15,19 @@ from jeit_solvers.engines import either_engine, has_values, namespace
 
 
 def check_flat(mesh: Mesh, what: str) -> None:
-    """Raise `ValueError` for a surface in space. `what`: a plural noun, such as "rasters", for what requires a flat
-    sheet or a solid."""
+    """Raise `ValueError` for a surface in space.
+
+    **Arguments:**
+
+    - `mesh`: any mesh.
+    - `what`: what requires a flat sheet or a solid, a plural noun for the message, such as "rasters".
+
+    **Example:**
+
+    ```python
+    check_flat(mesh, "rasters")
+    ```
+    """
     if mesh.is_surface:
         raise ValueError(
             f"mesh is a surface in space, and {what} are of flat sheets and solids; take the flat sheet that it was "
@@ -26,7 +37,18 @@ def check_flat(mesh: Mesh, what: str) -> None:
 
 @either_engine
 def measures(mesh: Mesh) -> Float[Array, " m"]:
-    """Area in m² (2-D) or volume in m³ (3-D) of every cell (m,); positive for a valid mesh."""
+    """Area in m² (2-D) or volume in m³ (3-D) of every cell (m,); positive for a valid mesh.
+
+    **Arguments:**
+
+    - `mesh`: any mesh.
+
+    **Example:**
+
+    ```python
+    area = measures(mesh).sum()
+    ```
+    """
     corners = mesh.points[mesh.cells]
     edges = corners[:, 1:] - corners[:, :1]
     xp = namespace(mesh.points)
@@ -46,6 +68,17 @@ def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
     are the columns of E⁻¹, and the gradient of φ_0 is minus their sum. E⁻¹ is computed from cross products of edges
     divided by the determinant. On a triangle in space with edges a, b and normal n = a × b, the gradients lie in its
     plane: ∇φ_1 = b × n / |n|² and ∇φ_2 = n × a / |n|².
+
+    **Arguments:**
+
+    - `mesh`: any mesh.
+
+    **Example:**
+
+    ```python
+    potential = mesh.points[:, 0]  # a potential that rises along x
+    field = -np.einsum("mks,mk->ms", gradients(mesh), potential[mesh.cells])
+    ```
     """
     xp = namespace(mesh.points)
     corners = mesh.points[mesh.cells]
@@ -72,7 +105,18 @@ def gradients(mesh: Mesh) -> Float[Array, "m k s"]:
 
 @either_engine
 def centroids(mesh: Mesh) -> Float[Array, "m s"]:
-    """Centroid (m, s) of every cell, in metres."""
+    """Centroid (m, s) of every cell, in metres.
+
+    **Arguments:**
+
+    - `mesh`: any mesh.
+
+    **Example:**
+
+    ```python
+    right = centroids(mesh)[:, 0] > 0
+    ```
+    """
     return mesh.points[mesh.cells].mean(axis=1)
 
 
@@ -81,6 +125,16 @@ def normals(mesh: Mesh) -> Float[Array, "m 3"]:
 
     For a plane mesh they are (0, 0, 1). Raises `ValueError` for a solid, which has normals on its facets but not its
     cells.
+
+    **Arguments:**
+
+    - `mesh`: a surface in space, or a plane mesh.
+
+    **Example:**
+
+    ```python
+    facing_up = normals(sleeve)[:, 2] > 0.5
+    ```
     """
     if mesh.dimension != 2:
         raise ValueError("mesh: a solid's cells have no normals; take those of its surface, surface_of(mesh).")

@@ -28,17 +28,26 @@ def from_gmsh(
     scale: float = 1.0,
     scripts: bool = False,
 ) -> Mesh:
-    """Mesh a geometry with Gmsh.
+    """Mesh a geometry with Gmsh (extra `mesh`). Physical groups of the boundary become tags.
 
-    **Arguments**: `source`: a geometry file (.step, .iges, .brep, .stl), an outline such as `Disk`, or None for the
-    current model of the `gmsh` module; `cell_size`: maximum edge length, in the unit of the geometry (metres for an
-    outline); `dimension`: 2 or 3, by default the dimension of the geometry; for a solid, 2 yields its surface in space;
-    `scale`: length of the geometry's unit in metres; `scripts`: whether to accept Gmsh scripts (.geo and all other
-    extensions), which can run any command and open any file, so only your own should be accepted. Physical groups of
-    the boundary become tags.
+    **Arguments:**
+
+    - `source`: a geometry file (.step, .iges, .brep, .stl), an outline such as `Disk`, or None for the current model of
+      the `gmsh` module.
+    - `cell_size`: maximum edge length, in the unit of the geometry (metres for an outline).
+    - `dimension`: 2 or 3, by default the dimension of the geometry; for a solid, 2 yields its surface in space.
+    - `scale`: length of the geometry's unit in metres.
+    - `scripts`: whether to accept Gmsh scripts (.geo and all other extensions). A script can run any command and open
+      any file, so accept only your own.
 
     Raises `ImportError` if the gmsh package or a system library that it needs is missing, `FileNotFoundError` if the
     file does not exist, and `ValueError` if Gmsh rejects the geometry, and for scripts unless `scripts` is True.
+
+    **Example:**
+
+    ```python
+    mesh = from_gmsh(Disk(0.1), cell_size=0.02)  # with gmsh
+    ```
     """
     if isinstance(source, (str, Path)) and not scripts and Path(source).suffix.lower() not in _GEOMETRY_FORMATS:
         raise ValueError(

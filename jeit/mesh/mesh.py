@@ -26,6 +26,13 @@ class Mesh(Module):
     normals (3-D), and in 2-D ordered head to tail, one loop after the other, the outer loop first; `tags`: names of
     groups of facets, with their indices into `facets`. Triangles in space form a surface: they are counter-clockwise as
     seen from outside, and `facets` has shape (0, 2) if the surface is closed.
+
+    **Example:**
+
+    ```python
+    square = Mesh.create([[0, 0], [1, 0], [1, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
+    square.num_cells, square.points
+    ```
     """
 
     points: Float[Array, "n s"]

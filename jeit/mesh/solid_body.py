@@ -20,6 +20,18 @@ class Solid(Body):
     """An upright solid above a plane outline, from z = 0 to `thickness` metres: a tank, a box, a layer.
 
     `Solid(Disk(radius), height)` is a cylinder, `Solid(Rectangle(width, depth), height)` a box.
+
+    **Arguments:**
+
+    - `outline`: outline of the base.
+    - `thickness`: height in metres, positive.
+
+    **Example:**
+
+    ```python
+    tank = Solid(Disk(0.14), 0.05)
+    tank.mesh(num_points=800)
+    ```
     """
 
     outline: Domain
@@ -58,7 +70,19 @@ class Solid(Body):
 
 
 class OwnMesh(Body):
-    """A body given as a mesh, which is used without remeshing."""
+    """A body given as a mesh, which is used without remeshing.
+
+    **Arguments:**
+
+    - `given`: the mesh.
+
+    **Example:**
+
+    ```python
+    body = OwnMesh(mesh)
+    body.extent
+    ```
+    """
 
     given: Mesh
 

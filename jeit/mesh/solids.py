@@ -26,19 +26,31 @@ def disk(
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh a disk of `radius` metres; its boundary nodes lie on the circle.
+    """Mesh a disk; its boundary nodes lie on the circle.
 
     Without refinement the mesh consists of concentric rings, and node 0 lies at angle 0. Otherwise it is unstructured,
-    and node 0 is the first boundary node counter-clockwise from angle 0.
+    and node 0 is the first boundary node counter-clockwise from angle 0. The mesh is a polygon inscribed in the circle:
+    with N boundary nodes, the relative deficit of its area is (2 π² / 3) / N². Every angle is at least 25°.
 
-    **Arguments**: `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in
-    metres; `centre` (x, y): in metres; `refine`: one or several `Refine`, or a function that takes points (p, 2) and
-    returns the requested edge lengths there (p,) in metres, which are scaled by a common factor if `num_points` is
-    given; `num_boundary`: number of nodes on the circle, from which cells grow inwards; `boundary_points`: angles in
-    radians at which nodes are placed; `interior_points` (k, 2): positions in metres at which nodes are placed.
+    **Arguments:**
 
-    The mesh is a polygon inscribed in the circle: with N boundary nodes, the relative deficit of its area is (2 π² / 3)
-    / N². Every angle is at least 25°. Raises `ValueError` for invalid or contradictory arguments.
+    - `radius`: in metres.
+    - `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in metres.
+    - `centre` (x, y): in metres.
+    - `refine`: one or several `Refine`, or a function that takes points (p, 2) and returns the requested edge lengths
+      there (p,) in metres, which are scaled by a common factor if `num_points` is given.
+    - `num_boundary`: number of nodes on the circle, from which cells grow inwards.
+    - `boundary_points`: angles in radians at which nodes are placed.
+    - `interior_points` (k, 2): positions in metres at which nodes are placed.
+
+    Raises `ValueError` for invalid or contradictory arguments.
+
+    **Example:**
+
+    ```python
+    mesh = disk(0.14, num_points=300)
+    mesh.num_points, mesh.num_cells
+    ```
     """
     return Disk(radius, centre).mesh(
         num_points=num_points,
@@ -61,11 +73,25 @@ def rectangle(
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh a rectangle of `width` (along x) by `height` (along y) metres.
+    """Mesh a rectangle.
 
     Without refinement the mesh consists of rows of nearly equilateral cells. Node 0 is the lower left corner. The sides
-    are tagged 'left', 'right', 'bottom', 'top'. `boundary_points` are arc lengths in metres, counter-clockwise from the
-    lower left corner; the other arguments and the errors raised are those of `disk`.
+    are tagged 'left', 'right', 'bottom', 'top'.
+
+    **Arguments:**
+
+    - `width`, `height`: lengths along x and along y, metres.
+    - `num_points`, `cell_size`, `centre`, `refine`, `interior_points`: as in `disk`.
+    - `boundary_points`: arc lengths in metres, counter-clockwise from the lower left corner, at which nodes are placed.
+
+    Raises `ValueError` for invalid or contradictory arguments.
+
+    **Example:**
+
+    ```python
+    sheet = rectangle(0.2, 0.1, num_points=300)
+    sheet.tags["left"]
+    ```
     """
     return Rectangle(width, height, centre).mesh(
         num_points=num_points,
@@ -86,13 +112,26 @@ def polygon(
     boundary_points: ArrayLike | None = None,
     interior_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh the inside of a simple polygon with `vertices` (k, 2) in metres, without its `holes`.
+    """Mesh the inside of a simple polygon.
 
-    The vertices are nodes, the first vertex is node 0. Every angle is at least 25°, except at sharper corners of the
-    polygon, each of which is cut off by a single isosceles cell. `boundary_points` are arc lengths in metres along the
-    outer outline, counter-clockwise from the first vertex; the other arguments are those of `disk`.
+    The vertices are nodes, and the first vertex is node 0. Every angle is at least 25°, except at sharper corners of
+    the polygon, each of which is cut off by a single isosceles cell.
+
+    **Arguments:**
+
+    - `vertices` (k, 2): corners of the outer edge, metres.
+    - `holes`: corners (h, 2) of each hole, metres.
+    - `num_points`, `cell_size`, `refine`, `interior_points`: as in `disk`.
+    - `boundary_points`: arc lengths in metres along the outer outline, counter-clockwise from the first vertex, at
+      which nodes are placed.
 
     Raises `ValueError` for an outline that is not simple, and for invalid or contradictory arguments.
+
+    **Example:**
+
+    ```python
+    triangle = polygon([[0, 0], [0.2, 0], [0.1, 0.15]], num_points=150)
+    ```
     """
     return Polygon(vertices, holes).mesh(
         num_points=num_points,
@@ -135,16 +174,30 @@ _RENAMED_TAGS = {"bottom": "front", "top": "back"}
 
 
 def layer(mesh: Mesh, thickness: float, num_layers: int = 1, *, heights: ArrayLike | None = None) -> Mesh:
-    """Extrude a plane mesh to a plate from z = 0 to `thickness` metres; each prism is divided into three tetrahedra.
+    """Extrude a plane mesh to a plate from z = 0 to `thickness`; each prism is divided into three tetrahedra.
 
     Node k · n + i is node i of the plane mesh at the height z = k · thickness / num_layers, or at the k-th of
-    `heights`, which rise from 0 to the thickness. Tags: 'bottom' (z = 0), 'top' (z = thickness), 'side', and the tags
-    of the plane mesh for the parts of the side above its edges; tags 'bottom' and 'top' of the plane mesh are renamed
-    to 'front' and 'back'.
+    `heights`. Tags: 'bottom' (z = 0), 'top' (z = thickness), 'side', and the tags of the plane mesh for the parts of
+    the side above its edges; tags 'bottom' and 'top' of the plane mesh are renamed to 'front' and 'back'. Every prism
+    is divided along the diagonals that rise from its lower-numbered to its higher-numbered node, so that the tetrahedra
+    of neighbouring prisms match.
 
-    Every prism is divided along the diagonals that rise from its lower-numbered to its higher-numbered node, so that
-    the tetrahedra of neighbouring prisms match. Raises `ValueError` for a mesh that is not plane, a thickness that is
-    not positive, no layers, or heights that do not rise from 0 to the thickness.
+    **Arguments:**
+
+    - `mesh`: a plane mesh.
+    - `thickness`: in metres.
+    - `num_layers`: number of layers of prisms.
+    - `heights` (num_layers + 1,): heights of the nodes in metres, from 0 to the thickness, instead of equal layers.
+
+    Raises `ValueError` for a mesh that is not plane, a thickness that is not positive, no layers, or heights that do
+    not rise from 0 to the thickness.
+
+    **Example:**
+
+    ```python
+    plate = layer(sheet, 0.01, num_layers=2)
+    plate.tags["top"]
+    ```
     """
     if mesh.is_surface:
         raise ValueError(
@@ -201,12 +254,25 @@ def box(
     num_layers: int | None = None,
     refine: Refinement = None,
 ) -> Mesh:
-    """Mesh a box of `width` (x) by `depth` (y) by `height` (z) metres, centred at x = y = 0, from z = 0 up.
+    """Mesh a box of `width` by `depth` by `height`, centred at x = y = 0, from z = 0 up.
 
-    Give `num_points`, the number of nodes (default 4,000, met within about 10 %), or `cell_size` in metres;
-    `num_layers` along z is derived from them unless given. `refine` is that of `jeit.mesh.disk`, as seen from above.
-    Tags: 'left', 'right' (across x), 'front', 'back' (across y), 'bottom', 'top' (across z), and 'side'. Raises
-    `ValueError` for invalid or contradictory arguments.
+    Tags: 'left', 'right' (across x), 'front', 'back' (across y), 'bottom', 'top' (across z), and 'side'.
+
+    **Arguments:**
+
+    - `width`, `depth`, `height`: lengths along x, y and z, metres.
+    - `num_points`: number of nodes, met within about 10 % (default 4,000); or `cell_size`: edge length in metres.
+    - `num_layers`: number of layers along z, by default derived from these.
+    - `refine`: as in `disk`, as seen from above.
+
+    Raises `ValueError` for invalid or contradictory arguments.
+
+    **Example:**
+
+    ```python
+    solid = box(0.2, 0.1, 0.05, num_points=500)
+    solid.tags["top"]
+    ```
     """
     width, depth = check_length("width", width), check_length("depth", depth)
     height = check_length("height", height)
@@ -227,12 +293,25 @@ def cylinder(
     num_boundary: int | None = None,
     boundary_points: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh an upright cylinder of `radius` and `height` metres around the z axis, from z = 0 up.
+    """Mesh an upright cylinder around the z axis, from z = 0 up.
 
-    Give `num_points`, the number of nodes (default 4,000, met within about 10 %), or `cell_size` in metres;
-    `num_layers` along z is derived from them unless given. `refine`, `num_boundary` and `boundary_points` (angles) are
-    those of `jeit.mesh.disk`, as seen from above. Tags: 'bottom', 'top', 'side'. Raises `ValueError` for invalid or
-    contradictory arguments.
+    Tags: 'bottom', 'top', 'side'.
+
+    **Arguments:**
+
+    - `radius`, `height`: in metres.
+    - `num_points`: number of nodes, met within about 10 % (default 4,000); or `cell_size`: edge length in metres.
+    - `num_layers`: number of layers along z, by default derived from these.
+    - `refine`, `num_boundary`, `boundary_points` (angles): as in `disk`, as seen from above.
+
+    Raises `ValueError` for invalid or contradictory arguments.
+
+    **Example:**
+
+    ```python
+    tank = cylinder(0.14, 0.05, num_points=800)
+    tank.num_cells
+    ```
     """
     radius, height = check_length("radius", radius, 2), check_length("height", height)
     base_points, layers = choose_layers(np.pi * radius**2, height, num_points, cell_size, num_layers)

@@ -73,6 +73,13 @@ class Refine(Module):
     ratio of the background cell size to that at the points, at least 1; `growth`: increase of the edge length per
     length, at most 1 (default 0.35; above 0.7 cells are visibly stretched); `distance`: distance in metres within which
     cells keep their smallest size.
+
+    **Example:**
+
+    ```python
+    ends = [[0.1, 0.0], [0.0, 0.1]]
+    graded = disk(0.1, num_points=300, refine=Refine(ends, factor=4))
+    ```
     """
 
     points: np.ndarray | None

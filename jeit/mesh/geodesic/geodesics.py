@@ -55,6 +55,13 @@ class Geodesics(Module):
     **Fields**: `surface`: the triangles; `corners`: their corners; `curvature` (n,): Gaussian curvature at the nodes,
     1/m²; `touching` (6 m,): corners grouped by the nodes of their opposite sides, the group of node i being
     `touching[first[i]:first[i + 1]]`; `first` (n + 1,): bounds of the groups.
+
+    **Example:**
+
+    ```python
+    paths = Geodesics.create(sleeve)
+    paths.distances(sleeve.points[:2])
+    ```
     """
 
     surface: Triangles

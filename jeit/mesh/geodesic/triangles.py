@@ -19,6 +19,13 @@ class SurfacePlaces(Module):
 
     **Fields**: `triangle` (p,): index of the triangle; `weights` (p, 3): barycentric coordinates in it; `points` (p,
     3): positions, metres; `away` (p,): distance of the originally given point from the surface, metres.
+
+    **Example:**
+
+    ```python
+    places = Triangles.of(sleeve).nearest([[0.05, 0.0, 0.05]])
+    places.points, places.away
+    ```
     """
 
     triangle: Int[np.ndarray, " p"]
@@ -33,9 +40,17 @@ class SurfacePlaces(Module):
 
 
 class Triangles(Module):
-    """Triangles in space.
+    """Triangles of a surface in space, with the geometry that geodesics need; usually made of a mesh, by
+    `Triangles.of`.
 
     **Fields**: `points` (n, 3) metres; `cells` (m, 3), counter-clockwise as seen from outside.
+
+    **Example:**
+
+    ```python
+    surface = Triangles.of(sleeve)
+    surface.areas.sum(), surface.normals
+    ```
     """
 
     points: Float[np.ndarray, "n 3"]

@@ -34,6 +34,13 @@ class Unfolding(NamedTuple):
     in the plane of the triangle that contains each point; `place` (L, 2): position of each point in this plane;
     `reached` (L, m): whether a triangle is unfolded around a point; `exact` (L,): whether the reached triangles are
     developable and at most 128 triangles away.
+
+    **Example:**
+
+    ```python
+    around = unfold(sleeve, sleeve.points[:1], np.full((1, sleeve.num_cells), 0.02))
+    around.reached.sum(), around.exact
+    ```
     """
 
     corners: Float[Array, "m 3 2"]
@@ -55,8 +62,21 @@ class Unfolding(NamedTuple):
 
 
 def unfold(mesh: Mesh, places: Float[Array, "L 3"], max_distance: Float[Array, "L m"]) -> Unfolding:
-    """Unfold the triangles whose centroids lie within a straight distance of `max_distance` metres of points `places`
-    on the surface and which are connected to the point's own triangle."""
+    """Unfold the triangles around points on a surface into the plane: those whose centroids lie within a straight
+    distance of each point, and which are connected to the point's own triangle.
+
+    **Arguments:**
+
+    - `mesh`: a surface in space.
+    - `places` (L, 3): points on the surface, metres.
+    - `max_distance` (L, m): maximum distance from each point to the centroid of each triangle, metres.
+
+    **Example:**
+
+    ```python
+    around = unfold(sleeve, sleeve.points[:1], np.full((1, sleeve.num_cells), 0.02))
+    ```
+    """
     xp = namespace(mesh, places)
     corners = xp.asarray(mesh.points[mesh.cells])
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]

@@ -33,6 +33,13 @@ class Unrolled(Module):
     **Fields**: `surface`: the triangles in space; `cells` (m, 3): the triangles as indices of flat nodes, in which
     nodes on the cut occur twice; `points` (k, 2): flat nodes, metres; `nodes` (k,): node of the surface for each flat
     node; `stretch` (m, 2): minimum and maximum factor by which each triangle is stretched.
+
+    **Example:**
+
+    ```python
+    flat = unroll(sleeve)
+    flat.points, flat.stretch.max()
+    ```
     """
 
     surface: Triangles
@@ -75,10 +82,22 @@ class Unrolled(Module):
 
 
 def unroll(surface: Triangles | Mesh, face: str | None = None, *, cut: ArrayLike | None = None) -> Unrolled:
-    """Flatten a surface, or a `face` of a shell, as seen from outside.
+    """Flatten a surface, or a face of a shell, as seen from outside.
 
-    `cut`: a point (3,), metres, near which a sleeve is to be cut; by default, the side with the smallest x. Raises
-    `ValueError` as `Triangles.of` does, and for surfaces with handles or disconnected parts.
+    **Arguments:**
+
+    - `surface`: a surface in space, its triangles, or a shell.
+    - `face`: face of a shell, "inner" or "outer".
+    - `cut`: a point (3,), metres, near which a sleeve is to be cut; by default, the side with the smallest x.
+
+    Raises `ValueError` as `Triangles.of` does, and for surfaces with handles or disconnected parts.
+
+    **Example:**
+
+    ```python
+    flat = unroll(sleeve)
+    flat.points
+    ```
     """
     triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
     cells, nodes = _cut_to_disk(triangles, cut)

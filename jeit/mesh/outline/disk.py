@@ -21,7 +21,20 @@ from jeit_solvers.engines import as_array
 
 
 class Disk(Domain):
-    """A disk of given radius and centre, in metres; arc length starts at angle 0."""
+    """A disk of given radius and centre, in metres; arc length starts at angle 0.
+
+    **Arguments:**
+
+    - `radius`: in metres, positive.
+    - `centre` (x, y): in metres.
+
+    **Example:**
+
+    ```python
+    tank = Disk(0.1)
+    tank.area, tank.contains([[0.0, 0.0], [0.2, 0.0]])
+    ```
+    """
 
     radius: float
     centre: tuple[float, float]

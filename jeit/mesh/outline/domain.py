@@ -20,7 +20,15 @@ from jeit_solvers.module import Module
 
 class Body(Module):
     """Base of all bodies: plane outlines (`Domain`), solids above an outline (`Solid`), and given meshes
-    (`OwnMesh`)."""
+    (`OwnMesh`).
+
+    **Example:**
+
+    ```python
+    body: Body = Solid(Disk(0.1), 0.05)
+    body.mesh(num_points=500).num_cells
+    ```
+    """
 
     @property
     @abc.abstractmethod
@@ -66,6 +74,13 @@ class Domain(Body):
     Readers, layouts, rasters and mesh builders use only the methods defined here, so a new outline needs only one
     class. Arc length runs counter-clockwise along the outer edge. For outlines with straight sides, or approximated by
     chords, each method can be a single call of a function in `jeit.mesh.outline.polyline`; see `Polygon`.
+
+    **Example:**
+
+    ```python
+    outline: Domain = Rectangle(0.2, 0.1)
+    outline.boundary([0.0, outline.perimeter / 2])
+    ```
     """
 
     @property

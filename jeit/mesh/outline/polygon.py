@@ -21,7 +21,20 @@ from jeit_solvers.engines import as_array, has_values
 
 
 class Polygon(Domain):
-    """A simple polygon, possibly with holes, in metres; arc length starts at the first vertex."""
+    """A simple polygon, possibly with holes, in metres; arc length starts at the first vertex.
+
+    **Arguments:**
+
+    - `vertices` (k, 2): corners of the outer edge, metres.
+    - `holes`: corners (h, 2) of each hole, metres.
+
+    **Example:**
+
+    ```python
+    corner = Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0.1, 0.2], [0, 0.2]])
+    corner.mesh(num_points=200)
+    ```
+    """
 
     vertices: Float[Array, "k 2"]
     holes: tuple[Float[Array, "h 2"], ...]

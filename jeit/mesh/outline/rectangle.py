@@ -21,7 +21,20 @@ from jeit_solvers.engines import as_array, either_engine, has_values, namespace
 
 
 class Rectangle(Domain):
-    """A rectangle with sides along the axes, in metres; arc length starts at the lower left corner."""
+    """A rectangle with sides along the axes, in metres; arc length starts at the lower left corner.
+
+    **Arguments:**
+
+    - `width`, `height`: lengths along x and along y, metres, positive.
+    - `centre` (x, y): in metres.
+
+    **Example:**
+
+    ```python
+    skin = Rectangle(0.2, 0.1)
+    skin.vertices
+    ```
+    """
 
     width: float
     height: float

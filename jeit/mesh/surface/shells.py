@@ -18,10 +18,21 @@ from jeit.mesh.topology import odd_permutation
 
 
 def surface_of(mesh: Mesh, tag: str | None = None) -> Mesh:
-    """Extract the boundary triangles of a solid, all or those with one `tag`, as a surface in space that faces outward.
+    """Extract the boundary triangles of a solid as a surface in space that faces outward.
+
+    **Arguments:**
+
+    - `mesh`: a mesh of tetrahedra.
+    - `tag`: name in `mesh.tags` of the triangles to extract, by default all of the boundary.
 
     Raises `ValueError` for a mesh that is not a solid, an unknown tag, and triangles that do not form one surface: for
     a shell, choose 'inner' or 'outer'.
+
+    **Example:**
+
+    ```python
+    top = surface_of(solid, "top")
+    ```
     """
     if mesh.dimension != 3:
         raise ValueError("mesh: only solids have a boundary surface; this one consists of triangles.")
@@ -49,6 +60,16 @@ def node_normals(mesh: Mesh) -> np.ndarray:
     accurate to second order in the cell size, also at the border. At creases, and where there are too few neighbours,
     the normal is the angle-weighted mean of the normals of the triangles. Computed with NumPy, without derivatives.
     Raises `ValueError` for a solid.
+
+    **Arguments:**
+
+    - `mesh`: a surface in space, or a plane mesh.
+
+    **Example:**
+
+    ```python
+    outward = node_normals(sleeve)
+    ```
     """
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     facing = np.asarray(normals(mesh))
@@ -107,17 +128,30 @@ _LINE_TOLERANCE = 1e-12
 
 
 def bend(mesh: Mesh, radius: float, *, axis: str = "y", num_folds: int | None = None) -> Mesh:
-    """Bend a flat sheet around a cylinder of `radius` metres that touches the sheet from below along its middle.
+    """Bend a flat sheet around a cylinder that touches the sheet from below along its middle.
 
-    Like paper, the sheet is not stretched: it is folded along straight lines parallel to the cylinder's `axis` ("x" or
-    "y") and stays flat between them, so all lengths and all voltages are preserved. The folds run along the rows of
-    nodes if the mesh has rows (`jeit.mesh.rectangle` has them for axis "x"). Otherwise there are `num_folds` strips, by
-    default about one per cell across, and cells are cut where folds cross them; `bend(mesh, numpy.inf)` is the flat
-    sheet with the same cells. Fold lines lie on the cylinder. The upper side becomes the outer one; a negative `radius`
-    bends the sheet upward. Tags are kept.
+    Like paper, the sheet is not stretched: it is folded along straight lines parallel to the cylinder's axis and stays
+    flat between them, so all lengths and all voltages are preserved. The folds run along the rows of nodes if the mesh
+    has rows (`jeit.mesh.rectangle` has them for axis "x"). Otherwise there are `num_folds` strips, and cells are cut
+    where folds cross them; `bend(mesh, numpy.inf)` is the flat sheet with the same cells. Fold lines lie on the
+    cylinder. The upper side becomes the outer one. Tags are kept.
+
+    **Arguments:**
+
+    - `mesh`: a plane mesh.
+    - `radius`: radius of the cylinder in metres; a negative one bends the sheet upward.
+    - `axis`: direction of the cylinder, "x" or "y".
+    - `num_folds`: number of strips, by default about one per cell across.
 
     Raises `ValueError` for a mesh that is not a flat sheet, a radius of zero, and a sheet so wide that it would overlap
     itself.
+
+    **Example:**
+
+    ```python
+    bent = bend(sheet, 0.1)
+    bent.space_dimension
+    ```
     """
     if mesh.dimension != 2 or mesh.is_surface:
         raise ValueError("mesh: only a flat (2-D) sheet bends without stretching; this one is not flat.")
@@ -231,17 +265,30 @@ def shell(
     outward: bool = True,
     normals: ArrayLike | None = None,
 ) -> Mesh:
-    """Mesh a skin of `thickness` metres on a surface in space: prisms along the normals at the nodes, divided into
-    tetrahedra.
+    """Mesh a skin on a surface in space: prisms along the normals at the nodes, divided into tetrahedra.
 
-    Node k · n + i is node i of the surface displaced by k · thickness / num_layers, `outward`, or inward if that is
-    False. Tags: 'inner', 'outer' and, unless the surface is closed, 'side', and the tags of the surface for the parts
-    of the side. `normals` (n, 3): unit vectors at the nodes, if more accurate ones than those of
-    `jeit.mesh.node_normals` are known.
+    Node k · n + i is node i of the surface displaced by k · thickness / num_layers. Tags: 'inner', 'outer' and, unless
+    the surface is closed, 'side', and the tags of the surface for the parts of the side.
+
+    **Arguments:**
+
+    - `surface`: a surface in space.
+    - `thickness`: in metres.
+    - `num_layers`: number of layers of prisms.
+    - `outward`: whether the skin extends outward from the surface, or else inward.
+    - `normals` (n, 3): unit vectors at the nodes, if more accurate ones than those of `jeit.mesh.node_normals` are
+      known.
 
     Raises `ValueError` for a mesh that is not a surface in space, a thickness that is not positive, no layers, a shell
     that intersects itself, and a thickness at which prisms turn inside out, as they do beyond the radius of curvature;
     the message then states the position and the maximum thickness.
+
+    **Example:**
+
+    ```python
+    skin = shell(sleeve, 0.005)
+    skin.tags["outer"]
+    ```
     """
     if not surface.is_surface:
         raise ValueError("surface: this mesh is flat, and a shell needs a surface in space; use jeit.mesh.layer.")

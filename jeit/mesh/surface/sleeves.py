@@ -31,13 +31,24 @@ def tube(
     cell_size: float | None = None,
     num_around: int | None = None,
 ) -> Mesh:
-    """Mesh the lateral surface of an upright cylinder of `radius` and `height` metres around the z axis, from z = 0 up:
-    a sleeve, open at both ends.
+    """Mesh the lateral surface of an upright cylinder around the z axis, from z = 0 up: a sleeve, open at both ends.
 
-    Give `num_points`, the number of nodes (default 1,200, met within about 5 %), `cell_size` in metres, or
-    `num_around`, the number of nodes around the tube. Rows of nodes lie on the cylinder, alternately rotated by half
-    the distance of nodes; node 0 lies at angle 0. Tags: 'bottom', 'top'. For a part of a cylinder, bend a sheet with
-    `bend`. Raises `ValueError` for invalid or contradictory arguments.
+    Rows of nodes lie on the cylinder, alternately rotated by half the distance of nodes; node 0 lies at angle 0. Tags:
+    'bottom', 'top'. For a part of a cylinder, bend a sheet with `bend`.
+
+    **Arguments:**
+
+    - `radius`, `height`: in metres.
+    - `num_points`: number of nodes, met within about 5 % (default 1,200); or `cell_size`: edge length in metres; or
+      `num_around`: number of nodes around the tube.
+
+    Raises `ValueError` for invalid or contradictory arguments.
+
+    **Example:**
+
+    ```python
+    sleeve = tube(0.04, 0.2, num_points=300)
+    ```
     """
     radius, height = check_length("radius", radius), check_length("height", height)
     around, rows = _node_counts(2 * np.pi * radius, height, num_points, cell_size, num_around)
@@ -53,11 +64,24 @@ def forearm(
     cell_size: float | None = None,
     num_around: int | None = None,
 ) -> Mesh:
-    """Mesh a tapered sleeve around the z axis, from the `wrist` at z = 0 to the `elbow` at z = `length` metres.
+    """Mesh a tapered sleeve around the z axis, from the `wrist` at z = 0 to the `elbow` at z = `length`.
 
-    `wrist`, `elbow`: radius of a circular section in metres, or semi-axes (along x, along y) of an elliptical one; the
-    sections between are interpolated linearly. The other arguments are those of `tube`; nodes are evenly spaced around
-    each section. Tags: 'bottom', 'top'. Raises `ValueError` for invalid or contradictory arguments.
+    Sections between wrist and elbow are interpolated linearly, and nodes are evenly spaced around each section. Tags:
+    'bottom', 'top'.
+
+    **Arguments:**
+
+    - `length`: in metres.
+    - `wrist`, `elbow`: radius of a circular section in metres, or semi-axes (along x, along y) of an elliptical one.
+    - `num_points`, `cell_size`, `num_around`: as in `tube`.
+
+    Raises `ValueError` for invalid or contradictory arguments.
+
+    **Example:**
+
+    ```python
+    arm = forearm(0.2, 0.03, (0.045, 0.04), num_points=300)
+    ```
     """
     length = check_length("length", length)
     ends = np.stack([_semi_axes("wrist", wrist), _semi_axes("elbow", elbow)])
@@ -141,11 +165,23 @@ def _triangles_between_rings(low: np.ndarray, high: np.ndarray, ahead: int) -> n
 
 
 def sphere(radius: float, *, num_points: int | None = None, cell_size: float | None = None) -> Mesh:
-    """Mesh a closed sphere of `radius` metres around the origin.
+    """Mesh a closed sphere around the origin.
 
     Every triangle of an icosahedron is divided into k² triangles, which are projected onto the sphere. This makes 10 k²
-    + 2 nodes; k is chosen to come closest to `num_points` (default 1,200), or for edges of about `cell_size` metres.
+    + 2 nodes; k is chosen to come closest to what is requested.
+
+    **Arguments:**
+
+    - `radius`: in metres.
+    - `num_points`: number of nodes (default 1,200); or `cell_size`: edge length in metres.
+
     Raises `ValueError` for invalid or contradictory arguments.
+
+    **Example:**
+
+    ```python
+    ball = sphere(0.05, num_points=162)
+    ```
     """
     radius = check_length("radius", radius)
     target = unstructured.Target.create(num_points, cell_size)
@@ -182,12 +218,25 @@ def cap(
     cell_size: float | None = None,
     refine: Refinement = None,
 ) -> Mesh:
-    """Mesh the part of a sphere of `radius` metres around the origin within `angle` radians of its pole (0, 0, radius).
+    """Mesh the part of a sphere around the origin within `angle` of its pole (0, 0, radius).
 
     The mesh of a disk is laid onto the sphere so that distances from the pole are preserved; at the edge of a
-    hemisphere, cells are compressed along the edge by a factor of π/2. `num_points`, `cell_size` and `refine` are those
-    of `jeit.mesh.disk`, with positions (x, y) on the flat disk. Tag: 'edge'. Raises `ValueError` for invalid or
-    contradictory arguments.
+    hemisphere, cells are compressed along the edge by a factor of π/2. Tag: 'edge'.
+
+    **Arguments:**
+
+    - `radius`: radius of the sphere in metres.
+    - `angle`: angle from the pole to the edge, radians.
+    - `num_points`, `cell_size`, `refine`: as in `disk`, with positions (x, y) on the flat disk.
+
+    Raises `ValueError` for invalid or contradictory arguments.
+
+    **Example:**
+
+    ```python
+    dome = cap(0.1, np.pi / 3, num_points=200)
+    dome.is_surface
+    ```
     """
     radius = check_length("radius", radius)
     if not (isinstance(angle, float | int | np.floating) and 0 < angle < 0.95 * np.pi):

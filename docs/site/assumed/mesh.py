@@ -1,0 +1,8 @@
+import numpy as np
+
+from jeit.mesh import box, disk, rectangle, tube
+
+mesh = disk(0.1, num_points=200)
+sheet = rectangle(0.2, 0.1, num_points=200)
+sleeve = tube(0.04, 0.1, num_points=300)
+solid = box(0.2, 0.1, 0.05, num_points=300)
