@@ -10,7 +10,7 @@ from jeit.protocol import two_terminal
 
 key = jax.random.key(0)
 layout = named_layout("grid-4x2", Rectangle(0.1, 0.08))
-skin = Skin.create(layout, num_layers=2, cell_size=0.01)  # a layer
+skin = Skin.create(layout, num_layers=2, cell_size=0.008)  # a layer
 touches = touch_grid(skin.outline, 6, 5)
 
 sheet = Skin.create(layout, num_layers=0, num_points=300, protocol=two_terminal(8))
@@ -23,7 +23,7 @@ candidates = Candidates.from_factor(changes.T, objective.prior.factor, noise=1e-
 surface = tube(0.03, 0.08, num_points=250)
 placed = SurfaceLayout(spread(surface, 8, margin=0.02), 8e-3, surface, contact_impedance=1e-4)
 curved = Skin.create(placed, num_layers=0)
-curved_objective = Objective.create(curved, touch_grid(surface, 5, 5).places, correlation=0.02)
+curved_objective = Objective.create(curved, touch_grid(curved.outline, 5, 5).places, correlation=0.02)
 
 Path("skin.toml").write_text('[skin]\nmodel = "sheet"\n[electrodes]\nlayout = "grid-4x2"\n')
 Path("study.toml").write_text('[electrodes]\nlayouts = ["grid-4x2", "inner-8"]\n[touch]\ncolumns = 6\nrows = 6\n')

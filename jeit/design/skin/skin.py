@@ -62,7 +62,7 @@ class Skin(Module):
     **Example:**
 
     ```python
-    skin = Skin.create(layout, thickness=0.01, num_layers=2, cell_size=0.01)
+    skin = Skin.create(layout, thickness=0.01, num_layers=2, cell_size=0.008)
     changes = skin.voltage_changes(skin.touched_cells([(0.0, 0.0)], Bell(2e-3)))
     ```
     """
