@@ -274,7 +274,9 @@ def example(docstring: str) -> str:
 def parameters(thing: object) -> list[str]:
     """What a call of a function or class takes."""
     try:
-        return [one for one in inspect.signature(thing).parameters if one not in ("self", "cls")]  # type: ignore[arg-type]
+        return [
+            one for one in inspect.signature(thing).parameters if not one.startswith("_") and one not in ("self", "cls")
+        ]  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return []
 

@@ -14,16 +14,13 @@ from jeit.live import ConductivityView, LiveFrame, frames, simulated_tank
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import adjacent
 from jeit.touch import (
-    GestureModel,
     LearntSkin,
     NetworkPreset,
     Person,
     PressedSkin,
     Presses,
-    TouchImages,
-    TouchLevel,
     TrainingPlan,
-    find_touches,
+    learn_gestures,
     learn_images,
     material,
     simulate_gestures,
@@ -69,11 +66,7 @@ model = ForwardModel(Disk(0.1).mesh(num_points=200), electrodes, adjacent(8, cur
 skin = PressedSkin(key, model, material("velostat"))
 made = simulate_gestures(key, skin, Disk(0.1), [Person.draw(key)], 3, gestures=("tap", "push"), rate=30.0)
 untouched = made.untouched
-images = TouchImages.prepare(description, untouched, settings)
-level = TouchLevel.of_untouched(images.mesh, images.changes(untouched))
-courses = [(seconds, images.changes(voltages)) for seconds, voltages in map(made.recording, range(6))]
-touches = [find_touches(level, *course)[0] for course in courses]
-gestures = GestureModel.fit(touches, made.gesture, method="linear-svm", form="seven")
+gestures = learn_gestures(description, made, method="linear-svm", form="seven").model
 
 # A network that estimates depth.
 sheet = Skin.create(named_layout("grid-3x3", Rectangle(0.06, 0.06)), num_layers=0, cell_size=8e-3)

@@ -34,10 +34,23 @@ class MapQuality:
 
 
 def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
-    """Compute the quality of a map for frames (n, M), which may be those it was learnt from or others.
+    """Compute the quality of a self-organising map.
 
-    Trustworthiness is computed for at most 2,000 evenly spaced frames, with 12 neighbours of each. Raises `ValueError`
-    if `learnt` is no map, and for fewer than 25 frames, another number of channels, and NaN.
+    Trustworthiness is computed for at most 2,000 evenly spaced frames, with 12 neighbours of each.
+
+    **Arguments:**
+
+    - `learnt`: the map.
+    - `frames`: frames (n, M), those it was learnt from or others, in their unit.
+
+    Raises `ValueError` if `learnt` is no map, and for fewer than 25 frames, another number of channels, and NaN.
+
+    **Example:**
+
+    ```python
+    quality = map_quality(learnt_map, map_frames)
+    print(quality)
+    ```
     """
     trustworthiness = optional("sklearn.manifold", "the trustworthiness of a map").trustworthiness
 

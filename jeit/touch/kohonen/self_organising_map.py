@@ -31,6 +31,13 @@ class SelfOrganisingMap:
 
     **Fields**: `weights` (R, C, M): the frame of every neuron on a grid of R rows and C columns, in the unit of frames;
     `scale`: distance between a frame and a neuron at which the neuron's activity is 1/2, in the same unit.
+
+    **Example:**
+
+    ```python
+    learnt_map = SelfOrganisingMap.fit(map_frames, key, shape=(6, 6), schedule=MapSchedule(500, 500))
+    print(learnt_map.winners(map_frames[:3]))
+    ```
     """
 
     weights: Float[np.ndarray, "R C M"]

@@ -320,6 +320,13 @@ class NetworkPreset:
 
     **Fields**: `number`: number of training touches; `held_out`: number of held-out touches, and of test touches;
     `plan`: plan of every training; `three_stages`: plan for the design "three-stages" if it is another, otherwise None.
+
+    **Example:**
+
+    ```python
+    preset = NetworkPreset(20, 10, TrainingPlan(batch=10, epochs=1))
+    learnt_images = learn_images(sheet, "network", preset=preset)
+    ```
     """
 
     number: int
@@ -385,15 +392,31 @@ def learn_images(
     client: Any = None,
     progress: Callable[[str], None] | None = None,
 ) -> LearntImages:
-    """Simulate touches of a skin, train a network on them, and write it to `folder`, as `network.jeit`.
+    """Simulate touches of a skin, train a network on them, and write it to a folder, as `network.jeit`.
 
     If it is interrupted, the same call resumes: touches are stored in chunks in the folder `work`, and trainings in
-    checkpoints. `preset`: "quick", under two minutes, "full", or a `NetworkPreset`; `design`: "unrolled", a network
-    with the skin's forward model, or "three-stages", that of Park et al. 2022; `touches`: number of training touches,
-    by default that of the preset, limited only by the disk; `client`: client of a dask cluster for the simulation.
-    `progress` is called with a description of the progress. Raises `ValueError` for curved skins, unknown names, an
-    invalid number of touches, and a folder with work on another skin; `ImportError` without the extras `learn` and
-    `cluster`.
+    checkpoints.
+
+    **Arguments:**
+
+    - `skin`: the skin, which is flat.
+    - `folder`: the folder, which is created if needed.
+    - `preset`: "quick", under two minutes, "full", or a `NetworkPreset`.
+    - `design`: "unrolled", a network with the skin's forward model, or "three-stages", that of Park et al. 2022.
+    - `touches`: number of training touches, by default that of the preset, limited only by the disk.
+    - `seed`: random seed.
+    - `client`: client of a dask cluster for the simulation.
+    - `progress`: called with a description of the progress.
+
+    Raises `ValueError` for curved skins, unknown names, an invalid number of touches, and a folder with work on another
+    skin; `ImportError` without the extras `learn` and `cluster`.
+
+    **Example:**
+
+    ```python
+    preset = NetworkPreset(20, 10, TrainingPlan(batch=10, epochs=1))
+    learnt_images = learn_images(sheet, "network", preset=preset)
+    ```
     """
     need_extra("learn", "a network that images touches")
     need_extra("cluster", "a store of simulated touches")

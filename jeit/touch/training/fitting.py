@@ -25,12 +25,24 @@ _CHECKPOINT_BATCHES, _AT_ONCE = 32, 256
 
 
 class TrainingObjective(NamedTuple):
-    """The objective of a training; both functions are compiled.
+    """The objective of a training; its functions are compiled.
 
-    **Fields**: `loss(network, batch, key)`: returns the loss of a batch of rows, which is minimised, and the network,
-    in which leaves that are not trained, such as running means, may have changed; `held_out(network, batch)`: returns
-    the loss (b,) of each held-out row; `trained`: selects the leaves (arrays) of the network that are trained: a
-    function of a leaf that returns true or false, or a tree of booleans like the network, as in `equinox.filter`.
+    **Fields**
+
+    - `loss`: function of a network, a batch of rows and a random key, which returns the loss of the batch, which is
+      minimised, and the network, in which leaves that are not trained, such as running means, may have changed.
+    - `held_out`: function of a network and a batch of rows, which returns the loss (b,) of each held-out row.
+    - `trained`: selects the leaves (arrays) of the network that are trained: a function of a leaf that returns true or
+      false, or a tree of booleans like the network, as in `equinox.filter`.
+
+    **Example:**
+
+    ```python
+    objective = TrainingObjective(
+        loss=lambda network, batch, key: (jnp.mean((network * batch[0] - batch[1]) ** 2), network),
+        held_out=lambda network, batch: (network * batch[0] - batch[1]) ** 2,
+    )
+    ```
     """
 
     loss: Callable[[Any, Any, Array], tuple[Float[Array, ""], Any]]
@@ -47,6 +59,13 @@ class TrainingPlan:
     evaluations of the held-out rows, by default an epoch; `patience`: number of consecutive evaluations without
     improvement after which training stops; `seconds`: time between checkpoints, which may be exceeded by some dozen
     batches.
+
+    **Example:**
+
+    ```python
+    plan = TrainingPlan(rate=1e-2, batch=16, epochs=20, patience=5)
+    trained = fit_network(jnp.array(0.0), objective, rows, rows, plan, key=key)
+    ```
     """
 
     rate: float = 1e-3
@@ -96,14 +115,31 @@ def fit_network(
     checkpoint: str | Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> TrainingResult:
-    """Train a `network`, any tree of arrays and functions, on rows.
+    """Train a network by Adam with early stopping on held-out rows.
 
-    `training` and `validation`: arrays (n, …) in any tree, such as (inputs, targets); `training` may also be `Rows` of
-    many chunks. The same `key` gives identical results on the same machine. `checkpoint`: a file; if the training is
-    killed at any moment, the same call resumes from it, with results identical to those of an uninterrupted training;
-    the file remains after the training. `progress`: is called with a description of the progress after every evaluation
-    of the held-out rows. Raises `ValueError` for arguments that do not fit together, a checkpoint of another training,
-    and losses that are not finite from the first evaluation on; `ImportError` without the extra `learn`.
+    The same `key` gives identical results on the same machine.
+
+    **Arguments:**
+
+    - `network`: the network, any tree of arrays and functions.
+    - `objective`: its losses.
+    - `training`: arrays (n, …) in any tree, such as (inputs, targets), or `Rows` of many chunks.
+    - `validation`: the held-out rows, in the same form, but in memory.
+    - `plan`: settings of the training, by default `TrainingPlan()`.
+    - `key`: random key.
+    - `checkpoint`: a file; if the training is killed at any moment, the same call resumes from it, with results
+      identical to those of an uninterrupted training; the file remains after the training.
+    - `progress`: called with a description of the progress after every evaluation of the held-out rows.
+
+    Raises `ValueError` for arguments that do not fit together, a checkpoint of another training, and losses that are
+    not finite from the first evaluation on; `ImportError` without the extra `learn`.
+
+    **Example:**
+
+    ```python
+    trained = fit_network(jnp.array(0.0), objective, rows, rows, TrainingPlan(epochs=20), key=key)
+    print(trained.network)
+    ```
     """
     need_extra("learn", "training")
     check_key(key)

@@ -30,7 +30,17 @@ class AbstractIndenter(Module):
 
 
 class DiscIndenter(AbstractIndenter):
-    """The flat end of a cylinder with `diameter` in metres, such as of a weight."""
+    """The flat end of a cylinder, such as of a weight.
+
+    **Fields**: `diameter`: diameter, metres.
+
+    **Example:**
+
+    ```python
+    press = Press(DiscIndenter(0.01), load=2.0, position=(0.01, 0.02))
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     diameter: float
 
@@ -50,7 +60,17 @@ class DiscIndenter(AbstractIndenter):
 
 
 class RingIndenter(AbstractIndenter):
-    """The flat end of a tube with `outer_diameter` and `inner_diameter` in metres."""
+    """The flat end of a tube.
+
+    **Fields**: `outer_diameter`, `inner_diameter`: diameters, metres.
+
+    **Example:**
+
+    ```python
+    press = Press(RingIndenter(0.02, 0.014), load=2.0)
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     outer_diameter: float
     inner_diameter: float
@@ -78,8 +98,17 @@ class RingIndenter(AbstractIndenter):
 
 
 class BarIndenter(AbstractIndenter):
-    """A flat rectangle, such as the face of a cube or the edge of a ruler, with `length` along x and `width` along y in
-    metres."""
+    """A flat rectangle, such as the face of a cube or the edge of a ruler.
+
+    **Fields**: `length`: side along x, metres; `width`: side along y, metres.
+
+    **Example:**
+
+    ```python
+    press = Press(BarIndenter(0.03, 0.004), load=2.0, angle=0.5)
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     length: float
     width: float
@@ -101,8 +130,18 @@ class BarIndenter(AbstractIndenter):
 
 
 class PrismIndenter(AbstractIndenter):
-    """A prism that touches with an edge along x, like a roof upside down: `length` of the edge, `width` and `height` of
-    the triangular section, all in metres."""
+    """A prism that touches with an edge along x, like a roof upside down.
+
+    **Fields**: `length`: length of the edge, metres; `width`, `height`: width and height of the triangular section,
+    metres.
+
+    **Example:**
+
+    ```python
+    press = Press(PrismIndenter(0.03, 0.01, 0.008), load=1.0)
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     length: float
     width: float
@@ -127,8 +166,17 @@ class PrismIndenter(AbstractIndenter):
 
 
 class RevolvedIndenter(AbstractIndenter):
-    """A rigid body of revolution with the profile of an `indentation` of `jeit.design`, such as `Bell()`; its depth in
-    the skin follows from the load."""
+    """A rigid body of revolution; its depth in the skin follows from the load.
+
+    **Fields**: `indentation`: its profile, an indentation of `jeit.design`, such as `Bell()`.
+
+    **Example:**
+
+    ```python
+    press = Press(RevolvedIndenter(Bell(depth=5e-3, deviation=5e-3)), load=1.0)
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     indentation: AbstractIndentation
 
@@ -151,7 +199,21 @@ class RevolvedIndenter(AbstractIndenter):
 
 
 def ball_indenter(diameter: float) -> RevolvedIndenter:
-    """The lower half of a ball with `diameter` in metres. Raises `ValueError` for a diameter that is not positive."""
+    """The lower half of a ball.
+
+    **Arguments:**
+
+    - `diameter`: diameter of the ball, metres.
+
+    Raises `ValueError` for a diameter that is not positive.
+
+    **Example:**
+
+    ```python
+    press = Press(ball_indenter(0.015), load=2.0, position=(0.01, 0.02))
+    frames = skin.frames(key, [press])
+    ```
+    """
     check_metres("diameter", diameter)
     return RevolvedIndenter(Hemisphere(diameter / 2, diameter))
 
@@ -161,6 +223,13 @@ class DepthMapIndenter(AbstractIndenter):
 
     **Fields**: `height`: (rows, columns), height of the surface towards the skin in metres, NaN where there is no
     surface; row 0 is at the minimum y; `pixel`: side of a pixel in metres.
+
+    **Example:**
+
+    ```python
+    roof = -np.abs(np.linspace(-5e-3, 5e-3, 21))[:, None] * np.ones(21)
+    press = Press(DepthMapIndenter(roof, pixel=5e-4), load=1.0)
+    ```
     """
 
     height: Float[np.ndarray, "rows columns"]

@@ -167,8 +167,18 @@ _LEAST_SIDE = 0.06
 
 
 class Person(Module):
-    """A simulated person. **Fields**: `medians`: (6, 5), median of each of the `TRAITS` (columns) in touches of this
-    person, for each of the `GESTURES` (rows), in SI units."""
+    """A simulated person, who touches skins in a manner of their own.
+
+    **Fields**: `medians` (6, 5): median of each of the five traits (columns) in touches of this person, for each of the
+    six gestures (rows), in SI units.
+
+    **Example:**
+
+    ```python
+    person = Person.draw(key)
+    motion, times = person.touch(key, "stroke", outline)
+    ```
+    """
 
     medians: Float[np.ndarray, "6 5"]
 
