@@ -22,7 +22,35 @@ from jeit.inverse import one_step
 from jeit.layout import grid, named_layout, ring
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import adjacent
-from jeit.touch import *
+from jeit.touch import (
+    CellFinder,
+    DiscIndenter,
+    ImageNoise,
+    LabelledClips,
+    LearntSkin,
+    Listener,
+    MapSchedule,
+    MovingPress,
+    NetworkPreset,
+    Person,
+    PlacedMap,
+    Press,
+    PressedSkin,
+    Presses,
+    SelfOrganisingMap,
+    SkinHealth,
+    TouchImages,
+    TouchLevel,
+    TouchWatch,
+    TrainingObjective,
+    TrainingPlan,
+    find_contacts,
+    find_touches,
+    learn_gestures,
+    learn_images,
+    material,
+    simulate_gestures,
+)
 
 key = jax.random.key(0)
 

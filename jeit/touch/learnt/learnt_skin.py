@@ -69,7 +69,7 @@ class LearntSkin:
 
     ```python
     learnt = LearntSkin.fit(presses, method="neighbours")
-    print(learnt.predict(presses.frames).position)
+    print(learnt.predict(presses.frames, reference).position)
     ```
     """
 

@@ -408,7 +408,7 @@ class Touches:
     **Example:**
 
     ```python
-    found = learnt.predict(presses.frames[:3])
+    found = learnt.predict(presses.frames[:3], reference)
     print(isinstance(found, Touches), found.position, found.position_std)
     ```
     """

@@ -112,7 +112,7 @@ def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarra
 
     ```python
     for imaged in stream_depths(read_network("network"), [rest, rest], rest):
-        print(imaged.status)
+        print(imaged.number, imaged.reason)
     ```
     """
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
