@@ -85,7 +85,20 @@ class TableLayout:
 
 @dataclass(frozen=True)
 class Description:
-    """A checked description; its sections are explained in the docstring of the module."""
+    """A checked description of measured data, with the body, the electrodes and the protocol, as `load_description`
+    reads it from a TOML file. docs/data.md explains its sections.
+
+    **Fields**: `origin`: the file, for messages; `title`; `domain`: the body, or None; `electrodes`: the electrodes, or
+    None; `layout`: how a table holds the voltages; `notes`: assumptions, in sentences; `protocol_section`: the table
+    that describes the protocol; `uncertainty`: how accurately electrodes and body are known, or None.
+
+    **Example:**
+
+    ```python
+    description = load_description("tank6cm")
+    description.title, description.electrodes
+    ```
+    """
 
     origin: str
     title: str
@@ -159,7 +172,17 @@ class Description:
 def load_description(which: str | Path) -> Description:
     """Read a description from a TOML file, or by the name of a bundled one ("tank6cm").
 
+    **Arguments:**
+
+    - `which`: a TOML file, or the name of a bundled description.
+
     Raises `ValueError` with the section and key at fault.
+
+    **Example:**
+
+    ```python
+    description = load_description("tank6cm")
+    ```
     """
     if str(which) in BUNDLED:
         origin = f"{which}.toml"

@@ -23,15 +23,26 @@ from jeit.protocol.patterns import pair_patterns
 
 
 def write_table(measurement: Measurement, path: str | Path) -> tuple[Path, Path]:
-    """Write a measurement to `path` (.npz) and its description to a file of the same name (.toml); return both paths.
+    """Write a measurement to an NPZ file and its description to a TOML file of the same name; return both paths.
 
     The NPZ file holds `voltages` (F, M) in volts, `mask` (F, M), `frame_names`, `notes`, `times` (F,) in seconds if
     known, and the protocol: `drive` (S, L) in amperes, `measurement` (K, L), `drive_index` (M,), `measurement_index`
     (M,), `protocol_name`. The TOML file holds geometry, electrodes, protocol and uncertainty, so it also describes
     other tables of the same sensor. `read` restores the measurement.
 
+    **Arguments:**
+
+    - `measurement`: the measurement.
+    - `path`: the .npz file.
+
     Raises `ValueError` for another suffix, and for electrodes or bodies that a description cannot express (a mesh or an
     outline of your own, and electrodes on its facets).
+
+    **Example:**
+
+    ```python
+    write_table(pressed, "pressed.npz")
+    ```
     """
     file = Path(path)
     if file.suffix.lower() != ".npz":
@@ -110,11 +121,24 @@ def _toml(value) -> str:
 
 
 def from_pyeit(mesh: Any, protocol: Any, *, current: float = 1.0) -> ForwardModel:
-    """The forward model of a mesh and a protocol of pyEIT (`pyeit.mesh.PyEITMesh`, `pyeit.eit.protocol.PyEITProtocol`):
-    point electrodes, drive and measurement pairs in the same order.
+    """The forward model of a mesh and a protocol of pyEIT: point electrodes, drive and measurement pairs in the same
+    order. With the conductivity `mesh.perm`, voltages are those of `EITForward.solve_eit`.
 
-    `current`: amplitude, amperes; pyEIT drives 1 A. With the conductivity `mesh.perm`, voltages are those of
-    `EITForward.solve_eit`. Raises `ValueError` for objects without the fields of these classes, and as `Mesh.create`.
+    **Arguments:**
+
+    - `mesh`: a `pyeit.mesh.PyEITMesh`.
+    - `protocol`: a `pyeit.eit.protocol.PyEITProtocol`.
+    - `current`: amplitude, amperes; pyEIT drives 1 A.
+
+    Raises `ValueError` for objects without the fields of these classes, and as `Mesh.create`.
+
+    **Example:**
+
+    ```python
+    import pyeit.mesh as shapes  # with pyeit
+    from pyeit.eit.protocol import create
+    model = from_pyeit(shapes.create(16), create(16))
+    ```
     """
     fields = {"mesh": (mesh, ("node", "element", "el_pos")), "protocol": (protocol, ("ex_mat", "meas_mat"))}
     for name, (given, needed) in fields.items():
@@ -136,10 +160,22 @@ def from_eidors(path: str | Path, variable: str | None = None) -> ForwardModel:
     """The forward model of a `fwd_model` of EIDORS, saved by `save('tank.mat', 'fwd_model', '-v7')`: nodes, elements,
     electrodes with their contact impedances, and stimulation with its signs.
 
-    `variable`: its name in the file, of a `fwd_model` or of a model or image that has one; by default the only such
-    variable. Electrodes of one node are point electrodes. Files are read by SciPy; take them from people you trust.
-    Lengths are those of the file, in metres. Raises `ValueError` for files without a model, and for electrodes of no
-    boundary facets.
+    Electrodes of one node are point electrodes. Files are read by SciPy; take them from people you trust. Lengths are
+    those of the file, in metres.
+
+    **Arguments:**
+
+    - `path`: the .mat file.
+    - `variable`: name in the file of a `fwd_model`, or of a model or image that has one; by default the only such
+      variable.
+
+    Raises `ValueError` for files without a model, and for electrodes of no boundary facets.
+
+    **Example:**
+
+    ```python
+    model = from_eidors("tank.mat")  # with tank.mat
+    ```
     """
     check_kind("path", path, (str, Path), "the name of a .mat file")
     file = Path(path)

@@ -24,6 +24,17 @@ def join(measurements: Sequence[Measurement]) -> Measurement:
 
     The body, the electrodes and the notes are taken from the first measurement. Raises `ValueError` for an empty
     sequence, and if two measurements have different protocols.
+
+    **Arguments:**
+
+    - `measurements`: of the same set-up.
+
+    **Example:**
+
+    ```python
+    both = join([rest, pressed])
+    both.num_frames
+    ```
     """
     if not measurements:
         raise ValueError("measurements: there is none; give at least one.")
@@ -52,7 +63,15 @@ _FRAMES, _TIMES = ("voltages", "frames"), ("seconds", "time")
 @dataclass(frozen=True)
 class FrameRecording:
     """Frames of a file. **Fields**: `frames`: (F, M) volts, NaN for missing readings; `seconds`: (F,) times, None if
-    unknown; `reference`: (M,) or (r, M) volts of the untouched skin, or None; `name`: name of the file."""
+    unknown; `reference`: (M,) or (r, M) volts of the untouched skin, or None; `name`: name of the file.
+
+    **Example:**
+
+    ```python
+    np.savez("touches.npz", frames=pressed.voltages, reference=rest.voltages[0])
+    read_frame_recording("touches.npz").frames
+    ```
+    """
 
     frames: Float[np.ndarray, "F M"]
     seconds: Float[np.ndarray, " F"] | None
@@ -72,6 +91,18 @@ def read_frame_recording(path: str | Path, description: Description | None = Non
     of the file. Raises `FileNotFoundError`, and `ValueError` for another kind of file, for a number of channels that
     differs from that of the protocol, and for times that decrease, are not finite, or do not match the number of
     frames.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `description`: of the sensor, with the protocol.
+
+    **Example:**
+
+    ```python
+    np.savez("touches.npz", frames=pressed.voltages, seconds=[0.0])
+    recording = read_frame_recording("touches.npz")
+    ```
     """
     path = Path(path)
     if path.is_dir():
@@ -157,6 +188,14 @@ class GestureSet:
     times, from 0 in each recording; `voltages`: (F, M) volts, NaN for missing readings; `reference`: (M,) volts, mean
     of frames of the untouched skin before the recordings; `untouched`: (u, M) frames of the untouched skin, recorded
     over as long a time as the recordings.
+
+    **Example:**
+
+    ```python
+    frames = np.concatenate([pressed.voltages, rest.voltages])
+    start, seconds = np.array([0, 2]), np.array([0.0, 0.1])
+    taps = GestureSet(np.array(["tap"]), np.array(["A"]), start, seconds, frames, rest.voltages[0], rest.voltages)
+    ```
     """
 
     gesture: np.ndarray

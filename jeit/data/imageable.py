@@ -50,6 +50,8 @@ _MOST_MASKS = 8
 class FrameQuality:
     """Result of `assess` for one frame and its difference from the reference.
 
+    **Fields**
+
     - `difference`: ‖v - v_reference‖ / ‖v_reference‖ over the usable channels.
     - `difference_noise`: noise of the difference, in volts and relative to the difference; None if it cannot be
       estimated.
@@ -62,6 +64,13 @@ class FrameQuality:
       of frame and reference; or None.
     - `usable_channels`: number of channels that are usable in both frame and reference.
     - `reason`: why the frame cannot be imaged; empty if it can.
+
+    **Example:**
+
+    ```python
+    quality = check_imageable(pressed, rest)[0]
+    quality.difference, quality.usable_channels
+    ```
     """
 
     difference: float
@@ -189,16 +198,26 @@ def assess(measurement: Measurement, reference: Measurement) -> list[FrameQualit
 
 
 def mask_spikes(measurement: Measurement, reference: Measurement, *, fill: bool = False) -> Measurement:
-    """The measurement without spikes: single channels of a frame whose change from the mean of `reference` contradicts
-    that of all others, masked, with a note; with `fill`, replaced by what the others determine, and masked otherwise.
+    """Mask spikes: single channels of a frame whose change from the mean of `reference` contradicts that of all others.
+    A note lists them.
 
     The voltages of every body follow from its symmetric transfer impedance, which has fewer entries than most protocols
-    have channels. What of a frame's change no symmetric matrix explains is noise, or a spike: where one channel leaves
-    more of it unexplained than all others together. If that does not determine which of two reciprocal channels is at
-    fault, both are masked. Nothing is found in protocols whose channels are all independent, and of more than about 40
-    electrodes, for which the search would take too long.
+    have channels. The part of a frame's change that no symmetric matrix explains is noise, or a spike where one channel
+    leaves more of it unexplained than all others together. If that does not determine which of two reciprocal channels
+    is at fault, both are masked. Nothing is found in protocols whose channels are all independent, and in protocols of
+    more than about 40 electrodes, for which the search would take too long.
 
-    The `reference` must be of the same set-up (`check_same_setup`).
+    **Arguments:**
+
+    - `measurement`: the frames.
+    - `reference`: frames of the undisturbed body, from the same set-up.
+    - `fill`: replace spikes by what the other channels determine, and mask only those that they do not.
+
+    **Example:**
+
+    ```python
+    clean = mask_spikes(pressed, rest)
+    ```
     """
     mean = reference.mean_frame()
     base, known = np.asarray(mean.voltages)[0], np.asarray(mean.mask)[0]
@@ -309,8 +328,22 @@ def rounding_of_difference(frame: Measurement, reference: Measurement) -> Float[
 
 
 def check_imageable(measurement: Measurement, reference: Measurement) -> list[FrameQuality]:
-    """The result of `assess(measurement, reference)`; raises `ValueError` with the reason if a frame cannot be
-    imaged."""
+    """Judge each frame for difference imaging, and raise an error if one cannot be imaged, such as for noise as large
+    as the signal.
+
+    **Arguments:**
+
+    - `measurement`: the frames to image.
+    - `reference`: frames of the undisturbed body, from the same set-up.
+
+    Raises `ValueError` with the reason.
+
+    **Example:**
+
+    ```python
+    check_imageable(pressed, rest)[0].difference
+    ```
+    """
     qualities = assess(measurement, reference)
     for index, quality in enumerate(qualities):
         if not quality.imageable:

@@ -40,6 +40,13 @@ class Measurement(Module):
     - `times`: (F,) increasing times of the frames in seconds; None if they are not known.
     - `uncertainty`: how accurately electrodes and domain are known; None for the defaults of
       `jeit.inverse.Uncertainty`.
+
+    **Example:**
+
+    ```python
+    pressed.voltages, pressed.protocol, pressed.notes
+    pressed.without_electrodes(3).mask
+    ```
     """
 
     voltages: Inexact[Array, "F M"]

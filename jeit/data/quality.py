@@ -31,9 +31,18 @@ _MOST_DIGITS, _EXACTLY, _LEAST_ROUNDED = 5, 1e-6, 16
 class NoiseEstimate:
     """Estimate of the noise in a single voltage.
 
+    **Fields**
+
     - `standard_deviation`: standard deviation (root mean square) in volts.
     - `relative`: standard deviation divided by the root mean square of the usable voltages.
     - `method`: "reciprocity" or "repeated frames".
+
+    **Example:**
+
+    ```python
+    noise = estimate_noise(pressed)
+    noise.standard_deviation, noise.method
+    ```
     """
 
     standard_deviation: float
@@ -42,16 +51,24 @@ class NoiseEstimate:
 
 
 def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M"] | None = None) -> float | None:
-    """Relative deviation from reciprocity: ‖T - Tᵀ‖ / ‖T‖, where T is the transfer between drives.
-
-    `deviation` (M,): expected errors of the channels, relative to each other; the entries of T are divided by the
-    errors that follow from them. By default all channels are weighted equally.
+    """Relative deviation from reciprocity: ‖T - Tᵀ‖ / ‖T‖, where T is the transfer between drives; None if no two
+    usable channels are related by reciprocity.
 
     T_ij is the voltage that drive pattern i would read while drive j flows, combined from the measured channels (see
     `jeit.protocol.reciprocity.transfer_between_drives`). It is symmetric for every body, so an asymmetry is due to
     noise, drift, gain errors, or a wrong protocol. Independent noise of relative size ε yields about √2 ε.
 
-    Returns None if no two usable channels are related by reciprocity.
+    **Arguments:**
+
+    - `measurement`: the frames.
+    - `deviation` (M,): expected errors of the channels, relative to each other; the entries of T are divided by the
+      errors that follow from them. By default all channels are weighted equally.
+
+    **Example:**
+
+    ```python
+    error = reciprocity_error(pressed)
+    ```
     """
     error, noise, signal = _asymmetry(measurement, deviation)
     if error.size == 0:
@@ -64,7 +81,18 @@ def reciprocity_error(measurement: Measurement, deviation: Float[np.ndarray, " M
 
 def channel_reciprocity_error(measurement: Measurement) -> Float[np.ndarray, "F M"]:
     """(F, M) volts: each voltage minus the value predicted by its reciprocal channel; NaN for channels without a
-    reciprocal one."""
+    reciprocal one.
+
+    **Arguments:**
+
+    - `measurement`: the frames.
+
+    **Example:**
+
+    ```python
+    deviation = channel_reciprocity_error(pressed)
+    ```
+    """
     pairs, ratio = measurement.protocol.reciprocal_pairs()
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     result = np.full(voltages.shape, np.nan, dtype=voltages.dtype)
@@ -89,6 +117,16 @@ def estimate_noise(measurement: Measurement) -> NoiseEstimate | None:
 
     The estimator is robust: 1.4826 times the median absolute value, unaffected by outliers in up to half of the
     channels.
+
+    **Arguments:**
+
+    - `measurement`: the frames.
+
+    **Example:**
+
+    ```python
+    noise = estimate_noise(pressed)
+    ```
     """
     voltages, mask = np.asarray(measurement.voltages), np.asarray(measurement.mask)
     size = float(np.sqrt(np.mean(np.abs(voltages[mask]) ** 2))) if mask.any() else 0.0
@@ -138,9 +176,20 @@ def impossible_signs(
     """(F,) fraction of the usable voltages whose sign is impossible on a passive body (real part of complex voltages).
 
     Voltages that are pure noise have the wrong sign half of the time, so the fraction of noisy channels is about twice
-    the value returned. `order` lists the electrodes as they follow each other along the boundary; by default it is
-    found from their positions. Returns None if the electrodes are not known to lie along the boundary of an outline, or
-    if no channel has a known sign. See `expected_signs`.
+    the value returned. Returns None if the electrodes are not known to lie along the boundary of an outline, or if no
+    channel has a known sign. See `expected_signs`.
+
+    **Arguments:**
+
+    - `measurement`: the frames.
+    - `order` (L,): the electrodes as they follow each other along the boundary; by default it is found from their
+      positions.
+
+    **Example:**
+
+    ```python
+    share = impossible_signs(pressed)
+    ```
     """
     order = boundary_order(measurement) if order is None else order
     if order is None:

@@ -86,6 +86,8 @@ def read(
 ) -> Measurement:
     """Read a measurement from a file.
 
+    **Arguments:**
+
     - `path`: the data file; or a folder of Sciospec files, one per frame, which are read in the order of their names.
     - `format`: a name in `FORMATS` ("kit4", "ktc2023", "eidors", "sciospec", "draeger", "carefusion", "swisstom",
       "goettingen", "cn0565", "quadrupoles", "openeit", "table", "tank6cm"); by default it is recognised from the
@@ -97,6 +99,13 @@ def read(
     - `key`: name of the array of voltages in a .mat or .npz file, in place of `[data] keys`.
 
     Raises `ValueError` if the file does not exist, is of no known format, or violates its format.
+
+    **Example:**
+
+    ```python
+    write_table(pressed, "pressed.npz")
+    measurement = read("pressed.npz")
+    ```
     """
     file = Path(path)
     if file.is_dir():

@@ -31,6 +31,13 @@ class RoundSkin(Module):
     **Fields**: `radius` in metres; `num_electrodes`; `electrode_width` in metres; `contact_impedance` in ohm·m;
     `conductivity`: sheet conductivity in siemens; `current` in amperes; `num_points`: number of nodes of the mesh for
     the simulation, which should be finer than the mesh of the reconstruction.
+
+    **Example:**
+
+    ```python
+    skin = RoundSkin(radius=0.05, num_points=400)
+    skin.model().voltages(1e-3)
+    ```
     """
 
     radius: float = 0.05
@@ -79,10 +86,24 @@ def simulate_press(
 ) -> tuple[Measurement, Measurement]:
     """Simulate a frame of the pressed skin and a frame of the skin at rest; returns `(pressed, rest)`.
 
-    `key`: key of the random noise (`jax.random.key`). `position`: (x, y) of the press, and `radius` of its contact, in
-    metres. `strength`: maximum relative change of conductivity. `noise`: standard deviation of the noise in each
-    voltage relative to the root mean square of all voltages (1e-4: 80 dB). Raises `ValueError` for a press beyond the
-    edge, for values that are not positive, and for arguments that are not a skin or a key.
+    **Arguments:**
+
+    - `skin`: the skin.
+    - `key`: key of the random noise (`jax.random.key`).
+    - `position` (x, y): of the press, metres.
+    - `radius`: of the contact, metres.
+    - `strength`: maximum relative change of conductivity.
+    - `noise`: standard deviation of the noise in each voltage relative to the root mean square of all voltages (1e-4:
+      80 dB).
+
+    Raises `ValueError` for a press beyond the edge, for values that are not positive, and for arguments that are not a
+    skin or a key.
+
+    **Example:**
+
+    ```python
+    pressed, rest = simulate_press(skin, jax.random.key(1), (0.0, 0.02), radius=0.01)
+    ```
     """
     check_kind("skin", skin, RoundSkin, "a RoundSkin, such as RoundSkin(radius=0.05)")
     where = np.asarray(position, float)

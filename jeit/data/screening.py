@@ -34,21 +34,36 @@ def screen(
     frame_names: tuple[str, ...] = (),
     notes: tuple[str, ...] = (),
 ) -> Measurement:
-    """Convert raw voltages (M,) or (F, M), in volts, to a `Measurement`; unusable voltages are masked, with notes on
-    why.
+    """Convert raw voltages to a `Measurement`; unusable voltages are masked, with notes on why.
 
     Masked are voltages that
 
-    - `mask` (True = usable) excludes;
+    - `mask` excludes;
     - are NaN, infinite, or larger than 1e12 V;
-    - are saturated: at or beyond `saturation` volts, or, if that is not given, stuck at exactly the same extreme value;
+    - are saturated;
     - belong to a drive that reads nothing at all because its current did not flow, or read an electrode all of whose
       drives are of this kind;
     - belong to a frame that is all zero.
 
     A note is also added if electrodes are not numbered in their order along the edge.
 
+    **Arguments:**
+
+    - `voltages` (M,) or (F, M): volts.
+    - `protocol`: drive and measurement patterns of the M channels.
+    - `electrodes`, `domain`: the electrodes and the body, if they are known.
+    - `mask` (M,) or (F, M): True for usable voltages.
+    - `saturation`: volts at which the instrument saturates; by default, voltages stuck at exactly the same extreme
+      value are taken as saturated.
+    - `name`, `source`, `frame_names`, `notes`: as in `Measurement`.
+
     Raises `ValueError` if the shape does not fit the protocol, or no usable voltage is left.
+
+    **Example:**
+
+    ```python
+    measurement = screen(pressed.voltages, pressed.protocol, electrodes=pressed.electrodes, domain=pressed.domain)
+    ```
     """
     name = name.encode("utf-8", "backslashreplace").decode()  # the name of a file may not be valid text
     values = _as_frames(voltages, protocol, name)

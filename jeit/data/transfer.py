@@ -25,8 +25,20 @@ def transfer_impedance(measurement: Measurement) -> Inexact[np.ndarray, "F L L"]
     """The transfer impedance (F, L, L) of every frame, in ohm: potentials of all electrodes, minus their mean, for a
     unit current into each.
 
-    It is the symmetric matrix that fits the usable voltages in the least-squares sense. Raises `ValueError` if they do
-    not determine it, because there are too few patterns or the voltages of driven electrodes are missing.
+    It is the symmetric matrix that fits the usable voltages in the least-squares sense.
+
+    **Arguments:**
+
+    - `measurement`: the frames.
+
+    Raises `ValueError` if the voltages do not determine it, because there are too few patterns or the voltages of
+    driven electrodes are missing.
+
+    **Example:**
+
+    ```python
+    impedance = transfer_impedance(complete)
+    ```
     """
     protocol, count = measurement.protocol, measurement.protocol.num_electrodes
     basis = scipy.linalg.null_space(np.ones((1, count)))
@@ -81,6 +93,17 @@ def driven_by(measurement: Measurement, protocol: Protocol) -> Measurement:
     This is meant for a reference that was measured with other currents than the frames. Noise is amplified where the
     measured patterns barely determine the new voltages. Raises `ValueError` for another number of electrodes, and as
     `transfer_impedance`.
+
+    **Arguments:**
+
+    - `measurement`: the frames.
+    - `protocol`: drive and measurement patterns of the voltages to compute.
+
+    **Example:**
+
+    ```python
+    converted = driven_by(complete, adjacent(16, current=2e-3))
+    ```
     """
     if protocol.num_electrodes != measurement.protocol.num_electrodes:
         raise ValueError(

@@ -93,8 +93,22 @@ class ForwardModel(Module):
     and is two to four times as fast afterwards. All methods are differentiable with respect to the conductivity and
     every field of the model (`model.electrodes.position`, `.contact_impedance`, `model.mesh.points`, …).
 
+    **Arguments:**
+
+    - `mesh`, `electrodes`, `protocol`: the body, its electrodes, and what is driven and measured.
+    - `solver`: "auto" (chosen by size; `model.system.solver` states which solver and why), "cholesky", "cg", or any
+      lineax solver. With "auto", `jeit_solvers.Multigrid` or `jeit_solvers.Pardiso`, methods run in NumPy where they
+      can; with other values they are always compiled.
+
     **Fields**: `mesh`, `electrodes`, `protocol`; `system`: sparsity pattern and linear solver; `at_once`: whether
     methods run in NumPy where possible.
+
+    **Example:**
+
+    ```python
+    model = ForwardModel(mesh, electrodes, adjacent(16))
+    voltages, jacobian = model.voltages(1.0), model.jacobian(1.0)
+    ```
     """
 
     mesh: Mesh
@@ -111,10 +125,7 @@ class ForwardModel(Module):
         *,
         solver: str | lx.AbstractLinearSolver = "auto",
     ):
-        """`solver`: "auto" (chosen by size; `model.system.solver` states which solver and why), "cholesky", "cg", or
-        any lineax solver. With "auto", `jeit_solvers.Multigrid` or
-        `jeit_solvers.Pardiso` methods run in NumPy where they can, with other values they are always compiled.
-        Raises `ValueError` if electrodes, mesh and protocol do not fit together."""
+        """Arguments as for the class. Raises `ValueError` if electrodes, mesh and protocol do not fit together."""
         _check_model_parts(mesh, electrodes, protocol)
         self.mesh = mesh
         self.electrodes = electrodes

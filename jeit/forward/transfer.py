@@ -49,9 +49,22 @@ class ElectrodeImpedance(NamedTuple):
 def transfer_impedance(mesh: Mesh, conductivity: ArrayLike, electrodes: AbstractElectrodes, system: System):
     """Transfer impedance Z (L, L) in ohms: electrode potentials are U = Z I for currents I that sum to zero.
 
-    `conductivity` in S/m (2-D: S), (m,), (n,) or (m, d, d). Z is symmetric; its rows and columns sum to zero, so
-    potentials are relative to the mean of all electrodes. Arguments are not checked, unlike in
-    `ForwardModel.transfer_impedance`.
+    Z is symmetric; its rows and columns sum to zero, so potentials are relative to the mean of all electrodes.
+    Arguments are not checked, unlike in `ForwardModel.transfer_impedance`.
+
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `conductivity` (m,), (n,) or (m, d, d): in S/m (2-D: S).
+    - `electrodes`: the electrodes on the mesh.
+    - `system`: sparsity pattern and linear solver, such as `ForwardModel.system`.
+
+    **Example:**
+
+    ```python
+    model = ForwardModel(mesh, electrodes, adjacent(16))
+    impedance = transfer_impedance(mesh, np.ones(mesh.num_cells), electrodes, model.system)
+    ```
     """
     return impedance_parts(mesh, conductivity, electrodes, system).transfer
 

@@ -1,11 +1,13 @@
 from .image_series import ImageSeries, Oscillation, amplitude_spectrum, oscillation
 from .inclusions import Inclusion, SolidForm, find_inclusions
-from .merit import figures_of_merit
-from .plane import Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
+from .merit import FiguresOfMerit, figures_of_merit
+from .plane import Cut, Plane, TriangleSurface, cut_by_plane, isosurface_of, node_values
 from .raster import Raster
 from .segmentation import ball_region, box_region, half_region, segment
 
 __all__ = [
+    "Cut",
+    "FiguresOfMerit",
     "ImageSeries",
     "Inclusion",
     "Oscillation",

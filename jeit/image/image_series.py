@@ -33,6 +33,13 @@ class ImageSeries:
     `timed`: False if `times` are the numbers of the frames instead.
 
     Raises `ValueError` if shapes disagree, if times do not increase, and if no frame has an image.
+
+    **Example:**
+
+    ```python
+    series = ImageSeries(mesh, changes, times, background=1.0)
+    series.frame_rate, series.mean_change(ball_region(mesh, [0.04, 0.0], 0.02))
+    ```
     """
 
     mesh: Mesh
@@ -116,14 +123,24 @@ _MIN_PERIODS = 1.0
 
 @dataclass(frozen=True)
 class Oscillation:
-    """The component of values (F, …) that oscillates at `frequency`, in hertz.
+    """The component of values (F, …) that oscillates at one frequency, the result of `oscillation`.
 
+    **Fields**
+
+    - `frequency`: hertz.
     - `amplitude`: (…), in the unit of the values: half of the difference between maximum and minimum.
     - `phase`: (…), radians from -π to π: the values vary as cos(2πf t + phase), with the times t that were given. The
       phase is meaningless where the amplitude is only noise.
     - `noise`: (…), standard deviation of the amplitude, from the residual of the fit, which includes other
       oscillations.
     - `resolution`: hertz.
+
+    **Example:**
+
+    ```python
+    found = oscillation(changes, times, 1.0)
+    found.amplitude, found.phase
+    ```
     """
 
     frequency: float
@@ -136,15 +153,26 @@ class Oscillation:
 def oscillation(
     values: ArrayLike, times: ArrayLike, frequency: float | tuple[float, float], *, window: Window = "hann"
 ) -> Oscillation:
-    """Amplitude and phase of values (F, …) at times (F,) in seconds, which need not be evenly spaced.
+    """Amplitude and phase with which values oscillate over time. Rows of NaN are left out.
 
+    **Arguments:**
+
+    - `values` (F, …): in any unit.
+    - `times` (F,): in seconds, which need not be evenly spaced.
     - `frequency`: hertz; or a band (lowest, highest), in which the frequency with the largest power over all values is
       found. Frequencies with less than one period in the measured time are not considered.
     - `window`: "hann", which separates different frequencies better, or "none", which has twice the resolution for a
       single oscillation.
 
-    Rows of NaN are left out. Raises `ValueError` for fewer than five frames, less than one period, a frequency at or
-    above half the frame rate, and invalid options.
+    Raises `ValueError` for fewer than five frames, less than one period, a frequency at or above half the frame rate,
+    and invalid options.
+
+    **Example:**
+
+    ```python
+    breath = oscillation(changes, times, (0.5, 1.5))
+    breath.frequency, breath.amplitude
+    ```
     """
     kept, at = _finite_rows(values, times)
     check_name("window", window, _WINDOW_RESOLUTION)
@@ -178,11 +206,23 @@ def oscillation(
 def amplitude_spectrum(
     values: ArrayLike, times: ArrayLike, *, window: Window = "hann"
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, "K ..."]]:
-    """Frequencies (K,) in hertz, from one period in the measured time to half the frame rate in steps of half the
-    resolution, and the amplitude (K, …) of values (F, …) at each frequency, in the unit of the values. A single
-    oscillation has a peak of the height of its amplitude.
+    """Amplitude of values at every frequency, from one period in the measured time to half the frame rate in steps of
+    half the resolution. Returns the frequencies (K,) in hertz, and the amplitudes (K, …) in the unit of the values.
+    A single oscillation has a peak of the height of its amplitude.
 
-    The mean is subtracted first. Rows of NaN are left out. Raises `ValueError` as `oscillation` does.
+    The mean is subtracted first. Rows of NaN are left out.
+
+    **Arguments:**
+
+    - `values`, `times`, `window`: as in `oscillation`.
+
+    Raises `ValueError` as `oscillation` does.
+
+    **Example:**
+
+    ```python
+    frequencies, amplitudes = amplitude_spectrum(changes.mean(axis=1), times)
+    ```
     """
     kept, at = _finite_rows(values, times)
     check_name("window", window, _WINDOW_RESOLUTION)

@@ -23,6 +23,13 @@ class SolidForm(Module):
 
     **Fields**: `centre` in metres; `axes`: three semi-axes as rows, in metres; the last one of a column points to its
     upper end; `column`: whether the shape is a column.
+
+    **Example:**
+
+    ```python
+    form = SolidForm((0.0, 0.0, 0.03), ((0.02, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.01)), column=False)
+    form.surface().enclosed
+    ```
     """
 
     centre: tuple[float, ...]
@@ -66,6 +73,13 @@ class Inclusion(Module):
     `form`: shape of an inclusion that was fitted to data as a body in a solid, else None. Where they were estimated:
     `contrast_interval`: 68 % interval of the change relative to the background; `area_interval`: of the area, m²,
     or volume, m³; `strength` and `strength_interval`: see `jeit.inverse.shapes.Quantities`.
+
+    **Example:**
+
+    ```python
+    inclusion = find_inclusions(mesh, image)[0]
+    inclusion.kind, inclusion.centroid, inclusion.radius
+    ```
     """
 
     sign: int
@@ -113,15 +127,29 @@ def find_inclusions(
     noise: Float[Array, " m"] | None = None,
     least_significance: float = 5.5,
 ) -> list[Inclusion]:
-    """Find the peaks of an image, each with the surrounding region where the change exceeds `level` times the peak.
+    """Find the peaks of an image, each with the surrounding region where the change exceeds `level` times the peak. The
+    strongest inclusion comes first; peaks that do not satisfy the limits below are artefacts.
 
-    `image`: (m,) change of conductivity in every cell. A peak is an inclusion if it is at least `least_peak` times the
-    strongest change of either sign, stands at least `least_prominence` times its own height above the saddle towards a
-    higher peak, and has a region that covers at least the fraction `least_area` of the mesh; other peaks are artefacts.
-    The default of `least_area` is 0.004 for a sheet and 0.001 for a solid (0.004 of a solid would be a ball of a fifth
-    of its width). If `noise` (m,), the standard deviation of the image, is given, peaks below `least_significance`
-    times the noise are artefacts too. The strongest inclusion comes first. Raises `ValueError` for an image of another
-    size or with NaN.
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `image` (m,): change of conductivity in every cell.
+    - `level`: edge of an inclusion, as a share of its peak.
+    - `least_peak`: minimum height of a peak, as a share of the strongest change of either sign.
+    - `least_prominence`: minimum height of a peak above the saddle towards a higher peak, as a share of its own height.
+    - `least_area`: minimum area (volume) of a region, as a fraction of the mesh; default 0.004 for a sheet and 0.001
+      for a solid (0.004 of a solid would be a ball of a fifth of its width).
+    - `noise` (m,): standard deviation of the image, in its unit.
+    - `least_significance`: minimum height of a peak relative to the noise, if that is given.
+
+    Raises `ValueError` for an image of another size or with NaN.
+
+    **Example:**
+
+    ```python
+    for inclusion in find_inclusions(mesh, image):
+        print(inclusion)
+    ```
     """
     regions = inclusion_regions(
         mesh,

@@ -45,6 +45,13 @@ class FiguresOfMerit(Module):
 
     All fields except `amplitude_response`, `distance` and `body_radius` are NaN for an image without a pixel of the
     target's sign, because Q is empty. The ringing is infinite if the net change in C does not have the target's sign.
+
+    **Example:**
+
+    ```python
+    figures = figures_of_merit(raster.sample(image), raster.extent, [0.04, 0.0], area=1e-3)
+    figures.position_error, figures.resolution
+    ```
     """
 
     amplitude_response: Float[Array, "*targets"]
@@ -82,14 +89,28 @@ def figures_of_merit(
     area: Float[Array, "*targets"] | float,
     change: Float[Array, "*targets"] | float = 1.0,
 ) -> FiguresOfMerit:
-    """GREIT figures of merit of one image (rows, columns) or of several images (T, rows, columns), each of one target.
+    """GREIT figures of merit of one image or of several images, each of one target. The centre of the body is the
+    centre of gravity of its pixels.
 
-    `raster`: change of conductivity on pixels, NaN outside the body, as returned by `Raster.sample`, row 0 at the top;
-    `extent`: (x_min, x_max, y_min, y_max) of the raster in metres. `position`: (2,) or (T, 2) centre of each target in
-    metres. `area`: area of the target in m², and `change`: its change of conductivity in siemens (negative for a
-    resistive target); each a number or (T,). The centre of the body is the centre of gravity of its pixels.
+    Works under jit and vmap.
 
-    Works under jit and vmap. Raises `ValueError` for arguments whose shapes or values do not fit.
+    **Arguments:**
+
+    - `raster` (rows, columns) or (T, rows, columns): change of conductivity on pixels, NaN outside the body, as
+      returned by `Raster.sample`, row 0 at the top.
+    - `extent`: (x_min, x_max, y_min, y_max) of the raster in metres.
+    - `position` (2,) or (T, 2): centre of each target in metres.
+    - `area`: area of each target in m², a number or (T,).
+    - `change`: change of conductivity of each target, negative for a resistive one, in the unit of the raster; a number
+      or (T,).
+
+    Raises `ValueError` for arguments whose shapes or values do not fit.
+
+    **Example:**
+
+    ```python
+    figures = figures_of_merit(raster.sample(image), raster.extent, [0.04, 0.0], area=1e-3)
+    ```
     """
     if jnp.iscomplexobj(raster) or jnp.iscomplexobj(change):
         raise ValueError("raster and change must be real; judge the real and the imaginary part of an image apart.")

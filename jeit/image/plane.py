@@ -86,7 +86,15 @@ def _cut_cells(cells, values, level: float, cases: dict[int, list[list[int]]]) -
 @dataclass(frozen=True)
 class TriangleSurface:
     """A surface of triangles in space. **Fields**: `points`: (n, 3) metres; `triangles`: (m, 3) indices of points,
-    ordered so that normals point outward."""
+    ordered so that normals point outward.
+
+    **Example:**
+
+    ```python
+    surface = isosurface_of(solid, solid_image, 0.3)
+    surface.points, surface.enclosed
+    ```
+    """
 
     points: Float[np.ndarray, "n 3"]
     triangles: Int[np.ndarray, "m 3"]
@@ -103,9 +111,22 @@ class TriangleSurface:
 
 
 def node_values(mesh: Mesh, image: Float[np.ndarray, "..."]) -> Float[np.ndarray, " n"]:
-    """Values (n,) of an image at the nodes. Values per cell (m,) are averaged over the cells around each node, weighted
-    by their measure; values per node are returned unchanged. Raises `ValueError` for another shape, complex values and
-    NaN."""
+    """Values (n,) of an image at the nodes.
+
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `image`: values per cell (m,), which are averaged over the cells around each node, weighted by their measure; or
+      values per node (n,), which are returned unchanged.
+
+    Raises `ValueError` for another shape, complex values and NaN.
+
+    **Example:**
+
+    ```python
+    smooth = node_values(mesh, image)
+    ```
+    """
     values = np.asarray(image)
     if values.shape not in ((mesh.num_cells,), (mesh.num_points,)):
         raise ValueError(
@@ -127,9 +148,22 @@ def node_values(mesh: Mesh, image: Float[np.ndarray, "..."]) -> Float[np.ndarray
 def isosurface_of(mesh: Mesh, values: Float[np.ndarray, "..."], level: float) -> TriangleSurface:
     """The closed surface of the region where an image exceeds `level`, or, for a negative level, falls below it.
 
-    `values`: (m,) per cell, which are averaged to the nodes first, or (n,) per node; linear in between. Where the
-    region reaches the wall of the body, the wall closes the surface. The surface has no triangles if no value reaches
-    the level. Raises `ValueError` for a level that is zero or not a number, and as `node_values`.
+    Where the region reaches the wall of the body, the wall closes the surface. The surface has no triangles if no value
+    reaches the level.
+
+    **Arguments:**
+
+    - `mesh`: the mesh of a solid.
+    - `values`: (m,) per cell, which are averaged to the nodes first, or (n,) per node; linear in between.
+    - `level`: in the unit of the values.
+
+    Raises `ValueError` for a level that is zero or not a number, and as `node_values`.
+
+    **Example:**
+
+    ```python
+    surface = isosurface_of(solid, solid_image, 0.3)
+    ```
     """
     check_solid(mesh)
     if not is_number(level) or level == 0:
@@ -178,6 +212,13 @@ class Plane:
 
     The z axis points up on the page; in horizontal planes the y axis does. Make a plane with `Plane.at` or
     `Plane.through`.
+
+    **Example:**
+
+    ```python
+    plane = Plane.at("z", 0.02)
+    plane.distance(solid.points), plane.name
+    ```
     """
 
     point: np.ndarray
@@ -236,6 +277,13 @@ class Cut:
     **Fields**: `polygons`: (p, 4, 2) corners in metres on the page of the plane, with the last corner repeated in
     triangles; `cell`: (p,) cell of each polygon; `outline`: (s, 2, 2) line segments where the plane meets the surface
     of the body.
+
+    **Example:**
+
+    ```python
+    section = cut_by_plane(solid, Plane.at("z", 0.02))
+    section.area, section.outline
+    ```
     """
 
     polygons: Float[np.ndarray, "p 4 2"]
@@ -254,7 +302,19 @@ def cut_by_plane(mesh: Mesh, plane: Plane) -> Cut:
     """Exact section of a solid by a plane: the cells as polygons, and the outline of the section.
 
     A plane that contains facets of the mesh cuts the cells behind it, or those in front of it if there are none behind.
+
+    **Arguments:**
+
+    - `mesh`: the mesh of the solid.
+    - `plane`: the plane.
+
     Raises `ValueError` for a mesh that is not a solid, and for a plane that misses it.
+
+    **Example:**
+
+    ```python
+    section = cut_by_plane(solid, Plane.through([0.0, 0.0, 0.02], [1.0, 0.0, 1.0]))
+    ```
     """
     check_solid(mesh)
     check_kind("plane", plane, Plane, "a Plane, such as Plane.at('z', 0.02)")

@@ -18,6 +18,13 @@ class Raster(Module):
     **Fields**: `cell`: (rows, columns) index of the cell that contains the centre of the pixel, or -1 outside the mesh;
     row 0 is at the top (largest y), column 0 at the left; `extent`: (x_min, x_max, y_min, y_max) in metres, the outer
     edges of the outermost pixels.
+
+    **Example:**
+
+    ```python
+    raster = Raster.create(mesh, shape=(64, 64))
+    raster.sample(image), raster.extent
+    ```
     """
 
     cell: Int[Array, "rows columns"]

@@ -14,10 +14,22 @@ from jeit.mesh.geometry import interior_facets
 
 
 def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray, " m"]:
-    """(m,) True for cells whose centroid lies within `radius` metres of `centre` (d,); a disk in a sheet.
+    """Cells whose centroid lies within a ball, or a disk in a sheet: (m,) True.
+
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `centre` (d,): in metres.
+    - `radius`: in metres.
 
     Raises `ValueError` for a centre with another number of coordinates, a radius that is not positive, and an empty
     region.
+
+    **Example:**
+
+    ```python
+    region = ball_region(mesh, [0.04, 0.0], 0.02)
+    ```
     """
     if not (is_number(radius) and radius > 0):
         raise ValueError(f"radius must be a positive number of metres; it is {describe(radius)}.")
@@ -26,10 +38,21 @@ def ball_region(mesh: Mesh, centre: ArrayLike, radius: float) -> Bool[np.ndarray
 
 
 def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarray, " m"]:
-    """(m,) True for cells whose centroid lies between the corners `lower` and `upper` (d,), in metres.
+    """Cells whose centroid lies between two corners: (m,) True.
+
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `lower`, `upper` (d,): corners, metres.
 
     Raises `ValueError` for corners with another number of coordinates, for a corner `upper` that is not larger than
     `lower`, and for an empty region.
+
+    **Example:**
+
+    ```python
+    region = box_region(mesh, [0.0, -0.05], [0.05, 0.05])
+    ```
     """
     above, below = _centroids_from(mesh, lower, "lower"), _centroids_from(mesh, upper, "upper")
     if not (np.asarray(lower, float) < np.asarray(upper, float)).all():
@@ -39,11 +62,21 @@ def box_region(mesh: Mesh, lower: ArrayLike, upper: ArrayLike) -> Bool[np.ndarra
 
 
 def half_region(mesh: Mesh, direction: ArrayLike, point: ArrayLike | None = None) -> Bool[np.ndarray, " m"]:
-    """(m,) True for cells whose centroid lies in `direction` (d,) from `point` (d,), in metres; direction (1, 0)
-    selects the right half.
+    """Cells whose centroid lies on one side of a point: (m,) True.
 
-    `point`: by default the centroid of the body. Raises `ValueError` for a direction of length zero, and for an empty
-    region.
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `direction` (d,): direction of the cells from the point; (1, 0) selects the right half.
+    - `point` (d,): in metres, by default the centroid of the body.
+
+    Raises `ValueError` for a direction of length zero, and for an empty region.
+
+    **Example:**
+
+    ```python
+    region = half_region(mesh, [1.0, 0.0])
+    ```
     """
     towards = np.asarray(direction, float)
     if towards.shape != (mesh.dimension,) or not np.isfinite(towards).all() or not towards.any():
@@ -129,12 +162,21 @@ def segment(
 ) -> UInt8[np.ndarray, "rows columns"]:
     """Labels of the pixels: 0 background, 1 resistive, 2 conductive; 0 outside the body.
 
-    `image`: (rows, columns) deviation from the background, negative where resistive, NaN outside the body. For absolute
-    images give the logarithm of conductivity divided by background, which weights both signs equally. A sign is
-    labelled if its peak is at least `least_peak` times the strongest peak of both signs; its label covers the pixels
-    above `level` times the peak (one half is the middle of a blurred edge). Islands smaller than the fraction
-    `least_area` of the body are artefacts. Raises `ValueError` for an image that is not two-dimensional, or has no
-    pixel inside the body.
+    **Arguments:**
+
+    - `image` (rows, columns): deviation from the background, negative where resistive, NaN outside the body. For
+      absolute images give the logarithm of conductivity divided by background, which weights both signs equally.
+    - `level`: edge of a label, as a share of the peak of its sign (one half is the middle of a blurred edge).
+    - `least_peak`: minimum peak of a sign, as a share of the strongest peak of both signs.
+    - `least_area`: minimum area of an island, as a fraction of the body; smaller ones are artefacts.
+
+    Raises `ValueError` for an image that is not two-dimensional, or has no pixel inside the body.
+
+    **Example:**
+
+    ```python
+    labels = segment(raster.sample(image))
+    ```
     """
     values = np.asarray(image)
     if values.ndim != 2 or np.iscomplexobj(values):

@@ -1,4 +1,5 @@
 from .compared_rules import ComparedRules, RuleOutcome, compare_on_data
+from .describe import find_description
 from .difference import ImagedDifference, image_difference
 from .method import CONTACTS, METHODS, ImagingSettings
 from .preparation import PreparedDifference, calibrated_model, imaging_mesh, prepare_difference, select_frames
@@ -18,6 +19,7 @@ __all__ = [
     "StreamSettings",
     "calibrated_model",
     "compare_on_data",
+    "find_description",
     "frames_of",
     "frequency_weight",
     "image_difference",

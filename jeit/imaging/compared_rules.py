@@ -27,11 +27,20 @@ from jeit.inverse.linearisation import Linearisation
 class RuleOutcome:
     """Result of one rule for a difference.
 
+    **Fields**
+
     - `choice`: the chosen λ, and the curve from which it was chosen.
     - `residual`: ‖w (v - Jx)‖ / ‖w v‖, the share of the difference v not explained by the image x.
     - `noise_figure`: signal-to-noise ratio of the data divided by that of the image (see `jeit.inverse.RULES`).
     - `change`: the image, change of conductivity per cell (m,), S/m (2-D: S).
     - `inclusions`: inclusions found in the image, strongest first.
+
+    **Example:**
+
+    ```python
+    outcome = compare_on_data(pressed, rest, quick, rules=["gcv"]).outcomes["gcv"]
+    outcome.residual, outcome.inclusions
+    ```
     """
 
     choice: Choice
@@ -45,10 +54,19 @@ class RuleOutcome:
 class ComparedRules:
     """Result of `compare_on_data`.
 
+    **Fields**
+
     - `prepared`: the imaged difference.
     - `settings`: the settings used, among them the prior.
     - `outcomes`: the result of each rule, by name.
     - `refused`: the reason why a rule could not choose λ, by name of the rule.
+
+    **Example:**
+
+    ```python
+    compared = compare_on_data(pressed, rest, quick, rules=["gcv", "l-curve"])
+    {name: outcome.choice.hyperparameter for name, outcome in compared.outcomes.items()}
+    ```
     """
 
     prepared: PreparedDifference
@@ -68,10 +86,22 @@ def compare_on_data(
 ) -> ComparedRules:
     """Image the change between a reference frame and a frame of `measurement` with the hyperparameter of each rule.
 
-    `rules`: names in `jeit.inverse.RULES`; default: all. The images are computed by one-step imaging; `settings` gives
-    the prior, the mesh, the calibration and the search for inclusions. Other arguments as in
-    `jeit.imaging.image_difference`. A rule that cannot be applied to the data is listed in `refused`, or raises
-    `ValueError` if it is the only one requested. Raises `ValueError` for unknown rules, and as `image_difference`.
+    The images are computed by one-step imaging. A rule that cannot be applied to the data is listed in `refused`, or
+    raises `ValueError` if it is the only one requested.
+
+    **Arguments:**
+
+    - `measurement`, `reference`, `frame`, `progress`: as in `image_difference`.
+    - `settings`: prior, mesh, calibration, and search for inclusions.
+    - `rules`: names in `jeit.inverse.RULES`; default: all.
+
+    Raises `ValueError` for unknown rules, and as `image_difference`.
+
+    **Example:**
+
+    ```python
+    compared = compare_on_data(pressed, rest, quick, rules=["gcv", "l-curve"])
+    ```
     """
     settings = as_settings(settings)
     names = list(dict.fromkeys(RULES if rules is None else rules))

@@ -145,6 +145,9 @@ def find_description(
 ) -> Findings:
     """Find out what a file of voltages may be: compare the protocols that fit it, and describe the best.
 
+    **Arguments:**
+
+    - `path`: file of the voltages.
     - `geometry`, `electrodes`: tables of a description, metres, the second without the number of electrodes and without
       the contact impedance, ohm·m (on a solid ohm·m²), which is estimated roughly unless given.
     - `reference`: file of the empty body; without it, the mean of all frames stands for it.
@@ -154,6 +157,15 @@ def find_description(
     - `progress`: called with the name of each step when it begins.
 
     Raises `ValueError` for files that cannot be read, several arrays and none named, and if no protocol fits.
+
+    **Example:**
+
+    ```python
+    from pathlib import Path
+    np.savetxt("tank.csv", np.concatenate([rest.voltages, pressed.voltages]), delimiter=",")
+    electrodes = {"layout": "ring", "kind": "boundary", "width": 0.008}
+    found = find_description(Path("tank.csv"), {"shape": "disk", "radius": 0.05}, electrodes)
+    ```
     """
     if (own := format_with_protocol(path)) is not None:
         progress("read")

@@ -47,6 +47,8 @@ _MOST_VOLTS, _SMALLER = 60.0, (("mV", 1e3), ("uV", 1e6))
 class ImagedDifference:
     """Result of `image_difference`.
 
+    **Fields**
+
     - `measurement`, `reference`: the two frames compared, one frame each.
     - `quality`: the quality of the data, assessed before imaging.
     - `settings`: the settings used, with automatic choices filled in.
@@ -67,6 +69,13 @@ class ImagedDifference:
     - `labels`: label of every pixel of the raster, if requested: 0 background, 1 resistive, 2 conductive.
     - `timings`: duration of each step in seconds.
     - `frame`: number of the imaged frame in its file, from 0; `num_frames`: number of frames in the file.
+
+    **Example:**
+
+    ```python
+    imaged = image_difference(pressed, rest, quick)
+    imaged.inclusions, imaged.change, imaged.doubts
+    ```
     """
 
     measurement: Measurement
@@ -248,11 +257,24 @@ def image_difference(
 ) -> ImagedDifference:
     """Image the change between a reference frame and a frame of `measurement`.
 
-    `reference`: measurement of the undisturbed body, whose frames are averaged; None if `measurement` has a frame named
-    "reference". `frame`: number (from 0) or name of the frame to image; default: the first. `progress` is called with
-    the name of each step when it begins. Raises `ValueError` for data that cannot be imaged (see
-    `jeit.data.check_imageable`) or lack the places of the electrodes, and for arguments of another type, such as the
-    path of a file.
+    **Arguments:**
+
+    - `measurement`: the frames, with protocol, electrodes and body.
+    - `reference`: measurement of the undisturbed body, whose frames are averaged; None if `measurement` has a frame
+      named "reference".
+    - `settings`: default: `ImagingSettings()`.
+    - `frame`: number (from 0) or name of the frame to image; default: the first.
+    - `progress`: called with the name of each step when it begins.
+
+    Raises `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the positions of the
+    electrodes, and for arguments of another type, such as the path of a file.
+
+    **Example:**
+
+    ```python
+    imaged = image_difference(pressed, rest, quick)
+    imaged.inclusions[0].centroid
+    ```
     """
     settings = as_settings(settings)
     clock = Clock(progress)

@@ -36,6 +36,8 @@ AUTO = "auto"
 class ImagingSettings:
     """Settings of imaging. The defaults apply to Python and the command line alike.
 
+    **Arguments:**
+
     - `method`: "auto" or a name in `METHODS`, which has linear methods, iterative methods that solve for conductivity
       itself, and "shapes", which fits outlines of bodies. "auto" uses one-step imaging if its image is sound, otherwise
       Gauss-Newton imaging with outlines of the bodies; in solids, ellipsoids are fitted wherever the data support them
@@ -58,6 +60,12 @@ class ImagingSettings:
     - `bodies`: kind of the bodies in a solid: "either", "ellipsoids", or "columns" through its whole height.
 
     Raises `ValueError`, naming the setting, for unknown or incompatible values.
+
+    **Example:**
+
+    ```python
+    settings = ImagingSettings(method="gauss-newton", hyperparameter=5.0, num_points=500)
+    ```
     """
 
     method: str = AUTO

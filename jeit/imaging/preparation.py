@@ -90,6 +90,8 @@ _EXPLAINED, _MISPLACED, _BETTER, _WORSE = 0.01, 0.0175, 0.7, 2.0
 class PreparedDifference:
     """A difference of two frames, ready to be imaged.
 
+    **Fields**
+
     - `measurement`, `reference`: the two frames compared, one frame each.
     - `quality`: the quality of the data.
     - `domain`: the body.
@@ -99,6 +101,13 @@ class PreparedDifference:
     - `difference`: difference of the voltages (M,) in volts, zero in masked channels.
     - `mask`: (M,), True for channels that are usable in both frames.
     - `frame`: number of the frame in its file, from 0; `num_frames`: number of frames in the file.
+
+    **Example:**
+
+    ```python
+    prepared = prepare_difference(pressed, rest, num_points=200)
+    prepared.calibration, prepared.noise
+    ```
     """
 
     measurement: Measurement
@@ -236,10 +245,22 @@ def prepare_difference(
 ) -> PreparedDifference:
     """Check a frame and its reference, mask spikes, build a mesh, and calibrate a model of the body on the reference.
 
-    Arguments as in `jeit.imaging.image_difference` and its settings; `clock` measures the duration of each step. Raises
-    `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the places of the electrodes,
-    if the calibration fails, and, unless `as_is`, if the wiring differs from its description or from that of the
-    reference (see `jeit.imaging.wiring`). `as_is` leaves spikes in place, too.
+    **Arguments:**
+
+    - `measurement`, `reference`, `frame`: as in `image_difference`.
+    - `contact`, `num_points`: as in `ImagingSettings`.
+    - `as_is`: image even if the wiring seems to differ from its description, and leave spikes in place.
+    - `clock`: measures the duration of each step.
+
+    Raises `ValueError` for data that cannot be imaged (see `jeit.data.check_imageable`) or lack the positions of the
+    electrodes, if the calibration fails, and, unless `as_is`, if the wiring differs from its description or from that
+    of the reference (see `jeit.imaging.wiring`).
+
+    **Example:**
+
+    ```python
+    prepared = prepare_difference(pressed, rest, num_points=200)
+    ```
     """
     clock = Clock(None) if clock is None else clock
     one, base = select_frames(measurement, reference, frame)
@@ -287,10 +308,25 @@ def check_wiring(wiring: Wiring, reference: Measurement, as_is: bool) -> None:
 def calibrated_model(
     model: ForwardModel, base: Measurement, *, contact: str | None = None, clock: Clock | None = None
 ) -> tuple[Calibration, str]:
-    """Calibrate the forward model on a frame of the undisturbed body; return it and the `contact` calibration used.
+    """Calibrate the forward model on a frame of the undisturbed body; return the `Calibration`, and which calibration
+    of the contact impedance was used.
 
-    `contact`: "each", "common" or "fixed"; default: `default_contact`, or "common" if the data do not determine the
-    contact impedance of each electrode. Raises `ValueError` if the calibration fails.
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `base`: a frame of the undisturbed body.
+    - `contact`: "each", "common" or "fixed"; default: `default_contact`, or "common" if the data do not determine the
+      contact impedance of each electrode.
+    - `clock`: measures the duration of each step.
+
+    Raises `ValueError` if the calibration fails.
+
+    **Example:**
+
+    ```python
+    fit, contact = calibrated_model(skin.model(), rest)
+    fit.conductivity, fit.misfit
+    ```
     """
     clock = Clock(None) if clock is None else clock
     with clock("calibrate"), threads_for(model.mesh):
@@ -370,10 +406,21 @@ def select_frames(
 ) -> tuple[Measurement, Measurement]:
     """Select the frame to image and its reference, one frame each.
 
-    A frame named "reference" in `measurement` is imaged only if requested, and serves as reference if no `reference`
-    is given. A reference measured with other currents is converted to those of the measurement if it determines their
-    voltages (see `jeit.data.driven_by`), which is recorded in its notes. Raises `ValueError` if there is no reference
-    or no such frame, and for arguments that are not measurements.
+    A frame named "reference" in `measurement` is imaged only if requested, and serves as reference if no `reference` is
+    given. A reference measured with other currents is converted to those of the measurement if it determines their
+    voltages (see `jeit.data.driven_by`), which is recorded in its notes.
+
+    **Arguments:**
+
+    - `measurement`, `reference`, `frame`: as in `image_difference`.
+
+    Raises `ValueError` if there is no reference or no such frame, and for arguments that are not measurements.
+
+    **Example:**
+
+    ```python
+    frame, undisturbed = select_frames(pressed, rest)
+    ```
     """
     check_measurement("measurement", measurement)
     if reference is not None:
@@ -394,10 +441,23 @@ def check_measurement(name: str, given: Measurement) -> None:
 def imaging_mesh(
     domain: Body, electrodes: AbstractElectrodes, num_points: int | None, *, usual: int | None = None
 ) -> Mesh:
-    """Mesh of `domain` with about `num_points` nodes, finer near the electrodes, where fields are steep.
+    """Mesh of a body, finer near the electrodes, where fields are steep.
 
-    Default of `num_points`: `usual`, or, without it, 2,000 for a sheet and 10,000 for a solid. Raises `ValueError` if a
-    number is given for a body that has its own mesh.
+    **Arguments:**
+
+    - `domain`: the body.
+    - `electrodes`: the electrodes.
+    - `num_points`: number of nodes, approximately; None: `usual`, or, without it, 2,000 for a sheet and 10,000 for a
+      solid.
+    - `usual`: default of `num_points`.
+
+    Raises `ValueError` if a number is given for a body that has its own mesh.
+
+    **Example:**
+
+    ```python
+    mesh = imaging_mesh(pressed.domain, pressed.electrodes, 300)
+    ```
     """
     if num_points is None and not isinstance(domain, OwnMesh):
         num_points = usual or (SOLID_POINTS if isinstance(domain, Solid) else SHEET_POINTS)

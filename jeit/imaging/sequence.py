@@ -43,11 +43,20 @@ _MOST_FRAMES = 0.5
 class ImagedSequence:
     """Result of `image_sequence`.
 
+    **Fields**
+
     - `series`: the images.
     - `prepared`: the prepared difference, with the model of the body.
     - `reconstruction`: the reconstruction matrix, the same for all images.
     - `refused`: (F,), True for frames without an image because they lack channels.
     - `regions`: cells of each requested region, (m,) booleans, by name.
+
+    **Example:**
+
+    ```python
+    imaged = image_sequence(join([rest, pressed]), rest, quick)
+    imaged.series.changes, imaged.refused
+    ```
     """
 
     series: ImageSeries
@@ -67,18 +76,28 @@ def image_sequence(
 ) -> ImagedSequence:
     """Image every frame of a measurement, with one linear method and one λ. Frames without times are numbered.
 
+    **Arguments:**
+
+    - `measurement`: the frames.
     - `reference`: the undisturbed body; default: the frame named "reference", or else the mean of all frames, so that
       images show changes relative to the average.
     - `settings`: settings of a linear method; default: one-step imaging. λ is chosen for the frame that differs most
       from the reference.
-    - `regions`: regions of interest by name, each a function of the mesh, such as
-      `lambda mesh: jeit.image.ball_region(mesh, (0, 0), 0.01)`. They are called before imaging, so that their errors
-      are raised early.
+    - `regions`: regions of interest by name, each a function of the mesh, such as `lambda mesh:
+      jeit.image.ball_region(mesh, (0, 0), 0.01)`. They are called before imaging, so that their errors are raised
+      early.
+    - `progress`: called with the name of each step when it begins.
 
     Spikes in single channels are replaced by what other channels determine (`jeit.data.imageable.mask_spikes`).
     Channels missing in more than half of the frames are not used; frames that lack any other channel are refused. The
     images need four bytes per cell and frame. Raises `ValueError` as `image_difference`, for a measurement with
     one frame, for an iterative method, and for images that would not fit in memory.
+
+    **Example:**
+
+    ```python
+    imaged = image_sequence(join([rest, pressed]), rest, quick)
+    ```
     """
     check_measurement("measurement", measurement)
     check_real(measurement)
@@ -137,9 +156,18 @@ def image_sequence(
 class ImagedFrequencies:
     """Result of `image_frequencies`.
 
+    **Fields**
+
     - `image`: the image of the weighted difference of the two frequencies.
     - `weight`: factor α of the voltages at the first frequency, by which those of the body as a whole change; 1 for
       plain differences.
+
+    **Example:**
+
+    ```python
+    imaged = image_frequencies(pressed, rest, quick)
+    imaged.weight, imaged.image.inclusions
+    ```
     """
 
     image: ImagedDifference
@@ -156,10 +184,21 @@ def image_frequencies(
 ) -> ImagedFrequencies:
     """Image the change of a body between two frequencies, relative to the change of the body as a whole.
 
-    `first`, `second`: voltages of the same body, electrodes and protocol at two frequencies; complex voltages give an
-    image of admittivity. `weighted`: whether to image v₂ - αv₁ (see `frequency_weight`) or v₂ - v₁. The background is
-    fitted to αv₁, or v₁. `frame`: frame of `second`; `settings`: as for `image_difference`. Raises `ValueError` for
-    data that cannot be imaged, and if the voltages at the two frequencies are not similar.
+    **Arguments:**
+
+    - `second`, `first`: voltages of the same body, electrodes and protocol at two frequencies; complex voltages give an
+      image of admittivity.
+    - `settings`: as for `image_difference`.
+    - `weighted`: whether to image v₂ - αv₁ (see `frequency_weight`) or v₂ - v₁. The background is fitted to αv₁, or v₁.
+    - `frame`: number (from 0) or name of the frame of `second`; default: the first.
+
+    Raises `ValueError` for data that cannot be imaged, and if the voltages at the two frequencies are not similar.
+
+    **Example:**
+
+    ```python
+    imaged = image_frequencies(pressed, rest, quick)
+    ```
     """
     check_measurement("second", second)
     check_measurement("first", first)
@@ -175,7 +214,17 @@ def frequency_weight(second: Measurement, first: Measurement) -> float | complex
     """Weight α = ⟨v₁, v₂⟩ / ⟨v₁, v₁⟩ of the voltages at the first frequency, from the first frame of each measurement
     and the channels usable in both; complex for complex voltages.
 
+    **Arguments:**
+
+    - `second`, `first`: voltages of the same body at two frequencies.
+
     Raises `ValueError` if the numbers of channels differ, and if α is not finite or its real part is not positive.
+
+    **Example:**
+
+    ```python
+    weight = frequency_weight(pressed, rest)
+    ```
     """
     ahead, before = np.asarray(second.voltages)[0], np.asarray(first.voltages)[0]
     if ahead.shape != before.shape:

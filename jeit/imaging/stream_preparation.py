@@ -39,6 +39,8 @@ STREAM_POINTS = 1200
 class StreamSettings:
     """Settings of imaging frame by frame. The defaults apply to Python and the command line alike.
 
+    **Arguments:**
+
     - `solver`: `GaussNewton()`, `LevenbergMarquardt()`, or `OneStep()` for linear images; or one of the names
       "gauss-newton", "levenberg-marquardt", "one-step".
     - `max_steps`: maximum number of iterations per frame, if the solver does not set it; default: 4, as for
@@ -51,6 +53,12 @@ class StreamSettings:
 
     Raises `ValueError` for a solver that cannot image frames, an unknown prior, a memory that is not a number of
     frames, and as `jeit.imaging.ImagingSettings`.
+
+    **Example:**
+
+    ```python
+    settings = StreamSettings(solver="one-step", num_points=200)
+    ```
     """
 
     solver: AbstractSolver | str = field(default_factory=GaussNewton)
@@ -78,12 +86,22 @@ def prepare_imager(
     measurement: Measurement | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[Imager, Calibration]:
-    """Prepare an imager for a sensor, and return it with the model calibrated on `reference`, frames of the undisturbed
-    sensor.
+    """Prepare an imager for a sensor, and return it with the model calibrated on frames of the undisturbed sensor.
 
-    `measurement`: the frames to image, if they are available; their protocol must be that of the reference. `progress`
-    is called with the name of each step when it begins. Raises `ValueError` for another protocol, and as
-    `image_difference`.
+    **Arguments:**
+
+    - `reference`: frames of the undisturbed sensor.
+    - `settings`: default: `StreamSettings()`.
+    - `measurement`: the frames to image, if they are available; their protocol must be that of the reference.
+    - `progress`: called with the name of each step when it begins.
+
+    Raises `ValueError` for another protocol, and as `image_difference`.
+
+    **Example:**
+
+    ```python
+    imager, calibration = prepare_imager(rest, StreamSettings(solver="one-step", num_points=200))
+    ```
     """
     settings = StreamSettings() if settings is None else settings
     check_kind("settings", settings, StreamSettings, "StreamSettings, such as StreamSettings(solver='one-step')")
@@ -139,7 +157,18 @@ def described_reference(
 
 
 def frames_of(measurement: Measurement) -> Float[np.ndarray, "F M"]:
-    """Voltages (F, M) of a measurement, volts, NaN in masked channels: the input of `jeit.inverse.stream`."""
+    """Voltages (F, M) of a measurement, volts, NaN in masked channels: the input of `jeit.inverse.stream`.
+
+    **Arguments:**
+
+    - `measurement`: the frames.
+
+    **Example:**
+
+    ```python
+    voltages = frames_of(pressed)
+    ```
+    """
     return np.where(measurement.mask, measurement.voltages, np.nan)
 
 

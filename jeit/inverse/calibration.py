@@ -128,6 +128,13 @@ class Calibration(Module):
     `Status.number` of how the fit ended; `reason`: a sentence on why it did not converge, empty if it did; `shift`
     (L, a): displacements of electrodes whose positions were estimated (`jeit.inverse.placement`), metres, else None;
     `model_error`: the `ModelError` of positions and contact impedances, if it was estimated.
+
+    **Example:**
+
+    ```python
+    fit = calibrate(model, reference)
+    fit.conductivity, fit.misfit, fit.model.electrodes.contact_impedance
+    ```
     """
 
     model: ForwardModel
@@ -196,18 +203,31 @@ def calibrate(
 ) -> Calibration:
     """Fit background conductivity and contact impedance to a reference frame by least squares.
 
-    - `voltages`: (M,) volts of the empty tank.
-    - `mask`: True for the channels to use.
-    - `contact`: "common" fits one factor of the model's contact impedance for all electrodes; "each" fits one per
-      electrode; "fixed" keeps the model's contact impedance.
-
     The parameters are logarithms, so conductivity and impedance stay positive. The fit starts from the model's contact
     impedance and the conductivity that best scales the prediction for σ = 1 to the data (voltages are proportional to
     1/σ at fixed z·σ). For complex voltages the background σ + iωε is complex, with the two parts of its logarithm as
-    parameters; contact impedances stay real. Raises `ValueError` for a frame of another shape or without signal.
+    parameters; contact impedances stay real.
 
     Works inside `jax.grad`, `jax.vmap` and `jax.jit`, with respect to the voltages and all fields of the model.
     Derivatives of the minimum follow from the implicit function theorem with the full Hessian.
+
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `voltages` (M,): of the body without changes, such as the empty tank, volts.
+    - `mask` (M,): True for the channels to use.
+    - `contact`: "common" fits one factor of the model's contact impedance for all electrodes; "each" fits one per
+      electrode; "fixed" keeps the model's contact impedance.
+    - `max_steps`: maximum number of steps.
+
+    Raises `ValueError` for a frame of another shape or without signal.
+
+    **Example:**
+
+    ```python
+    fit = calibrate(model, reference)
+    fit.conductivity, fit.misfit
+    ```
     """
     check_model(model)
     check_mask(mask)

@@ -126,8 +126,20 @@ def relative_noise(
     """Standard deviation of channels whose errors grow with their voltages: relative · √(v² + (floor · median|v|)²).
 
     In real tanks most errors of difference data are proportional to the voltage, because the model does not describe
-    gains, electrode shapes and depth exactly; they are largest where driven electrodes are read. `voltages` (M,):
-    reference frame, volts. `mask`: True for usable channels; others are left out of the median and get 1.
+    gains, electrode shapes and depth exactly; they are largest where driven electrodes are read.
+
+    **Arguments:**
+
+    - `voltages` (M,): reference frame, volts.
+    - `mask` (M,): True for usable channels; others are left out of the median and get 1.
+    - `relative`: error as a fraction of the voltage.
+    - `floor`: voltage, as a fraction of the median, below which errors do not fall further.
+
+    **Example:**
+
+    ```python
+    image = reconstruct(model, voltages, 1.0, hyperparameter=1.0, noise=relative_noise(reference))
+    ```
     """
     xp = namespace(voltages, mask)
     size = abs(xp.asarray(voltages))
@@ -158,10 +170,22 @@ def repeated_noise(frames, mask=None, *, prior_frames: float = 4.0) -> Float[np.
     """Standard deviation (M,) of the channels of a single frame, in volts, estimated from repeated frames of an
     unchanged body.
 
-    `frames` (F, M): volts, F at least 2. `mask` (F, M) or (M,): True for usable voltages; a channel with fewer than two
-    usable voltages gets 1. Estimates from few frames are uncertain, so variances are shrunk towards their median over
-    channels with a weight of `prior_frames` frames. Raises `ValueError` for other shapes, for identical frames, and for
-    NaN in usable voltages.
+    Estimates from few frames are uncertain, so variances are shrunk towards their median over channels.
+
+    **Arguments:**
+
+    - `frames` (F, M): volts, F at least 2.
+    - `mask` (F, M) or (M,): True for usable voltages; a channel with fewer than two usable voltages gets 1.
+    - `prior_frames`: weight of the median, in frames.
+
+    Raises `ValueError` for other shapes, for identical frames, and for NaN in usable voltages.
+
+    **Example:**
+
+    ```python
+    frames = reference + 1e-6 * np.random.default_rng(0).normal(size=(10, len(reference)))
+    noise = repeated_noise(frames)
+    ```
     """
     if np.iscomplexobj(frames):
         raise ValueError("frames are complex; give their real part or magnitude.")

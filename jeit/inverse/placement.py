@@ -54,6 +54,12 @@ class Uncertainty:
     the frame. `size`: of the lengths of the body, relative. `other`: of whatever else differs from the model, as a
     share of the difference of the two frames; the misfit of the reference, if that is larger. Raises `ValueError` for
     values that are negative or not finite, and for sizes and others above 1.
+
+    **Example:**
+
+    ```python
+    doubts = Uncertainty(position=1e-3, drift=0.05)
+    ```
     """
 
     position: float | None = None
@@ -72,9 +78,19 @@ class Uncertainty:
 
 
 class Placement(NamedTuple):
-    """**Fields**: `model`: the model with the estimated electrodes; `conductivity`: estimated background, S; `shift`
-    (L, a): displacements along the a directions in which each electrode can move, metres; `deviation` (L, a): their
-    posterior standard deviations, metres; `error`: what stays unknown."""
+    """Estimated positions of electrodes, the result of `place_electrodes`.
+
+    **Fields**: `model`: the model with the estimated electrodes; `conductivity`: estimated background, S/m (2-D: S);
+    `shift` (L, a): displacements along the a directions in which each electrode can move, metres; `deviation` (L, a):
+    their posterior standard deviations, metres; `error`: the `ModelError` that remains.
+
+    **Example:**
+
+    ```python
+    placed = place_electrodes(model, reference, deviation=1e-3)
+    placed.shift, placed.deviation
+    ```
+    """
 
     model: ForwardModel
     conductivity: float
@@ -84,14 +100,21 @@ class Placement(NamedTuple):
 
 
 class ModelError(NamedTuple):
-    """What is not known of electrode positions and contact impedances once the reference frame is: an error of the
-    model, of a difference as well.
+    """Error of the model, and so of a difference of two frames, because electrode positions and contact impedances are
+    known only as well as the reference frame determines them.
 
     **Fields**: `factor` (p, p): F with the posterior covariance F Fᵀ of the shifts, metres, and of the logarithms of
     the contact impedances; `drift`: standard deviation of the logarithm of each contact impedance, from the reference
     to the frame.
 
     Kaipio and Somersalo, Journal of Computational and Applied Mathematics 198 (2007) 493.
+
+    **Example:**
+
+    ```python
+    error = place_electrodes(model, reference, deviation=1e-3).error
+    error.factor.shape
+    ```
     """
 
     factor: Float[np.ndarray, "p p"]
@@ -131,13 +154,24 @@ def place_electrodes(
     deviation: float,
     mask: Bool[ArrayLike, " M"] | None = None,
 ) -> Placement:
-    """Estimate where the electrodes of a `model` are, and their contact impedances, from a frame of the homogeneous
-    body.
+    """Estimate where the electrodes of a model are, and their contact impedances, from a frame of the homogeneous body.
 
-    `voltages` (M,), volts; `mask` (M,): True for channels to use; `deviation`: standard deviation of the described
-    positions, metres, in every direction in which an electrode can move; 0 if they are exact. Raises `ValueError` for
-    electrodes that cannot move, invalid arguments, voltages that have the opposite sign of the model's, and where
-    nothing is found that explains them.
+    **Arguments:**
+
+    - `model`: the model with the electrodes as they are described.
+    - `voltages` (M,): of the homogeneous body, volts.
+    - `deviation`: standard deviation of the described positions, metres, in every direction in which an electrode can
+      move; 0 if they are exact.
+    - `mask` (M,): True for the channels to use.
+
+    Raises `ValueError` for electrodes that cannot move, invalid arguments, voltages that have the opposite sign of the
+    model's, and where nothing is found that explains them.
+
+    **Example:**
+
+    ```python
+    placed = place_electrodes(model, reference, deviation=1e-3)
+    ```
     """
     measured, used = check_frame(model, voltages, mask)
     check_has_values("place_electrodes", (model, measured), "the fit takes steps of NumPy", "take calibrate")

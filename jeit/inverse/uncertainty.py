@@ -44,6 +44,13 @@ class Posterior(Module):
 
     **Fields**: `inversion`: the problem; `coefficients` (n,): ĉ; `jacobian` (r, n): J at ĉ; `root` (r, r): W with
     WᵀW = (JQ⁻¹Jᵀ + C)⁻¹; `cross` (r, n): JQ⁻¹; `prior`: normal distribution of precision Q.
+
+    **Example:**
+
+    ```python
+    known = posterior(reconstruct(model, voltages, 1.0, prior=Gaussian(0.03), hyperparameter=1.0))
+    known.standard_deviation(), known.credible_interval()
+    ```
     """
 
     inversion: Inversion
@@ -125,6 +132,17 @@ def posterior(reconstruction: Reconstruction) -> Posterior:
     the edges, and roughly their heights, are known, and are too small at an edge that may lie elsewhere. Raises
     `ValueError` for bounded solvers, whose posterior is not nearly Gaussian, for a failed reconstruction, and for any
     other object.
+
+    **Arguments:**
+
+    - `reconstruction`: result of `reconstruct`.
+
+    **Example:**
+
+    ```python
+    known = posterior(reconstruct(model, voltages, 1.0, prior=Gaussian(0.03), hyperparameter=1.0))
+    lower, upper = known.credible_interval(0.9)
+    ```
     """
     check_kind("reconstruction", reconstruction, Reconstruction, "what reconstruct has returned")
     inversion, coefficients = reconstruction.inversion, reconstruction.coefficients
@@ -219,6 +237,16 @@ def image_noise(reconstruction: Reconstruction) -> Float[np.ndarray, " m"]:
     The coefficients at the solution satisfy c = K (Jc - r) with K = Jᵀ(JJᵀ + C)⁻¹, so noise of covariance C gives them
     the covariance K C Kᵀ. If the image's misfit exceeds 1, the standard deviation is multiplied by it. Raises
     `ValueError` for total variation and bounded solvers, to which this does not apply.
+
+    **Arguments:**
+
+    - `reconstruction`: result of `reconstruct`.
+
+    **Example:**
+
+    ```python
+    image_noise(reconstruct(model, voltages, 1.0, prior=Gaussian(0.03), hyperparameter=1.0))
+    ```
     """
     if not reconstruction.inversion.penalty.is_standard_normal:
         raise ValueError("reconstruction: only images with smooth priors and unbounded solvers have such a noise.")

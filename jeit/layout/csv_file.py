@@ -200,9 +200,20 @@ def read_surface_layout(path: str | Path, surface: Mesh, *, outward: bool = True
     """Read the electrodes of a curved skin from a `.csv` file, such as `write_layout` writes.
 
     The columns are `x_mm`, `y_mm`, `z_mm`, `diameter_mm` and optionally `label` and `contact_impedance_ohm_m2`, in the
-    format of `read_layout`. `surface` and `outward` as in `SurfaceLayout`; positions are moved to the surface. Raises
-    `FileNotFoundError` if there is no such file, and `ValueError` for an invalid table, naming the line, and as
-    `SurfaceLayout` does.
+    format of `read_layout`. Positions are moved to the surface. Raises `FileNotFoundError` if there is no such file,
+    and `ValueError` for an invalid table, naming the line, and as `SurfaceLayout` does.
+
+    **Arguments:**
+
+    - `path`: the file.
+    - `surface`, `outward`: as in `SurfaceLayout`.
+
+    **Example:**
+
+    ```python
+    write_layout(SurfaceLayout.spread(sleeve, 8, 0.01), "sleeve.csv")
+    layout = read_surface_layout("sleeve.csv", sleeve)
+    ```
     """
     path = Path(path)
     if path.suffix.lower() != ".csv":

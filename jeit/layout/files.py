@@ -41,9 +41,20 @@ def read_layout(path: str | Path, *, outline: Domain | None = None) -> Layout:
       state its size with a unit (mm, cm, in, pt, or px of 1/96 inch). The y axis points up in the layout and down in
       the file.
 
-    `outline`: outline of the skin, metres, used if the file contains none. Raises `FileNotFoundError` if there is no
-    such file, `ImportError` if the extra is missing, and `ValueError` for an invalid layout, naming the line or
-    electrode.
+    **Arguments:**
+
+    - `path`: the file.
+    - `outline`: outline of the skin, used if the file contains none.
+
+    Raises `FileNotFoundError` if there is no such file, `ImportError` if the extra is missing, and `ValueError` for an
+    invalid layout, naming the line or electrode.
+
+    **Example:**
+
+    ```python
+    write_layout(named_layout("perimeter-16"), "skin.csv")
+    layout = read_layout("skin.csv", outline=Rectangle(0.2, 0.2))
+    ```
     """
     path = Path(path)
     reader = _for_suffix(path, _READERS)
@@ -64,7 +75,18 @@ def write_layout(layout: Layout | SurfaceLayout, path: str | Path) -> None:
     y in an SVG file are minus those of the layout, since the y axis of SVG points down. A `SurfaceLayout` is written to
     CSV only, with a column `z_mm`, and is read with `read_surface_layout`.
 
+    **Arguments:**
+
+    - `layout`: the layout.
+    - `path`: the file, .csv, .dxf or .svg.
+
     Raises `ValueError` for another suffix or a path that cannot be written; `ImportError` if the extra is missing.
+
+    **Example:**
+
+    ```python
+    write_layout(named_layout("perimeter-16"), "skin.svg")
+    ```
     """
     path = Path(path)
     writer = _for_suffix(path, _WRITERS)

@@ -56,6 +56,13 @@ class Layout(Module):
     - `outline`: outline of the skin, metres, or None if not known.
     - `labels`: labels of the electrodes (L,), all different and on one line each; by default "1", "2", …
     - `name`: name of the layout, for reports.
+
+    **Example:**
+
+    ```python
+    layout = Layout([[-0.05, 0.0], [0.05, 0.0]], 0.01, outline=Rectangle(0.2, 0.1))
+    layout.sheet_discs(contact_impedance=1e-4)
+    ```
     """
 
     centres: Float[Array, "L 2"]

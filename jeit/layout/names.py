@@ -24,10 +24,24 @@ def ring(
     centre: tuple[float, float] = (0.0, 0.0),
     height: float | None = None,
 ) -> np.ndarray:
-    """Positions evenly spaced on a circle: (L, 2) metres, or (L, 3) at a given `height` (3-D tanks).
+    """Positions evenly spaced on a circle: (L, 2) metres, or (L, 3) at a given height (3-D tanks).
 
-    `radius`, `centre` and `height` in metres; `start_angle`: angle of the first electrode, radians counter-clockwise
-    from +x (default: 12 o'clock). Raises `ValueError` for a radius that is not positive or fewer than two electrodes.
+    **Arguments:**
+
+    - `radius`: of the circle, metres.
+    - `num_electrodes`: L.
+    - `start_angle`: angle of the first electrode, radians counter-clockwise from +x (default: 12 o'clock).
+    - `clockwise`: whether the electrodes follow each other clockwise.
+    - `centre` (x, y): of the circle, metres.
+    - `height`: z of all electrodes, metres.
+
+    Raises `ValueError` for a radius that is not positive or fewer than two electrodes.
+
+    **Example:**
+
+    ```python
+    positions = ring(0.1, 16)
+    ```
     """
     check_count(num_electrodes, 2)
     if not radius > 0:
@@ -39,9 +53,20 @@ def ring(
 
 
 def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.ndarray:
-    """Positions of a `ring` of electrodes and of one more in its centre, the last: (num_electrodes + 1, d) metres.
+    """Positions of a `ring` of electrodes and of one more in its centre, the last: (num_electrodes + 1, d) metres. For
+    use with `jeit.protocol.reference_electrode`.
 
-    For use with `jeit.protocol.reference_electrode`. `options` and errors as in `ring`.
+    **Arguments:**
+
+    - `radius`, `num_electrodes`, `options`: as in `ring`.
+
+    Raises `ValueError` as `ring` does.
+
+    **Example:**
+
+    ```python
+    positions = ring_and_centre(0.1, 16, clockwise=True)
+    ```
     """
     position = ring(radius, num_electrodes, **options)
     return np.vstack([position, position.mean(axis=0)])
@@ -50,9 +75,20 @@ def ring_and_centre(radius: float, num_electrodes: int, **options: Any) -> np.nd
 def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.ndarray:
     """Positions evenly spaced along the edge of an outline, counter-clockwise: (L, 2) metres.
 
-    `start`: arc length of the first electrode along `domain.boundary`, metres. The boundary of a rectangle begins at
-    its lower left corner; half a pitch keeps electrodes of a square away from the corners if L is a multiple of four.
+    **Arguments:**
+
+    - `domain`: the outline.
+    - `num_electrodes`: L.
+    - `start`: arc length of the first electrode along `domain.boundary`, metres. The boundary of a rectangle begins at
+      its lower left corner; half a pitch keeps electrodes of a square away from the corners if L is a multiple of four.
+
     Raises `ValueError` for fewer than two electrodes.
+
+    **Example:**
+
+    ```python
+    positions = perimeter(Rectangle(0.2, 0.2), 16, start=0.025)
+    ```
     """
     check_count(num_electrodes, 2)
     arc_length = start + domain.perimeter * np.arange(num_electrodes) / num_electrodes
@@ -62,10 +98,21 @@ def perimeter(domain: Domain, num_electrodes: int, *, start: float = 0.0) -> np.
 def grid(
     width: float, height: float, columns: int, rows: int, *, centre: tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
-    """Positions of a regular grid of rows × columns electrodes that spans width × height metres: (L, 2) metres, row by
-    row from the lower left.
+    """Positions of a regular grid of electrodes: (L, 2) metres, row by row from the lower left.
+
+    **Arguments:**
+
+    - `width`, `height`: distances between the outermost electrodes, metres.
+    - `columns`, `rows`: numbers of electrodes along x and along y.
+    - `centre` (x, y): of the grid, metres.
 
     Raises `ValueError` for sides that are not positive, and for fewer than one row or column.
+
+    **Example:**
+
+    ```python
+    positions = grid(0.15, 0.1, columns=4, rows=3)
+    ```
     """
     check_count(columns, 1)
     check_count(rows, 1)
@@ -81,8 +128,22 @@ def quasi_uniform(domain: Domain, num_electrodes: int, *, margin: float = 0.0, i
 
     The positions are the centroids of a centroidal Voronoi tessellation, so that the area around every electrode is
     about the same. It is computed by Lloyd's algorithm on a fine grid of sample points, starting from farthest-point
-    sampling, and is deterministic. `margin`: minimum distance to the outline, metres; `iterations`: maximum number of
-    iterations. Raises `ValueError` if the margin leaves no room.
+    sampling, and is deterministic.
+
+    **Arguments:**
+
+    - `domain`: the outline.
+    - `num_electrodes`: L.
+    - `margin`: minimum distance to the outline, metres.
+    - `iterations`: maximum number of iterations.
+
+    Raises `ValueError` if the margin leaves no room.
+
+    **Example:**
+
+    ```python
+    positions = quasi_uniform(Disk(0.1), 16, margin=0.01)
+    ```
     """
     check_count(num_electrodes, 1)
     x_min, x_max, y_min, y_max = domain.extent
@@ -145,8 +206,20 @@ def named_layout(name: str, outline: Domain | None = None, *, diameter: float = 
     - "perimeter-N": N electrodes along the edge of a rectangle or a disk, with 2 mm of skin outside them.
     - "inner-N": N electrodes spread evenly inside any outline.
 
-    `diameter`: diameter of the electrodes, metres. Raises `ValueError` for an unknown name, for a skin that the layout
-    does not exist for, and for electrodes that would overlap.
+    **Arguments:**
+
+    - `name`: one of the names above.
+    - `outline`: outline of the skin, by default 200 × 200 mm about the origin.
+    - `diameter`: diameter of the electrodes, metres.
+
+    Raises `ValueError` for an unknown name, for a skin that the layout does not exist for, and for electrodes that
+    would overlap.
+
+    **Example:**
+
+    ```python
+    layout = named_layout("perimeter-16", Disk(0.1))
+    ```
     """
     outline = Rectangle(_PARK_SIDE, _PARK_SIDE) if outline is None else outline
     made = re.fullmatch(r"(perimeter|inner)-(\d{1,4})", name) if isinstance(name, str) else None

@@ -42,9 +42,23 @@ def spread(
 
     The counterpart of `quasi_uniform` for surfaces: each position is the centroid of the part of the surface that is
     closer to it than to any other position, by distances along the surface. It is computed by Lloyd's algorithm,
-    starting from farthest-point sampling, and is deterministic. `face`: face of a shell, "inner" or "outer"; `margin`:
-    minimum distance from the edge, metres; `iterations`: maximum number of iterations. Raises `ValueError` for fewer
-    than one position, a margin that leaves no room, and as `Triangles.of` does.
+    starting from farthest-point sampling, and is deterministic.
+
+    **Arguments:**
+
+    - `surface`: a surface in space, its triangles, or a shell.
+    - `number`: number of positions L.
+    - `face`: face of a shell, "inner" or "outer".
+    - `margin`: minimum distance from the edge, metres.
+    - `iterations`: maximum number of iterations.
+
+    Raises `ValueError` for fewer than one position, a margin that leaves no room, and as `Triangles.of` does.
+
+    **Example:**
+
+    ```python
+    positions = spread(sleeve, 12, margin=0.005)
+    ```
     """
     check_count(number, 1)
     triangles = surface if isinstance(surface, Triangles) else Triangles.of(surface, face)
@@ -114,6 +128,13 @@ class SurfaceLayout(Module):
       on its outer face. If False, it extends inwards, and electrodes are on its outer face.
     - `labels`: labels of the electrodes (L,), all different and on one line each; by default "1", "2", …
     - `name`: name of the layout, for reports.
+
+    **Example:**
+
+    ```python
+    layout = SurfaceLayout([[0.04, 0.0, 0.02], [-0.04, 0.0, 0.08]], 0.01, sleeve)
+    layout.lengths, layout.discs(contact_impedance=1e-4)
+    ```
     """
 
     centres: Float[Array, "L 3"]

@@ -143,6 +143,12 @@ class ColourScale(Module):
     - `bar`: whether to draw the colour bar.
 
     Raises `ValueError` for a limit that is negative or not finite.
+
+    **Example:**
+
+    ```python
+    plot_image(mesh, 1 + image, scale=ColourScale(difference=False, colour_map="magma"))
+    ```
     """
 
     difference: bool = True

@@ -40,8 +40,20 @@ def measurement_patterns(num_electrodes: int, measurement: Reading, reference: i
     - "mean": each potential minus the mean of all others, K = L; L / (L - 1) times the "mean-removed" values.
     - "against": each electrode against electrode `reference` (0-based, by default the last), K = L - 1.
 
+    **Arguments:**
+
+    - `num_electrodes`: L.
+    - `measurement`: one of the names above.
+    - `reference`: electrode of "against".
+
     Raises `ValueError` for an invalid count or option, and for a `reference` that does not exist or is given for
     another `measurement` than "against".
+
+    **Example:**
+
+    ```python
+    patterns = measurement_patterns(16, "against", reference=0)
+    ```
     """
     count = check_count(num_electrodes, "measurement_patterns", 2)
     check_choice(measurement, READINGS, "measurement_patterns", "measurement")
@@ -66,16 +78,25 @@ def from_matrices(
     name: str = "custom",
     large_currents: bool = False,
 ) -> Protocol:
-    """Combine every drive pattern with every measurement pattern, drive by drive.
+    """Combine every drive pattern with every measurement pattern, drive by drive. Channels are in the order of
+    `select.ravel()`: all measurements of the first drive, then of the second.
 
-    - `drive`: (S, L) currents in amperes, one row per drive.
-    - `measurement`: (K, L) weights, one row per measurement.
-    - `select`: (S, K) booleans, which combinations are measured; by default all.
+    **Arguments:**
+
+    - `drive` (S, L): currents in amperes, one row per drive.
+    - `measurement` (K, L): weights, one row per measurement.
+    - `select` (S, K): True for the combinations that are measured; by default all.
+    - `name`: name in reports.
     - `large_currents`: accept currents above 1 A, which are otherwise taken for an error of units.
 
-    Channels are in the order of `select.ravel()`: all measurements of the first drive, then of the second.
-
     Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A, and a `select` of another shape.
+
+    **Example:**
+
+    ```python
+    pairs = np.eye(8) - np.roll(np.eye(8), 1, axis=1)
+    protocol = from_matrices(1e-3 * pairs, pairs)
+    ```
     """
     drive, measurement = _as_matrix(drive, "drive"), _as_matrix(measurement, "measurement")
     if not large_currents:
@@ -103,12 +124,23 @@ def from_channels(
 ) -> Protocol:
     """Create a protocol from one measurement pattern and one drive index per channel, as is common for measured data.
 
-    - `drive`: (S, L) currents in amperes, one row per drive.
-    - `channel_measurement`: (M, L) weights, one row per channel; equal rows are stored once.
-    - `drive_index`: (M,) 0-based index of the drive of each channel.
+    **Arguments:**
+
+    - `drive` (S, L): currents in amperes, one row per drive.
+    - `channel_measurement` (M, L): weights, one row per channel; equal rows are stored once.
+    - `drive_index` (M,): 0-based index of the drive of each channel.
+    - `name`: name in reports.
+    - `large_currents`: accept currents above 1 A, which are otherwise taken for an error of units.
 
     Raises `ValueError` for patterns that `Protocol` rejects, currents above 1 A (unless `large_currents`), and a
     `drive_index` of another length.
+
+    **Example:**
+
+    ```python
+    known = adjacent(8)
+    protocol = from_channels(known.drive, known.channel_measurement, known.drive_index)
+    ```
     """
     drive, rows = _as_matrix(drive, "drive"), _as_matrix(channel_measurement, "measurement")
     if not large_currents:
@@ -161,14 +193,23 @@ def trigonometric(
 ) -> Protocol:
     """Sinusoidal currents in all electrodes at once: L - 1 drives, L(L - 1) channels.
 
-    The drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L and amplitude `current` in amperes: the patterns
-    that best distinguish a centred inclusion in a disk (Isaacson 1986; Gisser, Isaacson and Newell 1988). 16 electrodes
-    give 240 channels. On a solid, θ follows the electrodes' numbers: the drives are still complete, but no longer
-    optimal.
+    The drives are cos(θ), sin(θ), cos(2θ), sin(2θ), ... with θ = 2πl/L: the patterns that best distinguish a centred
+    inclusion in a disk (Isaacson 1986; Gisser, Isaacson and Newell 1988). 16 electrodes give 240 channels. On a solid,
+    θ follows the electrodes' numbers: the drives are still complete, but no longer optimal.
 
+    **Arguments:**
+
+    - `num_electrodes`: L.
     - `measurement`, `reference`: as in `measurement_patterns`.
+    - `current`: amplitude in amperes.
 
     Raises `ValueError` for an invalid count, current or option.
+
+    **Example:**
+
+    ```python
+    protocol = trigonometric(16)
+    ```
     """
     count = check_count(num_electrodes, "trigonometric", 3)
     angle = 2 * np.pi * np.arange(count) / count
@@ -185,17 +226,25 @@ def haar(
     reference: int | None = None,
     current: Current = 1e-3,
 ) -> Protocol:
-    """Haar wavelets over the electrodes' numbers: L - 1 orthogonal drives, coarse to fine, with currents of at most
-    `current` amperes.
+    """Haar wavelets over the electrodes' numbers: L - 1 orthogonal drives, coarse to fine.
 
     The first drive sends current from the first half of the electrodes to the second, the next two drives do so within
     each half, and so on (Haar 1910). If L is not a power of two, halves differ by one electrode, and each electrode of
-    the larger half carries less current, so that the sum is zero (unbalanced wavelets: Girardi and Sweldens 1997). L is
-    at least 2.
+    the larger half carries less current, so that the sum is zero (unbalanced wavelets: Girardi and Sweldens 1997).
 
+    **Arguments:**
+
+    - `num_electrodes`: L, at least 2.
     - `measurement`, `reference`: as in `measurement_patterns`.
+    - `current`: maximum current of an electrode, amperes.
 
     Raises `ValueError` for an invalid count, current or option.
+
+    **Example:**
+
+    ```python
+    protocol = haar(16)
+    ```
     """
     count = check_count(num_electrodes, "haar", 2)
     parts, drives = [np.arange(count)], []
@@ -222,18 +271,26 @@ def optimal(
 ) -> Protocol:
     """The currents that best distinguish two bodies, best first: at most L - 1 drives.
 
-    - `transfer`, `other`: (L, L) ohm, the transfer impedances of both bodies (`ForwardModel.transfer_impedance`, or
+    **Arguments:**
+
+    - `transfer`, `other` (L, L): transfer impedances of both bodies, ohm (`ForwardModel.transfer_impedance`, or
       measured: `jeit.data.transfer_impedance`). Without `other`, the drives are the eigenvectors of `transfer`.
     - `number`: maximum number of drives, by default all; a difference of low rank has fewer.
-    - `current`: unless `power` is given, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed ‖I‖: they are singular vectors
-      of the difference (Isaacson 1986; Gisser, Isaacson and Newell 1990), each scaled so that the maximum current of an
-      electrode is `current` amperes.
     - `power`: if given, in watts, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed power Iᵀ Z₁ I (Cheney and Isaacson
       1992), and each dissipates this power in the first body. It requires `other`, and `current` is not used.
     - `measurement`, `reference`: as in `measurement_patterns`.
+    - `current`: unless `power` is given, the drives I maximise ‖(Z₁ - Z₂) I‖ for fixed ‖I‖: they are singular vectors
+      of the difference (Isaacson 1986; Gisser, Isaacson and Newell 1990), each scaled so that the maximum current of an
+      electrode is `current` amperes.
 
     Raises `ValueError` for matrices that are not square, real, finite, and symmetric to within a tenth; for equal
     matrices; if `power` is given and some currents dissipate no power in `transfer`; and for invalid options.
+
+    **Example:**
+
+    ```python
+    protocol = optimal(transfer, number=5)
+    ```
     """
     first = _check_transfer("transfer", transfer)
     count = len(first)

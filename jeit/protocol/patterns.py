@@ -117,13 +117,22 @@ def adjacent(
 
     16 electrodes give 208 voltages, or 104 with `reciprocal="half"`. Brown and Seagar 1987.
 
+    **Arguments:**
+
     - `num_electrodes`: L, at least 4.
     - `current`: amplitude in amperes.
     - `driven_electrodes`: also measure on electrodes that carry current (L² channels).
-    - `reciprocal`: "half" keeps the first of every two channels that are equal by reciprocity.
+    - `reciprocal`: "half" keeps the first of every two channels that are equal by reciprocity, "all" keeps both.
     - `order`: "rotating" starts the measurements of each drive at the driven pair, "fixed" always at electrode 0.
 
     Raises `ValueError` for an invalid count, current or option.
+
+    **Example:**
+
+    ```python
+    protocol = adjacent(16, current=5e-3)
+    protocol.num_measurements
+    ```
     """
     return skip(
         num_electrodes,
@@ -145,11 +154,21 @@ def skip(
     reciprocal: Reciprocal = "all",
     order: Order = "rotating",
 ) -> Protocol:
-    """Drive pairs that skip `skipped` electrodes, and measurement pairs that skip `measurement_skipped`.
+    """Drive pairs and measurement pairs that skip electrodes. Skip-0 is adjacent.
 
-    Skip-0 is adjacent. `measurement_skipped` equals `skipped` unless given. Options as in `adjacent`.
+    **Arguments:**
+
+    - `skipped`: number of electrodes between the two driven ones.
+    - `measurement_skipped`: number of electrodes between the two measured ones, by default `skipped`.
+    - `num_electrodes`, `current`, `driven_electrodes`, `reciprocal`, `order`: as in `adjacent`.
 
     Raises `ValueError` for a skip that is negative or leads back to the same electrode, and as `adjacent` does.
+
+    **Example:**
+
+    ```python
+    protocol = skip(16, 4)
+    ```
     """
     where = "adjacent" if skipped == 0 else "skip"
     count = check_count(num_electrodes, where, 4)
@@ -180,12 +199,22 @@ def opposite(
     driven_electrodes: bool = False,
     order: Order = "rotating",
 ) -> Protocol:
-    """Opposite drive and adjacent measurement: L(L - 4)/2 channels from the L/2 distinct drives.
+    """Opposite drive and adjacent measurement: L(L - 4)/2 channels from the L/2 distinct drives. 16 electrodes give 96
+    voltages, 8 electrodes 16.
 
-    16 electrodes give 96 voltages, 8 electrodes 16. `drives="all"` also drives each pair in the opposite direction,
-    which doubles the number of voltages (192 and 32) without adding information. Options as in `adjacent`.
+    **Arguments:**
+
+    - `num_electrodes`, `current`, `driven_electrodes`, `order`: as in `adjacent`.
+    - `drives`: "all" also drives each pair in the opposite direction, which doubles the number of voltages (192 and 32)
+      without adding information.
 
     Raises `ValueError` for an odd number of electrodes, and as `adjacent` does.
+
+    **Example:**
+
+    ```python
+    protocol = opposite(16)
+    ```
     """
     count = check_count(num_electrodes, "opposite", 4)
     if count % 2:
@@ -215,6 +244,10 @@ def all_against_one(
 ) -> Protocol:
     """Drive every electrode in turn against the electrode `common`: L - 1 drives.
 
+    **Arguments:**
+
+    - `num_electrodes`, `current`, `reciprocal`: as in `adjacent`.
+    - `common`: index of the electrode against which all others are driven.
     - `measurement`: "common" also measures every electrode against `common` ((L - 1)² channels, all of which are on a
       driven electrode); "adjacent" measures neighbouring pairs.
     - `driven_electrodes`: measure on electrodes that carry current; by default only for `measurement="common"`, which
@@ -222,6 +255,12 @@ def all_against_one(
 
     Raises `ValueError` if `common` is not an electrode, for `measurement="common"` with `driven_electrodes=False`, and
     as `adjacent` does.
+
+    **Example:**
+
+    ```python
+    protocol = all_against_one(16, common=0, measurement="adjacent")
+    ```
     """
     count = check_count(num_electrodes, "all_against_one", 3)
     check_choice(measurement, ("common", "adjacent"), "all_against_one", "measurement")
@@ -252,11 +291,20 @@ def reference_electrode(
     The protocol has `num_boundary + 1` electrodes. 16 boundary electrodes and a central one give 16 · 14 = 224 voltages
     with adjacent drive (Silvera Tawil et al. 2011, "centre measurement pattern").
 
+    **Arguments:**
+
     - `num_boundary`: number of boundary electrodes, at least 4.
     - `skipped`: number of electrodes between the two driven ones.
     - `reference`: index of the reference electrode among the `num_boundary + 1`; by default the last.
+    - `current`, `driven_electrodes`, `order`: as in `adjacent`.
 
-    Other options as in `adjacent`. Raises `ValueError` for a `reference` that does not exist, and as `adjacent` does.
+    Raises `ValueError` for a `reference` that does not exist, and as `adjacent` does.
+
+    **Example:**
+
+    ```python
+    protocol = reference_electrode(16)
+    ```
     """
     count = check_count(num_boundary, "reference_electrode", 4)
     reference = count if reference is None else reference
@@ -283,12 +331,22 @@ def two_terminal(
     *,
     current: Current = 1e-3,
 ) -> Protocol:
-    """Drive and measure on the same two electrodes, pair by pair.
-
-    All L(L - 1)/2 pairs are used, or those in `pairs` (P, 2). Each voltage includes the voltage drop at the contact
+    """Drive and measure on the same two electrodes, pair by pair. Each voltage includes the voltage drop at the contact
     impedances of both electrodes.
 
+    **Arguments:**
+
+    - `num_electrodes`: L.
+    - `pairs` (P, 2): indices of electrodes from 0; by default all L(L - 1)/2 pairs.
+    - `current`: amplitude in amperes.
+
     Raises `ValueError` if a pair contains an electrode twice, or one that does not exist.
+
+    **Example:**
+
+    ```python
+    protocol = two_terminal(8)
+    ```
     """
     count = check_count(num_electrodes, "two_terminal", 2)
     check_current(current, "two_terminal")
@@ -316,11 +374,21 @@ def bipolar(
     reciprocal: Reciprocal = "all",
     name: str = "bipolar",
 ) -> Protocol:
-    """Combine any drive pairs (S, 2) with any measurement pairs (K, 2), drive by drive.
+    """Combine any drive pairs with any measurement pairs, drive by drive.
 
-    Options as in `adjacent`.
+    **Arguments:**
+
+    - `num_electrodes`, `current`, `driven_electrodes`, `reciprocal`: as in `adjacent`.
+    - `drive_pairs` (S, 2), `measurement_pairs` (K, 2): indices of electrodes from 0, positive first.
+    - `name`: name in reports.
 
     Raises `ValueError` if a pair contains an electrode twice, or one that does not exist.
+
+    **Example:**
+
+    ```python
+    protocol = bipolar(8, [[0, 4], [2, 6]], [[1, 2], [3, 4], [5, 6]])
+    ```
     """
     count = check_count(num_electrodes, "bipolar", 2)
     drive = check_pairs(drive_pairs, count, "bipolar: drive_pairs")

@@ -179,6 +179,13 @@ class Protocol(Module):
 
     **Raises** `ValueError` for patterns with NaN, with a zero row, with a row that does not sum to zero, or with
     different numbers of electrodes, and for indices out of range.
+
+    **Example:**
+
+    ```python
+    pairs = np.array([[1.0, -1, 0, 0], [0, 1, -1, 0], [0, 0, 1, -1]])
+    protocol = Protocol(1e-3 * pairs[:1], pairs[1:], drive_index=[0, 0], measurement_index=[0, 1])
+    ```
     """
 
     drive: Float[Array, "S L"] = eqx.field(converter=_as_float)

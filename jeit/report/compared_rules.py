@@ -31,7 +31,18 @@ _MAX_MESH_NODES = 1000
 
 def report_measurement(measurement: Measurement) -> dict[str, Any]:
     """Report of a measurement, as printed by `jeit info`: frames, body, electrodes, protocol and noise, in SI units.
-    Unknown values are None."""
+    Unknown values are None.
+
+    **Arguments:**
+
+    - `measurement`: the frames.
+
+    **Example:**
+
+    ```python
+    report_measurement(pressed)
+    ```
+    """
     protocol, noise, signs = measurement.protocol, estimate_noise(measurement), impossible_signs(measurement)
     content = {
         **describe_measurement(measurement),
@@ -81,9 +92,20 @@ _MAX_MARKED = 8
 
 
 def write_choice(result: ComparedRules, folder: str | Path) -> None:
-    """Write `choice.png` and `choice.json` to `folder`, which is created if needed.
+    """Write a picture of a comparison of rules, `choice.png`, and its report, `choice.json`.
+
+    **Arguments:**
+
+    - `result`: the comparison.
+    - `folder`: created if needed.
 
     Raises `ValueError` for a path that cannot be a folder.
+
+    **Example:**
+
+    ```python
+    write_choice(compared, "out")
+    ```
     """
     with results(folder, ("choice.png", "choice.json")) as made:
         draw_choice(result).savefig(made / "choice.png", dpi=120)
@@ -91,7 +113,18 @@ def write_choice(result: ComparedRules, folder: str | Path) -> None:
 
 
 def draw_choice(result: ComparedRules):
-    """Draw the image of every rule, above the curves from which each rule chose λ; return a matplotlib `Figure`."""
+    """Draw the image of every rule, above the curves from which each rule chose λ; return a matplotlib `Figure`.
+
+    **Arguments:**
+
+    - `result`: the comparison.
+
+    **Example:**
+
+    ```python
+    draw_choice(compared).savefig("choice.png")
+    ```
+    """
     from matplotlib.figure import Figure
 
     from jeit.plot import plot_choice
@@ -136,7 +169,18 @@ def _draw_scale(ax, largest: float, unit: str) -> None:
 
 
 def report_choice(result: ComparedRules) -> dict[str, Any]:
-    """Report of the comparison as plain numbers, strings, lists and dictionaries; unknown values are None."""
+    """Report of the comparison as plain numbers, strings, lists and dictionaries; unknown values are None.
+
+    **Arguments:**
+
+    - `result`: the comparison.
+
+    **Example:**
+
+    ```python
+    report_choice(compared)
+    ```
+    """
     prepared, settings = result.prepared, result.settings
     unit = "S" if prepared.mesh.dimension == 2 else "S/m"
     rules = []

@@ -32,8 +32,7 @@ _PACKAGES = ("jeit", "jax", "numpy", "scipy", "equinox", "lineax", "optimistix",
 
 
 def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[float, float] | None = None) -> None:
-    """Write `image.png`, `image.npz`, `report.json` and, for a solid, `image.vtu` to `folder`, which is created if
-    needed.
+    """Write `image.png`, `image.npz`, `report.json` and, for a solid, `image.vtu` to a folder.
 
     Arrays of the NPZ:
 
@@ -47,8 +46,20 @@ def write_image(result: ImagedDifference, folder: str | Path, *, truth: tuple[fl
     - `departure`: (m,), for iterative images, logarithm to base 10 of conductivity divided by background.
     - electrodes and inclusions, see `jeit.report.saved_image.saved_extras`, for `jeit view`.
 
-    The VTU has the conductivity and its change per cell, and the electrode of each node. `truth`: a known position
-    (x, y) in metres, marked in the picture of a sheet. Raises `ValueError` for a path that cannot be a folder.
+    The VTU has the conductivity and its change per cell, and the electrode of each node. Raises `ValueError` for a path
+    that cannot be a folder.
+
+    **Arguments:**
+
+    - `result`: the image.
+    - `folder`: created if needed.
+    - `truth` (x, y): a known position in metres, marked in the picture of a sheet.
+
+    **Example:**
+
+    ```python
+    write_image(imaged, "out")
+    ```
     """
     with results(folder, IMAGE_FILES) as made:
         draw_image(result, truth=truth).savefig(made / "image.png", dpi=150)
@@ -87,7 +98,19 @@ def _draw_views(result: ImagedDifference) -> np.ndarray:
 
 def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = None):
     """Draw a result, and return a matplotlib `Figure` that needs no display. For an image of admittivity, the real and
-    imaginary part are drawn."""
+    imaginary part are drawn.
+
+    **Arguments:**
+
+    - `result`: the image.
+    - `truth` (x, y): a known position in metres, marked in the picture of a sheet.
+
+    **Example:**
+
+    ```python
+    draw_image(imaged, truth=(0.02, 0.01)).savefig("image.png")
+    ```
+    """
     from matplotlib.figure import Figure
 
     from jeit.plot.axes import CHANGE, LOGARITHM
@@ -136,7 +159,18 @@ def draw_image(result: ImagedDifference, *, truth: tuple[float, float] | None = 
 
 def report_image(result: ImagedDifference) -> dict[str, Any]:
     """Report of the image and the settings as plain numbers, strings, lists and dictionaries; unknown values are
-    None."""
+    None.
+
+    **Arguments:**
+
+    - `result`: the image.
+
+    **Example:**
+
+    ```python
+    report_image(imaged)
+    ```
+    """
     reconstruction, quality, settings = result.reconstruction, result.quality, result.settings
     noise = quality.difference_noise
     content = {

@@ -56,12 +56,22 @@ _READ_ARRAYS = (
 class SavedImage:
     """Content of an `image.npz`: a body and its image.
 
+    **Fields**
+
     - `mesh`: the mesh of the body.
     - `change`: change of conductivity in every cell (m,), S/m (2-D: S); complex for admittivity.
     - `background`: conductivity of the reference; None if the file lacks it.
     - `departure`: (m,), for iterative images, logarithm to base 10 of conductivity divided by background; else None.
     - `electrodes`: electrodes as polygons; None if the file has none.
     - `inclusions`: the inclusions found in the image.
+
+    **Example:**
+
+    ```python
+    write_image(imaged, "out")
+    saved = read_image("out/image.npz")
+    saved.mesh, saved.change
+    ```
     """
 
     mesh: Mesh
@@ -113,6 +123,17 @@ def read_image(path: str | Path) -> SavedImage:
 
     Files of earlier versions lack electrodes and inclusions. Raises `ValueError` for files of another kind and for
     arrays that do not fit together, and `OSError` if the file does not exist.
+
+    **Arguments:**
+
+    - `path`: the file.
+
+    **Example:**
+
+    ```python
+    write_image(imaged, "out")
+    saved = read_image("out/image.npz")
+    ```
     """
     path = Path(path)
     name = path.name[:80]
@@ -241,16 +262,32 @@ def write_views(
     axis: str = "z",
     slices: int = 9,
 ) -> tuple[str, ...]:
-    """Write pictures of an image to `folder`, which is created if needed, and return their names.
+    """Write pictures of an image to a folder, and return their names.
 
-    - For a solid: `overview.png`; `isosurfaces.png`, isosurfaces at `levels`, seen from the `camera`, from the opposite
-      side, from the front and from above; `slices.png`, the given number of `slices` perpendicular to `axis`; and
-      `planes.png`, sections by `planes`, if any are given.
+    - For a solid: `overview.png`; `isosurfaces.png`, isosurfaces, seen from the `camera`, from the opposite side, from
+      the front and from above; `slices.png`, evenly spaced slices; and `planes.png`, sections by planes, if any are
+      given.
     - For a surface in space: `surface.png`, seen from the same sides.
     - For a sheet: `image.png`.
 
     For complex images, the real part is drawn. Raises `ValueError` for planes if the body is not a solid, for a path
     that cannot be a folder, and as `jeit.plot.plot_solid`.
+
+    **Arguments:**
+
+    - `image`: the image.
+    - `folder`: created if needed.
+    - `camera`: direction of view.
+    - `levels`: isosurfaces, as in `jeit.plot.plot_isosurfaces`.
+    - `planes`: planes of sections.
+    - `axis`, `slices`: axis perpendicular to the slices, "x", "y" or "z", and number of slices.
+
+    **Example:**
+
+    ```python
+    write_image(imaged, "out")
+    write_views(read_image("out/image.npz"), "out")
+    ```
     """
     if image.mesh.dimension != 3 and planes:
         raise ValueError("planes cut solids; this image is of a sheet. Leave them out.")

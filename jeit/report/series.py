@@ -48,7 +48,10 @@ def write_film(
 ) -> None:
     """Write the frames of a stream as a film with one colour scale.
 
-    - `path`: ends in .gif or .mp4.
+    **Arguments:**
+
+    - `path`: file of the film, .gif or .mp4.
+    - `mesh`, `electrodes`: as in `jeit.plot.plot_image`.
     - `changes`, `titles`: as in `jeit.plot.plot_frames`; refused frames are shown as refused.
     - `limit`: end of the colour scale, S (3-D: S/m); default: the maximum over all frames.
     - `rate`: frames per second of the stream. The film then lasts as long as the stream, but has at most 25 frames per
@@ -57,6 +60,12 @@ def write_film(
 
     For longer streams, 120 evenly spaced frames are drawn. Raises `ValueError` for an unknown suffix, for .mp4 if
     ffmpeg is not installed, and if every frame was refused.
+
+    **Example:**
+
+    ```python
+    write_film("press.gif", mesh, np.outer(np.linspace(0, 1, 5), np.ones(mesh.num_cells)))
+    ```
     """
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
@@ -101,13 +110,24 @@ def write_series(
     """Write `series.png`, `series.npz`, `regions.csv`, `report.json` and, if its name is given, a film to `folder`;
     return the report.
 
+    **Arguments:**
+
+    - `series_result`: the images.
+    - `folder`: created if needed.
     - `regions`: cells (m,) of each region, by name; default: the whole body.
     - `oscillations`: oscillations of `series_result.series.changes`.
+    - `film`: name of the film's file, ending in .gif or .mp4.
 
     The table has the time in seconds, or the number of the frame, and the mean change of each region, S/m (2-D: S),
     empty for refused frames. The NPZ has `changes` (F, m), `times` (F,), `background`, `points`, `cells`, `functional`
     (m,), and, for k oscillations, `frequency` (k,), `amplitude` (k, m) and `phase` (k, m) in radians. Raises
     `ValueError` for names that cannot be a folder or a film.
+
+    **Example:**
+
+    ```python
+    report = write_series(series, "out")
+    ```
     """
     series, model = series_result.series, series_result.prepared.model
     chosen = {"whole body": np.ones(series.mesh.num_cells, bool)} if not regions else dict(regions)

@@ -59,8 +59,11 @@ def write_stream(
     """Write a stream of any length to `folder`: `frames.csv`, with a line for every frame as it arrives, and at the end
     `images.npz`, the contact sheet `frames.png`, and a film. Images are stored on the disk, not in memory.
 
-    - `images`: images of `jeit.inverse.stream`, computed by an imager with this `calibration` (see
-      `jeit.imaging.prepare_imager`).
+    **Arguments:**
+
+    - `images`: images of `jeit.inverse.stream`.
+    - `calibration`: calibration of their imager (see `jeit.imaging.prepare_imager`).
+    - `folder`: created if needed.
     - `name`: name of the stream, for error messages.
     - `film`: name of the film's file, ending in .gif or, if ffmpeg is installed, .mp4; None for no film.
     - `rate`: frames per second, for titles with times instead of frame numbers, and for the pace of the film.
@@ -74,6 +77,13 @@ def write_stream(
     and pictures of an earlier stream are deleted first; each file is written completely or not at all. Raises
     `ValueError` for a stream without frames and for values that cannot be a folder, a film or a rate, and `OSError` if
     the disk is full.
+
+    **Example:**
+
+    ```python
+    frames = np.concatenate([frames_of(rest), frames_of(pressed)])
+    written = write_stream(stream(imager, frames), calibration, "out", film=None)
+    ```
     """
     if film is not None:
         check_film(film)

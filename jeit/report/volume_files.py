@@ -30,11 +30,24 @@ def write_vtu(
     point_data: Mapping[str, ArrayLike] | None = None,
     electrodes: AbstractElectrodes | None = None,
 ) -> None:
-    """Write a mesh with values per cell (m,) and per node (n,) as VTU file; complex values are written as two arrays.
+    """Write a mesh with values on it as VTU file; complex values are written as two arrays. Lengths are in metres.
 
-    With `electrodes`, the array "electrode" has the number of the electrode at each node, from 1, and 0 for other
-    nodes. Lengths are in metres. Raises `ValueError` for another suffix, values of another length, and a path that
-    cannot be written to.
+    **Arguments:**
+
+    - `path`: the .vtu file.
+    - `mesh`: the mesh.
+    - `cell_data`: values (m,) by name.
+    - `point_data`: values (n,) by name.
+    - `electrodes`: written as the array "electrode", the number of the electrode at each node, from 1, and 0 for other
+      nodes.
+
+    Raises `ValueError` for another suffix, values of another length, and a path that cannot be written to.
+
+    **Example:**
+
+    ```python
+    write_vtu("image.vtu", mesh, {"change": np.ones(mesh.num_cells)})
+    ```
     """
     path = Path(path)
     if path.suffix.lower() != ".vtu":
@@ -61,9 +74,22 @@ def draft_vtu(
 def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
     """Write a time series as a .pvd file, which ParaView opens, and one VTU file for each frame.
 
-    `times`: (F,) seconds; `cell_data`: values (F, m) by name. The VTU files are named after the series, such as
-    `breath_0000.vtu`. Either all files are written or none. Raises `ValueError` for another suffix, and for arrays that
-    do not fit together.
+    The VTU files are named after the series, such as `breath_0000.vtu`. Either all files are written or none.
+
+    **Arguments:**
+
+    - `path`: the .pvd file.
+    - `mesh`: the mesh.
+    - `times` (F,): seconds.
+    - `cell_data`: values (F, m) by name.
+
+    Raises `ValueError` for another suffix, and for arrays that do not fit together.
+
+    **Example:**
+
+    ```python
+    write_vtk_series("breath.pvd", mesh, [0.0, 0.1], {"change": np.zeros((2, mesh.num_cells))})
+    ```
     """
     path = Path(path)
     if path.suffix.lower() != ".pvd":
@@ -89,8 +115,21 @@ def write_vtk_series(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: 
 
 
 def write_xdmf(path: str | Path, mesh: Mesh, times: ArrayLike, cell_data: Mapping[str, ArrayLike]) -> None:
-    """Write a time series as a single XDMF file in text format; arguments as for `write_vtk_series`. Raises
-    `ValueError` for a suffix other than .xdmf, and for arrays that do not fit together."""
+    """Write a time series as a single XDMF file in text format.
+
+    **Arguments:**
+
+    - `path`: the .xdmf file.
+    - `mesh`, `times`, `cell_data`: as for `write_vtk_series`.
+
+    Raises `ValueError` for a suffix other than .xdmf, and for arrays that do not fit together.
+
+    **Example:**
+
+    ```python
+    write_xdmf("breath.xdmf", mesh, [0.0, 0.1], {"change": np.zeros((2, mesh.num_cells))})
+    ```
+    """
     from meshio.xdmf import TimeSeriesWriter
 
     path = Path(path)

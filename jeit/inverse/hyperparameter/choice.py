@@ -34,6 +34,13 @@ class Choice(Module):
 
     For a given number, the number is the only candidate and the curves are empty, (0,). Without data, residual and
     penalty are empty.
+
+    **Example:**
+
+    ```python
+    choice = choose_hyperparameter(model, 1.0, rule="gcv", difference=change, noise=1e-6)
+    choice.hyperparameter, choice.note
+    ```
     """
 
     hyperparameter: Float[Array, ""]

@@ -24,12 +24,25 @@ def choose_hyperparameter(
     noise: Float[Array, " M"] | float = 1.0,
     mask: Bool[Array, " M"] | None = None,
 ) -> Choice:
-    """Choose the λ that `one_step` would use with the same arguments, without computing the image.
+    """Choose the λ that `one_step` would use with the same arguments, without computing the image. The choice can be
+    given to `one_step` as its hyperparameter.
 
-    `conductivity`: the background, S/m (2-D: S). `rule`: a name in `jeit.inverse.RULES`, or a function of (spectrum,
-    data, mesh) that returns a `Choice`, such as `functools.partial(noise_figure, target=0.5)` with a rule of
-    `jeit.inverse.hyperparameter.rules`. The choice can be given to `one_step` as its hyperparameter. Raises
-    `ValueError` for arguments that do not fit together.
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `conductivity`: the background, S/m (2-D: S).
+    - `rule`: a name in `jeit.inverse.RULES`, or a function of (spectrum, data, mesh) that returns a `Choice`, such as
+      `functools.partial(noise_figure, target=0.5)`.
+    - `prior`, `difference`, `noise`, `mask`: as in `one_step`.
+
+    Raises `ValueError` for arguments that do not fit together.
+
+    **Example:**
+
+    ```python
+    choice = choose_hyperparameter(model, 1.0, rule="l-curve", difference=change, noise=1e-6)
+    image = one_step(model, 1.0, hyperparameter=choice, noise=1e-6).image(change)
+    ```
     """
     if not (isinstance(rule, str) or callable(rule)):
         raise ValueError(f"rule: give one of {', '.join(RULES)}, not {rule!r}; a number needs no choosing.")
@@ -50,10 +63,24 @@ def compare_rules(
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, Choice]:
     """Choose λ for the same data by several rules, and return the choices by name. The problem is decomposed once.
+    `jeit.plot.plot_choice` plots the result.
 
-    `rules`: rules to compare, default `jeit.inverse.RULES`; `progress`: called with the name of each step and rule as
-    it begins; other arguments as in `one_step`. `jeit.plot.plot_choice` plots the result. Raises `ValueError` for
-    arguments that do not fit together.
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `conductivity`: the background, S/m (2-D: S).
+    - `difference`, `prior`, `noise`, `mask`: as in `one_step`.
+    - `rules`: rules to compare, by name; default `jeit.inverse.RULES`.
+    - `progress`: function that is called with the name of each step and rule as it begins.
+
+    Raises `ValueError` for arguments that do not fit together.
+
+    **Example:**
+
+    ```python
+    choices = compare_rules(model, 1.0, difference=change, noise=1e-6)
+    {name: choice.hyperparameter for name, choice in choices.items()}
+    ```
     """
     rules, report = RULES if rules is None else rules, progress or (lambda step: None)
     report("linearise")

@@ -34,11 +34,27 @@ def best_resolution(
 ) -> Choice:
     """Choose the λ with the smallest blur radius, averaged over point targets spread through the body.
 
-    Without noise the smallest λ would always be sharpest, so the images of the targets are noisy; the root mean square
-    of a target's data is `signal_to_noise` times the noise. No measured data are used, so λ depends on the system and
-    not on the frame. Graham and Adler, Physiol. Meas. 27 (2006) S65-S79, calibrate λ in this way with a small target in
-    a tank. Criterion: mean `blur_radius` over `num_targets` targets, relative to the size of the body. Raises
-    `ValueError` without a mesh and for settings that are not positive.
+    Without noise the smallest λ would always be sharpest, so the images of the targets are noisy. No measured data are
+    used, so λ depends on the system and not on the frame. Graham and Adler, Physiol. Meas. 27 (2006) S65-S79, calibrate
+    λ in this way with a small target in a tank. Criterion: mean `blur_radius` over the targets, relative to the size of
+    the body.
+
+    **Arguments:**
+
+    - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
+    - `data`: not used.
+    - `mesh`: the mesh of the image.
+    - `signal_to_noise`: root mean square of a target's data, in standard deviations of the noise.
+    - `num_targets`: number of targets.
+
+    Raises `ValueError` without a mesh and for settings that are not positive.
+
+    **Example:**
+
+    ```python
+    rule = lambda *problem: best_resolution(*problem, num_targets=10)
+    choose_hyperparameter(model, 1.0, rule=rule).hyperparameter
+    ```
     """
     if mesh is None:
         raise ValueError("The rule 'best-resolution' measures areas: give the mesh that the spectrum belongs to.")
@@ -144,6 +160,16 @@ def generalised_cross_validation(spectrum: Spectrum, data: ArrayLike | None, mes
     each of M channels from the others; H maps data to predicted data. Golub, Heath and Wahba 1979.
 
     Criterion: this score, in units of the noise variance. Raises `ValueError` without data.
+
+    **Arguments:**
+
+    - `spectrum`, `data`, `mesh`: as in `discrepancy`.
+
+    **Example:**
+
+    ```python
+    choose_hyperparameter(model, 1.0, rule=lambda *problem: generalised_cross_validation(*problem), difference=change)
+    ```
     """
     candidates, data = spectrum.candidates(), _check_data(data, "gcv")
     residual, penalty = spectrum.curves(data, candidates)
@@ -157,9 +183,24 @@ def discrepancy(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = 
     """Choose λ by the discrepancy principle: the largest λ with ‖r‖² ≤ n noise², for the residual r with n independent
     components.
 
-    Criterion: ‖r‖/√n, the residual in standard deviations. `noise`: standard deviation of the whitened data (of each
-    part of complex data), 1 if the noise of the channels was specified correctly. Morozov, Soviet Math. Dokl. 7 (1966)
-    414-417. Raises `ValueError` without data.
+    Criterion: ‖r‖/√n, the residual in standard deviations. Morozov, Soviet Math. Dokl. 7 (1966) 414-417.
+
+    **Arguments:**
+
+    - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
+    - `data`: difference of frames in terms of the spectrum, whitened.
+    - `mesh`: not used.
+    - `noise`: standard deviation of the whitened data (of each part of complex data), 1 if the noise of the channels
+      was specified correctly.
+
+    Raises `ValueError` without data.
+
+    **Example:**
+
+    ```python
+    rule = lambda *problem: discrepancy(*problem, noise=1.2)
+    choose_hyperparameter(model, 1.0, rule=rule, difference=change, noise=1e-4).hyperparameter
+    ```
     """
     candidates, data = spectrum.candidates(), _check_data(data, "discrepancy")
     components = abs(adjoint(np.asarray(spectrum.basis)) @ data)
@@ -185,6 +226,16 @@ def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None
     Hansen, SIAM Review 34 (1992) 561-580.
 
     Criterion: this curvature, positive at a corner that points to the origin. Raises `ValueError` without data.
+
+    **Arguments:**
+
+    - `spectrum`, `data`, `mesh`: as in `discrepancy`.
+
+    **Example:**
+
+    ```python
+    choose_hyperparameter(model, 1.0, rule=lambda *problem: l_curve(*problem), difference=change, noise=1e-6)
+    ```
     """
     candidates, data = spectrum.candidates(), _check_data(data, "l-curve")
     residual, penalty = spectrum.curves(data, candidates)
@@ -196,12 +247,25 @@ def l_curve(spectrum: Spectrum, data: ArrayLike | None, mesh: Mesh | None = None
 def noise_figure(
     spectrum: Spectrum, data: ArrayLike | None = None, mesh: Mesh | None = None, *, target: float = 1.25
 ) -> Choice:
-    """Choose the λ at which the noise figure, the signal-to-noise ratio of the data divided by that of the image, is
-    `target`. No measured data are used.
+    """Choose the λ at which the noise figure, the signal-to-noise ratio of the data divided by that of the image, has a
+    given value. No measured data are used.
 
     Signals are drawn from the prior and the noise is white: the ratio of the data is trΛ / n for n components, that of
     the image tr(RJΓJᵀRᵀ) / tr(RRᵀ), in squared amplitudes. This follows Adler and Guardo 1996, who use one object at
     the centre in place of the prior. Criterion: the noise figure.
+
+    **Arguments:**
+
+    - `spectrum`: the problem, decomposed; `choose_hyperparameter` gives it to the rule.
+    - `data`, `mesh`: not used.
+    - `target`: the noise figure.
+
+    **Example:**
+
+    ```python
+    rule = lambda *problem: noise_figure(*problem, target=0.5)
+    image = one_step(model, 1.0, hyperparameter=rule).image(change)
+    ```
     """
     candidates = spectrum.candidates()
     eigenvalues = np.asarray(spectrum.eigenvalues)

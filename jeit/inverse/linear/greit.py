@@ -53,24 +53,35 @@ def greit(
 ) -> LinearReconstruction:
     """GREIT reconstruction matrix R = XYᵀ(YYᵀ + λ²W⁻¹)⁻¹ for a body of any shape, at a background conductivity.
 
-    The training targets are about `num_targets` small discs (3-D: balls) on a hexagonal (3-D: cubic) grid over the
-    body. Y holds their responses to a unit change of conductivity (S/m; 2-D: S), computed **from the Jacobian**. They
-    are exact for small changes; as in any linear image, the contrast of large changes is underestimated. X holds the
-    desired images: discs of one radius with a smooth edge, cut off at the body's outline, each with the same integral
-    as its target. X and Y are divided by √(number of targets).
+    The training targets are small discs (3-D: balls) on a hexagonal (3-D: cubic) grid over the body. Y holds their
+    responses to a unit change of conductivity (S/m; 2-D: S), computed **from the Jacobian**. They are exact for small
+    changes; as in any linear image, the contrast of large changes is underestimated. X holds the desired images: discs
+    of one radius with a smooth edge, cut off at the body's outline, each with the same integral as its target. X and Y
+    are divided by √(number of targets).
 
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `conductivity`: the background, S/m (2-D: S).
     - `radius`, `target_radius`: radii of the desired images and of the targets, as fractions of the body's radius,
       which is that of the disc of equal area (3-D: ball of equal volume). Default `radius` 1/√L, 0.25 for 16
       electrodes; a smaller radius improves resolution but increases ringing and noise.
     - `hyperparameter`: λ, or "noise-figure" for the λ at which the signal-to-noise ratio of the data is `noise_figure`
-      times that of the image, for a target in the middle of the body. The default 0.5 is the value agreed on by GREIT's
-      authors. The signal is the mean absolute value, over channels in units of their noise or over the body; the noise
-      is the root mean square standard deviation.
+      times that of the image, for a target in the middle of the body.
+    - `noise_figure`: the default 0.5 is the value agreed on by GREIT's authors. The signal is the mean absolute value,
+      over channels in units of their noise or over the body; the noise is the root mean square standard deviation.
     - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
       other).
-    - `mask`: True for the channels to use.
+    - `mask` (M,): True for the channels to use.
+    - `num_targets`: number of targets, approximately.
 
     Raises `ValueError` for arguments that do not fit together, and for a noise figure that no λ reaches.
+
+    **Example:**
+
+    ```python
+    image = greit(model, 1.0, num_targets=200).image(change)
+    ```
     """
     check_model(model)
     instead = (

@@ -45,6 +45,13 @@ class LinearReconstruction:
     (K, r): matrix that reduces the combined channels, or None; `hyperparameter`: λ; `rule`: how λ was chosen;
     `method`: name of the reconstruction; `choice`: curves used in choosing λ and a note on their reliability
     (`choice.note`), or None if the method chooses λ differently; `num_measurements`: number of channels M.
+
+    **Example:**
+
+    ```python
+    reconstruction = one_step(model, 1.0, hyperparameter=0.1)
+    reconstruction.matrix.shape, reconstruction.image(change)
+    ```
     """
 
     mesh: Mesh
@@ -200,24 +207,34 @@ def one_step(
 ) -> LinearReconstruction:
     """Reconstruction matrix of the linearised problem, R = (JᵀWJ + λ²Q)⁻¹JᵀW, at a background conductivity.
 
-    - `prior`: default `Noser()`.
-    - `hyperparameter`: λ, a rule in `jeit.inverse.RULES` that chooses it, or a `Choice`.
-    - `difference`: change of voltages (M,) to be imaged, required by rules that use data.
-    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
-      other).
-    - `mask`: True for the channels to use.
-
-    Raises `ValueError` for arguments that do not fit together.
-
-    A complex `conductivity` is an admittivity σ + iωε, S/m (2-D: S); voltages and image are then complex. Both parts
-    have the same prior, and `noise` is the standard deviation of each part. With a real background, real and imaginary
-    part of complex voltages are imaged separately.
+    A complex `conductivity` is an admittivity σ + iωε; voltages and image are then complex. Both parts have the same
+    prior, and `noise` is the standard deviation of each part. With a real background, real and imaginary part of
+    complex voltages are imaged separately.
 
     If λ is a number, the function and the image are differentiable and work inside `jax.grad`, `jax.vmap` and
     `jax.jit`. A rule for λ or a mask depends on values and must be evaluated outside.
 
     Computed in data space: R = ΓJᵀ(JΓJᵀ + λ²W⁻¹)⁻¹ with Γ = Q⁻¹; see `jeit.inverse.prior.priors` for a Q with a null
     space. Adler and Guardo, IEEE Trans. Med. Imaging 15 (1996) 170-179.
+
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `conductivity`: the background, S/m (2-D: S).
+    - `prior`: default `Noser()`.
+    - `hyperparameter`: λ, a rule in `jeit.inverse.RULES` that chooses it, or a `Choice`.
+    - `difference` (M,): change of voltages to be imaged, volts, required by rules that use data.
+    - `noise`: standard deviation of the channels, W = noise⁻²; one number or (M,), in volts (or relative to each
+      other).
+    - `mask` (M,): True for the channels to use.
+
+    Raises `ValueError` for arguments that do not fit together.
+
+    **Example:**
+
+    ```python
+    image = one_step(model, 1.0, hyperparameter=0.1).image(change)
+    ```
     """
     linear = Linearisation.create(model, conductivity, prior=prior, noise=noise, mask=mask)
     data = None if difference is None else linear.whiten(difference)
@@ -249,11 +266,24 @@ def back_projection(
     The relative change of a channel is assigned to the cells whose potential, under the channel's drive, lies between
     the potentials of its two measuring electrodes. The image of a cell is the mean over the channels that reach it
     (Barber and Brown, J. Phys. E 17 (1984) 723-733), scaled so that a uniform change of conductivity is imaged exactly.
+    A filtered image is sharper but noisier: its matrix is B F, where B is the matrix above and F minimises ‖JBFv - v‖²
+    + λ²‖JB‖²‖Fv‖², so that the Jacobian J maps the image to nearly the data.
 
-    `conductivity`: the background, S/m (2-D: S). `filtered`: back-project filtered data F v with the matrix B above,
-    where F minimises ‖JBFv - v‖² + λ²‖JB‖²‖Fv‖², so that the Jacobian J maps the image to nearly the data; the image is
-    sharper but noisier. `hyperparameter`: λ. `mask`: True for the channels to use. Raises `ValueError` for protocols
-    whose measurements use more than two electrodes, where no band is defined.
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `conductivity`: the background, S/m (2-D: S).
+    - `filtered`: whether to filter the data before they are projected.
+    - `hyperparameter`: λ of the filter.
+    - `mask` (M,): True for the channels to use.
+
+    Raises `ValueError` for protocols whose measurements use more than two electrodes, where no band is defined.
+
+    **Example:**
+
+    ```python
+    image = back_projection(model, 1.0).image(change)
+    ```
     """
     check_model(model)
     instead = (

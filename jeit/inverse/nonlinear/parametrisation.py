@@ -52,7 +52,19 @@ class AbstractUnknown(Module):
 
 
 class ContactImpedance(AbstractUnknown):
-    """Contact impedance of every electrode; the values are logarithms of its ratio to the model's."""
+    """Contact impedance of every electrode; the values are logarithms of its ratio to the model's.
+
+    **Arguments:**
+
+    - `model`: the forward model that is fitted.
+    - `deviation`: prior standard deviation of the logarithms.
+
+    **Example:**
+
+    ```python
+    parametrisation = Parametrisation(unknowns=[ContactImpedance(model, 0.2)])
+    ```
+    """
 
     deviation: Float[Array, " L"]
 
@@ -83,6 +95,17 @@ class ElectrodePosition(AbstractUnknown):
     Electrodes on the boundary have one value each, along the boundary and positive counter-clockwise; others have two:
     discs in a sheet x and y, discs and patches on a solid horizontal and upward. The first of all electrodes come
     before the second.
+
+    **Arguments:**
+
+    - `model`: the forward model that is fitted.
+    - `deviation`: prior standard deviation of the displacements, metres.
+
+    **Example:**
+
+    ```python
+    parametrisation = Parametrisation(unknowns=[ElectrodePosition(model, 1e-3)])
+    ```
     """
 
     deviation: Float[Array, " k"]
@@ -116,7 +139,17 @@ class ElectrodePosition(AbstractUnknown):
 class Background(AbstractUnknown):
     """Constant added to the image, on the link's scale (`Log`: the logarithm of a factor).
 
+    **Arguments:**
+
+    - `deviation`: prior standard deviation of the constant.
+
     Raises `ValueError` if the standard deviation is not positive.
+
+    **Example:**
+
+    ```python
+    parametrisation = Parametrisation(unknowns=[Background(0.1)])
+    ```
     """
 
     deviation: Float[Array, " 1"]
@@ -132,7 +165,18 @@ class Background(AbstractUnknown):
 class Scale(AbstractUnknown):
     """Factor on all voltages, such as an unknown current or gain; the value is its logarithm.
 
+    **Arguments:**
+
+    - `deviation`: prior standard deviation of the logarithm.
+
     Raises `ValueError` if the standard deviation is not positive.
+
+    **Example:**
+
+    ```python
+    parametrisation = Parametrisation(unknowns=[Scale(0.05)])
+    reconstruct(model, 1.02 * voltages, 1.0, hyperparameter=1.0, parametrisation=parametrisation).unknowns
+    ```
     """
 
     deviation: Float[Array, " 1"]
@@ -184,7 +228,15 @@ class AbstractLink(Module):
 
 
 class Linear(AbstractLink):
-    """Linear link σ = x. It does not keep the conductivity positive; a step that leads below zero is shortened."""
+    """Linear link σ = x. It does not keep the conductivity positive; a step that leads below zero is shortened.
+
+    **Example:**
+
+    ```python
+    parametrisation = Parametrisation(link=Linear())
+    reconstruct(model, voltages, 1.0, hyperparameter=1.0, parametrisation=parametrisation).conductivity.min()
+    ```
+    """
 
     def conductivity(self, estimate):
         """Conductivity x."""
@@ -205,7 +257,14 @@ class Linear(AbstractLink):
 
 class Log(AbstractLink):
     """Logarithmic link σ = exp(x): conductivity is positive, and the prior treats a ratio of conductivities and its
-    inverse alike."""
+    inverse alike.
+
+    **Example:**
+
+    ```python
+    image = reconstruct(model, voltages, 1.0, hyperparameter=1.0, parametrisation=Parametrisation(link=Log()))
+    ```
+    """
 
     def conductivity(self, estimate):
         """Conductivity exp(x)."""
@@ -230,7 +289,18 @@ class Bounded(AbstractLink):
     """Logistic link σ = lower + (upper - lower) / (1 + exp(-x)), which keeps σ strictly between `lower` and `upper`,
     S/m (2-D: S).
 
+    **Arguments:**
+
+    - `lower`, `upper`: limits of the conductivity, S/m (2-D: S).
+
     Raises `ValueError` unless 0 ≤ lower < upper, both finite.
+
+    **Example:**
+
+    ```python
+    parametrisation = Parametrisation(link=Bounded(0.1, 10.0))
+    reconstruct(model, voltages, 1.0, hyperparameter=1.0, parametrisation=parametrisation).conductivity.max()
+    ```
     """
 
     lower: float
@@ -297,17 +367,26 @@ def as_parametrisation(parametrisation: "Parametrisation | None") -> "Parametris
 class Parametrisation(Module):
     """Parametrisation of an image: the quantities that are estimated.
 
+    **Arguments:**
+
     - `link`: scale on which the prior acts, `Log()` by default.
     - `bounds`: minimum and maximum conductivity, S/m (2-D: S), satisfied exactly. They require a solver that keeps
       bounds and a prior that has a precision matrix, or total variation.
     - `regions` (m,): integer label of each cell; cells of the same label share one value, and cells labelled -1 are
-      held at the background. See `jeit.inverse.prior.bases.pixels`.
-    - `unknowns`: further parameters to estimate, see `jeit.inverse.nonlinear.parametrisation`.
+      held at the background. See `pixels`.
+    - `unknowns`: further parameters to estimate: `ContactImpedance`, `ElectrodePosition`, `Background`, `Scale`.
     - `informative`: minimum signal, in standard deviations of the noise, of a combination of the prior's shapes with
       prior amplitude of one standard deviation, linearised at the background. Images consist of the combinations above
       it; 0 takes all shapes. None is 0 in `reconstruct` and 0.03 in an `Imager`.
 
     Raises `ValueError` for invalid values.
+
+    **Example:**
+
+    ```python
+    coarse = Parametrisation(link=Linear(), regions=pixels(mesh, (8, 8)))
+    reconstruct(model, voltages, 1.0, hyperparameter=1.0, parametrisation=coarse).conductivity
+    ```
     """
 
     link: AbstractLink = eqx.field(default_factory=Log)

@@ -45,6 +45,13 @@ class Reconstruction(Module):
     `iterations`: number of iterations; `outcome`: `Status.number` of how the solver ended; `reason`: the same in a
     sentence; `choice`: choice of the hyperparameter λ; `inversion`, `coefficients`: the problem solved and its
     solution, for warm starts and uncertainty; `model`: forward model with the estimated unknowns.
+
+    **Example:**
+
+    ```python
+    image = reconstruct(model, voltages, 1.0, hyperparameter=1.0)
+    image.conductivity, image.misfit, image.status
+    ```
     """
 
     conductivity: Float[Array, " m"]
@@ -119,22 +126,7 @@ def reconstruct(
     parametrisation: Parametrisation | None = None,
     start: Reconstruction | None = None,
 ) -> Reconstruction:
-    """Estimate the conductivity per cell that explains measured `voltages` (M,), in volts: an absolute image.
-
-    - `background`: prior mean and starting point, one number or (m,), S/m (2-D: S); see `calibrate`.
-    - `prior`: `Noser()` by default; `TotalVariation()` for piecewise constant images.
-    - `hyperparameter`: weight λ of the prior, or a rule in `jeit.inverse.RULES`, which is applied to the problem
-      linearised at the background; default "noise-figure". Total variation takes a number, default 300.
-    - `noise`: standard deviation of the channels in volts, one number or (M,); default 1 % of the voltages, see
-      `relative_noise`.
-    - `mask`: True for the channels to use.
-    - `solver`: a solver of `jeit.inverse.nonlinear`, such as `LevenbergMarquardt(max_steps=60)`, its name, or a
-      least-squares solver of optimistix (not with total variation). Default `GaussNewton()`; with bounds `LBFGSB()`.
-    - `parametrisation`: the quantities estimated: link, bounds, regions of one value, further unknowns.
-    - `start`: an earlier reconstruction of the same kind, to start from.
-
-    Raises `ValueError` for arguments that do not fit together; a failure of the solver is reported in the result's
-    `status`.
+    """Estimate the conductivity per cell that explains measured voltages: an absolute image.
 
     If λ is a number, `reconstruct` works inside `jax.grad`, `jax.jacfwd`, `jax.vmap` and `jax.jit`, with respect to
     voltages, background, noise, λ, the prior's settings and all fields of the model. Derivatives are those of the
@@ -143,6 +135,32 @@ def reconstruct(
     docs/differentiable-images.md.
 
     Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Nocedal and Wright, Numerical Optimization (2006), ch. 10.
+
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `voltages` (M,): measured, volts.
+    - `background`: prior mean and starting point, one number or (m,), S/m (2-D: S); see `calibrate`.
+    - `prior`: `Noser()` by default; `TotalVariation()` for piecewise constant images.
+    - `hyperparameter`: weight λ of the prior, or a rule in `jeit.inverse.RULES`, which is applied to the problem
+      linearised at the background; default "noise-figure". Total variation takes a number, default 300.
+    - `noise`: standard deviation of the channels in volts, one number or (M,); default 1 % of the voltages, see
+      `relative_noise`.
+    - `mask` (M,): True for the channels to use.
+    - `solver`: a solver such as `LevenbergMarquardt(max_steps=60)`, its name, or a least-squares solver of optimistix
+      (not with total variation). Default `GaussNewton()`; with bounds `LBFGSB()`.
+    - `parametrisation`: the quantities estimated: link, bounds, regions of one value, further unknowns.
+    - `start`: an earlier reconstruction of the same kind, to start from.
+
+    Raises `ValueError` for arguments that do not fit together; a failure of the solver is reported in the result's
+    `status`.
+
+    **Example:**
+
+    ```python
+    image = reconstruct(model, voltages, 1.0, hyperparameter=1.0)
+    image.conductivity.max(), image.misfit
+    ```
     """
     measured, used = check_frame(model, voltages, mask)
     prior = PRIOR if prior is None else prior

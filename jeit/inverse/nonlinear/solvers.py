@@ -93,10 +93,17 @@ class AbstractSolver(Module):
 class GaussNewton(AbstractSolver):
     """Gauss-Newton method with a backtracking line search; total variation is treated by lagged diffusivity.
 
-    `max_steps`: default 30, for an `Imager` 4; rejected steps and the shorter steps tried in their place both count.
-    `rtol`: the iteration ends when the next step would change the objective by less than rtol times the objective or
-    rtol times ½, the misfit of one voltage that is wrong by a standard deviation; default 1e-6, with total variation
-    1e-4, for an `Imager` 1e-3.
+    **Arguments:** `max_steps`: maximum number of steps, default 30, for an `Imager` 4; rejected steps and the shorter
+    steps tried in their place both count. `rtol`: the iteration ends when the next step would change the objective by
+    less than rtol times the objective or rtol times ½, the misfit of one voltage that is wrong by a standard deviation;
+    default 1e-6, with total variation 1e-4, for an `Imager` 1e-3.
+
+    **Example:**
+
+    ```python
+    image = reconstruct(model, voltages, 1.0, hyperparameter=1.0, solver=GaussNewton(max_steps=10))
+    image.iterations, image.status
+    ```
     """
 
     name: ClassVar[str] = "gauss-newton"
@@ -122,8 +129,14 @@ class GaussNewton(AbstractSolver):
 class LevenbergMarquardt(AbstractSolver):
     """Levenberg-Marquardt method: Gauss-Newton steps, whose damping is increased when a step is rejected.
 
-    `max_steps`, `rtol`: as for `GaussNewton`. `damping`: damping of the first step, relative to the prior. Raises
-    `ValueError` for invalid settings.
+    **Arguments:** `max_steps`, `rtol`: as for `GaussNewton`. `damping`: damping of the first step, relative to the
+    prior. Raises `ValueError` for invalid settings.
+
+    **Example:**
+
+    ```python
+    image = reconstruct(model, voltages, 1.0, hyperparameter=1.0, solver=LevenbergMarquardt(max_steps=20))
+    ```
     """
 
     name: ClassVar[str] = "levenberg-marquardt"
@@ -150,8 +163,20 @@ class LevenbergMarquardt(AbstractSolver):
 
 
 class LBFGSB(AbstractSolver):
-    """L-BFGS-B method between bounds. `tolerance`: maximum change of a scaled coefficient in a step along the projected
-    gradient at convergence; see `minimise_between`."""
+    """L-BFGS-B method between bounds.
+
+    **Arguments:**
+
+    - `max_steps`: maximum number of steps.
+    - `tolerance`: maximum change of a scaled coefficient in a step along the projected gradient at convergence.
+
+    **Example:**
+
+    ```python
+    parametrisation = Parametrisation(bounds=(0.5, 3.0))
+    reconstruct(model, voltages, 1.0, hyperparameter=1.0, solver=LBFGSB(), parametrisation=parametrisation).status
+    ```
+    """
 
     name: ClassVar[str] = "l-bfgs-b"
     max_steps: int = eqx.field(static=True, default=1000)
@@ -171,7 +196,18 @@ class LBFGSB(AbstractSolver):
 
 
 class ProjectedGradient(AbstractSolver):
-    """Accelerated projected gradient method between bounds. `tolerance`: as for `LBFGSB`."""
+    """Accelerated projected gradient method between bounds.
+
+    **Arguments:**
+
+    - `max_steps`, `tolerance`: as for `LBFGSB`.
+
+    **Example:**
+
+    ```python
+    solver = ProjectedGradient(max_steps=500)
+    ```
+    """
 
     name: ClassVar[str] = "projected-gradient"
     max_steps: int = eqx.field(static=True, default=1000)
@@ -221,7 +257,14 @@ class LeastSquares(AbstractSolver):
 
 
 class OneStep(AbstractSolver):
-    """Linear images for an `Imager`: one Gauss-Newton step from the background."""
+    """Linear images for an `Imager`: one Gauss-Newton step from the background.
+
+    **Example:**
+
+    ```python
+    imager = Imager.create(model, 1.0, reference=reference, solver=OneStep())
+    ```
+    """
 
     name: ClassVar[str] = "one-step"
 

@@ -254,7 +254,18 @@ def pixels(mesh: Mesh, shape: tuple[int, int]) -> Int[np.ndarray, " m"]:
 
     `shape`: numbers of rows and columns of the grid.
 
+    **Arguments:**
+
+    - `mesh`: the mesh of the image.
+    - `shape`: numbers of rows and columns of the grid.
+
     Raises `ValueError` for a shape that is not two whole numbers from 1.
+
+    **Example:**
+
+    ```python
+    coarse = Parametrisation(regions=pixels(mesh, (16, 16)))
+    ```
     """
     sides = np.asarray(shape)
     if sides.shape != (2,) or sides.dtype.kind not in "iu" or sides.min() < 1:

@@ -38,12 +38,23 @@ _COLUMNS_AT_ONCE = 50
 
 
 class Matern(AbstractPrior):
-    """Matérn prior: a smooth random field of unit variance with correlation length `length`, in metres.
+    """Matérn prior: a smooth random field of unit variance.
 
-    The correlation falls to 0.14 at twice the `length`, as for `Gaussian(length)`, but decreases from distance zero on,
+    The correlation falls to 0.14 at twice the length, as for `Gaussian(length)`, but decreases from distance zero on,
     so images have sharper peaks. κ is 1 / length in a solid body, √2 / length in a sheet. The cells must not be much
-    larger than the length. Memory and time are roughly proportional to the number of nodes. Raises `ValueError` if the
-    length is not positive.
+    larger than the length. Memory and time are roughly proportional to the number of nodes.
+
+    **Arguments:**
+
+    - `length`: correlation length in metres.
+
+    Raises `ValueError` if the length is not positive.
+
+    **Example:**
+
+    ```python
+    image = one_step(model, 1.0, prior=Matern(0.02), hyperparameter=0.01, noise=1e-4).image(change)
+    ```
     """
 
     length: float

@@ -70,6 +70,12 @@ class AbstractPrior(Module):
     A new quadratic prior is a subclass with `covariance_product`, `precision` and `basis`. A prior whose energy is not
     xᵀQx overrides `penalty` and raises `ValueError` in the methods that do not apply. Real and imaginary part of a
     complex image have the same prior; methods take the complex conjugate of a complex Jacobian.
+
+    **Example:**
+
+    ```python
+    isinstance(Matern(0.05), AbstractPrior), Matern(0.05).is_quadratic
+    ```
     """
 
     @property
@@ -136,7 +142,14 @@ class AbstractPrior(Module):
 
 
 class Tikhonov(AbstractPrior):
-    """Zeroth-order Tikhonov prior, Q = I: cells are independent, and deviations from the background are penalised."""
+    """Zeroth-order Tikhonov prior, Q = I: cells are independent, and deviations from the background are penalised.
+
+    **Example:**
+
+    ```python
+    image = one_step(model, 1.0, prior=Tikhonov(), hyperparameter=0.01).image(change)
+    ```
+    """
 
     def covariance_product(self, mesh, jacobian):
         """Jᵀ."""
@@ -154,8 +167,17 @@ class Tikhonov(AbstractPrior):
 class Noser(AbstractPrior):
     """NOSER prior, Q = diag(JᵀJ)^exponent, which balances the sensitivity between the edge and the centre.
 
-    Cheney, Isaacson, Newell, Simske and Goble, Int. J. Imaging Syst. Technol. 2 (1990) 66-75. `exponent`: 0.5 by
-    default; 1 penalises relative to full sensitivity, 0 is `Tikhonov`.
+    Cheney, Isaacson, Newell, Simske and Goble, Int. J. Imaging Syst. Technol. 2 (1990) 66-75.
+
+    **Arguments:**
+
+    - `exponent`: 1 penalises relative to full sensitivity, 0 is `Tikhonov`.
+
+    **Example:**
+
+    ```python
+    image = one_step(model, 1.0, prior=Noser(0.5), hyperparameter=0.1).image(change)
+    ```
     """
 
     exponent: float = 0.5
@@ -185,6 +207,12 @@ class Laplace(AbstractPrior):
     Differences are not weighted by geometry, as is usual in EIT, and a constant image has no penalty. In a solid body
     of more than 30,000 cells, where the factor of Q would be too large, differences are taken between nodes that share
     an edge, and a cell has the mean of its nodes.
+
+    **Example:**
+
+    ```python
+    image = one_step(model, 1.0, prior=Laplace(), hyperparameter=0.01, noise=1e-4).image(change)
+    ```
     """
 
     def covariance_product(self, mesh, jacobian):
@@ -232,9 +260,19 @@ class Laplace(AbstractPrior):
 
 class Gaussian(AbstractPrior):
     """Gaussian prior: a smooth random field with covariance Γ_ij = exp(-|x_i - x_j|² / 2 length²) between cell centres.
+    It does not depend on the mesh.
 
-    It does not depend on the mesh. `length`: correlation length in metres. Raises `ValueError` if the length is not
-    positive.
+    **Arguments:**
+
+    - `length`: correlation length in metres.
+
+    Raises `ValueError` if the length is not positive.
+
+    **Example:**
+
+    ```python
+    image = one_step(model, 1.0, prior=Gaussian(0.02), hyperparameter=0.01, noise=1e-4).image(change)
+    ```
     """
 
     length: float

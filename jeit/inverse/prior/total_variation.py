@@ -197,9 +197,20 @@ class TotalVariation(AbstractPrior):
     """Total variation prior of `reconstruct`, for images that are piecewise constant.
 
     In a solid body the image is linear between nodes and a cell has the mean of its nodes; in a sheet every cell has
-    its own value. `smoothing` β: jump below which the penalty is nearly quadratic, on the link's scale (`Log()`:
-    relative). The energy is not quadratic, so linear images and the rules that choose λ cannot use it; λ is a number,
-    300 by default. Raises `ValueError` if the smoothing is not positive.
+    its own value. The energy is not quadratic, so linear images and the rules that choose λ cannot use it; λ is a
+    number, 300 by default.
+
+    **Arguments:**
+
+    - `smoothing`: β, the jump below which the penalty is nearly quadratic, on the link's scale (`Log()`: relative).
+
+    Raises `ValueError` if the smoothing is not positive.
+
+    **Example:**
+
+    ```python
+    image = reconstruct(model, voltages, 1.0, prior=TotalVariation())
+    ```
     """
 
     smoothing: float = 0.01

@@ -88,10 +88,17 @@ class BodyPrior(abc.ABC):
 class Quantities:
     """What the data determine of a body: posterior medians, and 68 % intervals, None at an end that is left open.
 
-    **Fields**: `change`: change of conductivity relative to the background; `measure`: area, m², or volume, m³;
-    `strength`: that times (ρ - 1) / (ρ + n - 1), where ρ is the conductivity relative to the background and n the
-    number of axes along which the body is bounded (2 in a sheet and for a column, else 3), negative for resistive
-    bodies; and `change_interval`, `measure_interval` and `strength_interval`.
+    **Fields**: `change`, `change_interval`: change of conductivity relative to the background; `measure`,
+    `measure_interval`: area, m², or volume, m³; `strength`, `strength_interval`: that times (ρ - 1) / (ρ + n - 1),
+    where ρ is the conductivity relative to the background and n the number of axes along which the body is bounded (2
+    in a sheet and for a column, else 3), negative for resistive bodies.
+
+    **Example:**
+
+    ```python
+    known = Quantities(1.0, (0.8, 1.3), 2.8e-3, (2.2e-3, 3.5e-3), 9e-4, (8e-4, 1e-3))
+    known.change_interval
+    ```
     """
 
     change: float

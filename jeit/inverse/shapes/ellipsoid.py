@@ -110,11 +110,17 @@ _LEVEL = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
 
 @dataclass(frozen=True)
 class EllipsoidPrior(BodyPrior):
-    """Prior of ellipsoids and columns. Fields that are not listed are described in `BodyPrior`.
+    """Prior of ellipsoids and columns, for `reconstruct_shapes` in a solid.
+
+    **Arguments:**
 
     - `modes`: 2, or 1 for balls.
-    - `place`: small, because smooth images of solids locate bodies well.
+    - `place`: standard deviation of each coordinate of a body's centre about its start, in units of the longest side of
+      the domain; small, because smooth images of solids locate bodies well.
+    - `radius`, `radius_spread`: median of the mean radius, in the same unit, and standard deviation of its logarithm.
     - `roughness`: standard deviation of the five coefficients of S, the log stretches.
+    - `drift`: standard deviation of the change of the bath's log conductivity between the two frames.
+    - `apart`: reciprocal of the standard deviation of the overlap of two bodies, as a fraction of the domain.
     - `contrast`, `contrast_spread`: median of the contrast in log σ, and standard deviation of its logarithm.
     - `odds_for_columns`: prior odds of a column relative to an ellipsoid; most tanks hold columns.
     - `odds_for_one_material`: prior odds that all bodies more conductive than the bath (or all less conductive) are of
@@ -122,6 +128,12 @@ class EllipsoidPrior(BodyPrior):
     - `kinds`: kinds of bodies considered, one of `KINDS`.
 
     Raises `ValueError` if a number is not positive or `kinds` is not in `KINDS`.
+
+    **Example:**
+
+    ```python
+    balls = EllipsoidPrior(modes=1)
+    ```
     """
 
     modes: int = 2
@@ -172,6 +184,13 @@ class Ellipsoid(Module):
     whose half axes is half the domain's height; `alike`: whether the body is assumed to be of the same material as
     others of its sign; `rise`: factor by which the minimum of the objective increases without this body, small for a
     ghost; `quantities`: posterior medians and intervals, if they were estimated.
+
+    **Example:**
+
+    ```python
+    body = Ellipsoid(+1, np.zeros(3), 0.02 * np.eye(3), 3.4e-5, np.zeros(3), 1.0, column=False, alike=False, rise=2.0)
+    body.holds([[0.0, 0.0, 0.01]])
+    ```
     """
 
     sign: int

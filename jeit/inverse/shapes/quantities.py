@@ -45,10 +45,17 @@ _INTERVAL_PROBABILITIES, _NUM_CONTRASTS, _NUM_NORMAL_DEVIATES = (0.16, 0.84), 24
 
 
 class Accuracy(NamedTuple):
-    """How accurately a difference is known. **Fields**: `noise` (M,): standard deviation of the channels, volts, of all
-    errors but those of `model_error`, the unknown part of electrode positions and contact impedances, if any; relative
-    standard deviations `size`, of the lengths of the described domain, and `strength`, of all strengths, from errors of
-    the background and the fields."""
+    """How accurately a difference of two frames is known. **Fields**: `noise` (M,): standard deviation of the channels,
+    volts, of all errors but those of `model_error`, the unknown part of electrode positions and contact impedances,
+    if any; relative standard deviations `size`, of the lengths of the described domain, and `strength`, of all
+    strengths, from errors of the background and the fields.
+
+    **Example:**
+
+    ```python
+    accuracy = Accuracy(relative_noise(reference, relative=1e-3), size=0.01, strength=0.02)
+    ```
+    """
 
     noise: Float[Array, " M"]
     model_error: ModelError | None = None

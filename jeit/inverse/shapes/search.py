@@ -79,6 +79,13 @@ class ShapeReconstruction(Module):
     a solid, the body of the other kind (ellipsoid or column) if the data do not determine the kind, else None;
     `alternative_deviations`: standard deviations of the contrasts of the alternatives, or NaN; `finer`:
     for a solid with bodies, the conductivity on the last refined mesh, for display.
+
+    **Example:**
+
+    ```python
+    found = reconstruct_shapes(model, voltages, 1.0, start=[(1, (0.04, 0.0), 0.03)])
+    found.bodies, found.misfit
+    ```
     """
 
     bodies: tuple[Body, ...]
@@ -122,9 +129,19 @@ def reconstruct_shapes(
     accuracy: Accuracy | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ShapeReconstruction:
-    """Estimate the bodies (star shapes in a sheet, ellipsoids in a solid) that explain measured `voltages` (M,), in
-    volts.
+    """Estimate the bodies (star shapes in a sheet, ellipsoids in a solid) that explain measured voltages.
 
+    All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and the others
+    are fitted again; the body whose absence raises the objective least is removed, as long as the rise is small. This
+    removes ghosts due to model errors and missing electrodes, because other bodies can take their place. Remaining
+    bodies are split in two, or changed to the other kind (a weak star, or a column from floor to lid), if the evidence
+    favours it (`ShapeProblem.surprise`). The search is run twice, starting with a split and with a change of kind, and
+    the better result is kept.
+
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `voltages` (M,): measured, volts.
     - `background`: conductivity without bodies, one number or (m,), S/m (2-D: S); its drift is estimated.
     - `start`: sign, centre (x, y) or (x, y, z) and radius, in metres, of every possible body, for example of all
       inclusions of an image. Surplus starts do no harm, and two bodies at one start are separated, but no body is added
@@ -137,21 +154,21 @@ def reconstruct_shapes(
       bodies are then modelled as a `SmoothField`, whose level is chosen by the evidence, and only bodies that are
       detected beside that field are fitted.
     - `accuracy`: the errors with which the `quantities` of each body are estimated, in place of `noise`; without it
-      they are not.
+      they are not estimated.
     - `progress`: called with the name of each stage as it begins. Stages take up to a minute in a solid.
-
-    All bodies are first fitted together, as strong disks or balls. Then each body in turn is left out and the others
-    are fitted again; the body whose absence raises the objective least is removed, as long as the rise is small. This
-    removes ghosts due to model errors and missing electrodes, because other bodies can take their place. Remaining
-    bodies are split in two, or changed to the other kind (a weak star, or a column from floor to lid), if the evidence
-    favours it (`ShapeProblem.surprise`). The search is run twice, starting with a split and with a change of kind, and
-    the better result is kept.
 
     Raises `ValueError` for arguments that do not fit together, and if `smooth` is not an image of these channels with a
     smooth prior.
 
     Kolehmainen, Arridge, Lionheart, Vauhkonen and Kaipio, Inverse Problems 15 (1999) 1375, boundaries by Fourier
     coefficients; the choice by evidence is jeit's own.
+
+    **Example:**
+
+    ```python
+    found = reconstruct_shapes(model, voltages, 1.0, start=[(1, (0.04, 0.0), 0.03)])
+    [body.centroid for body in found.bodies]
+    ```
     """
     measured, used = check_frame(model, voltages, mask)
     check_has_values("reconstruct_shapes", (model, measured), "bodies are chosen by comparison", "take reconstruct")

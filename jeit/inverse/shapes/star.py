@@ -28,9 +28,12 @@ _OUTLINE = 128
 
 @dataclass(frozen=True)
 class StarPrior(BodyPrior):
-    """Prior of stars. Fields that are not listed are described in `BodyPrior`.
+    """Prior of stars, for `reconstruct_shapes` in a sheet.
+
+    **Arguments:**
 
     - `modes`: N, number of the highest mode of an outline; 1 gives disks.
+    - `place`, `radius`, `radius_spread`, `drift`, `apart`: as in `EllipsoidPrior`.
     - `roughness`: standard deviation of a₂ and b₂; for aₙ and bₙ it is multiplied by 2/n.
     - `contrast`, `contrast_spread`: mean and standard deviation of the contrast in log σ of a strong body, ten times as
       conductive or resistive as the bath or more. Data hardly distinguish its contrast from a higher one, so the mean
@@ -38,6 +41,13 @@ class StarPrior(BodyPrior):
     - `weak_contrast`, `weak_spread`: median of the contrast in log σ of a weak body, and standard deviation of its
       logarithm.
     - `odds_against_weak`: prior odds of a strong body relative to a weak one.
+
+    **Example:**
+
+    ```python
+    disks = StarPrior(modes=1)
+    reconstruct_shapes(model, voltages, 1.0, start=[(1, (0.04, 0.0), 0.03)], prior=disks).bodies
+    ```
     """
 
     modes: int = 4
@@ -76,6 +86,13 @@ class Star(Module):
     `weak`: whether the body is weak, so that the data determine its contrast: for other bodies the contrast follows the
     prior and is roughly a lower limit; `rise`: factor by which the minimum of the objective increases without this
     body, small for a ghost; `quantities`: posterior medians and intervals, if they were estimated.
+
+    **Example:**
+
+    ```python
+    body = Star(+1, np.array([0.04, 0.0]), np.array([[0.06, 0.0], [0.04, 0.02], [0.02, 0.0]]), 0.7, True, 3.0)
+    body.area, body.centroid
+    ```
     """
 
     sign: int

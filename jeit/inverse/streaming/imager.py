@@ -87,6 +87,13 @@ class Imager(Module):
     True for channels that drive or read each electrode; `tied`: pairs (P, 2) of reciprocal channels, and the ratio (P,)
     of the second voltage to the first; `solver`: solver with its settings; `persistence`: fraction of the last image
     that is expected in the next one, 0 without a memory.
+
+    **Example:**
+
+    ```python
+    imager = Imager.create(model, 1.0, reference=reference, solver="one-step")
+    [image.conductivity for image in stream(imager, [voltages])]
+    ```
     """
 
     channels: IndependentChannels

@@ -35,7 +35,15 @@ _CORRELATION_THRESHOLD, _MIN_PAIRS, _EQUAL_TOLERANCE = 3.0, 10, 1e-12
 
 
 class FrameStatus(StrEnum):
-    """Status of a frame, as a string."""
+    """Status of a frame, as a string.
+
+    **Example:**
+
+    ```python
+    imager = Imager.create(model, 1.0, reference=reference, solver="one-step")
+    [frame.status == FrameStatus.IMAGED for frame in stream(imager, [voltages, reference])]
+    ```
+    """
 
     IMAGED = "imaged"
     PARTIAL = "partial"
@@ -187,6 +195,14 @@ class FrameImage(Module):
     True for the channels used; `misfit`: root mean square of predicted - measured in standard deviations (NaN for
     refused frames and linear images, for which no forward problem is solved); `iterations`: number of iterations;
     `latency`: time from the frame to its image, seconds.
+
+    **Example:**
+
+    ```python
+    imager = Imager.create(model, 1.0, reference=reference, solver="one-step")
+    image = next(stream(imager, [voltages]))
+    image.status, image.latency
+    ```
     """
 
     number: int
@@ -205,7 +221,7 @@ class FrameImage(Module):
 
 
 def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
-    """Yield the image of each frame (M,), in volts, as soon as the frame arrives. NaN marks channels without a reading.
+    """Yield the image of each frame as soon as the frame arrives.
 
     Iterative methods start from the last image; an imager with a memory also uses it as prior mean. Everything is
     compiled before the first frame is requested. A frame is refused, and the stream continues, if it has another number
@@ -214,8 +230,21 @@ def stream(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
     channels are left out, which `reason` reports. A frame that differs from an undisturbed one by noise only is imaged
     with status "unchanged".
 
+    **Arguments:**
+
+    - `imager`: the imager of the sensor.
+    - `frames`: frames (M,), in volts; NaN marks channels without a reading.
+
     Raises `ValueError` if `imager` is not an `Imager`, if `frames` is not iterable, and for an array of frames whose
     shape is not (frames, channels).
+
+    **Example:**
+
+    ```python
+    imager = Imager.create(model, 1.0, reference=reference, solver="one-step")
+    for image in stream(imager, [reference, voltages]):
+        print(image.number, image.status)
+    ```
     """
     check_kind("imager", imager, Imager, "an Imager, as of Imager.create or prepare_imager(reference)[0]")
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
@@ -231,9 +260,19 @@ def _image_frames(imager: Imager, frames: Iterable) -> Iterator[FrameImage]:
 
 
 class StreamState:
-    """State of a stream between frames, for programs that receive frames one by one; `stream` is made of it.
+    """State of a stream between frames, for programs that receive frames one by one; `stream` uses it. Everything is
+    compiled when it is created.
 
-    Everything is compiled when it is created. `check`: the check of frames.
+    **Arguments:**
+
+    - `imager`: the imager of the sensor.
+
+    **Example:**
+
+    ```python
+    state = StreamState(Imager.create(model, 1.0, reference=reference, solver="one-step"))
+    state.image(0, voltages).status
+    ```
     """
 
     # NumPy is used where JAX's dispatch would take longer than the computation.

@@ -37,11 +37,26 @@ _CRITERIA = {
 def plot_choice(choices: Choice | Mapping[str, Choice], *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the curves used in choosing a hyperparameter, and the point chosen.
 
-    For one `Choice`, the L-curve is drawn for "l-curve", ‖residual‖ against ‖image‖ with the corner marked, and the
-    criterion against λ for other rules. For several choices by name, as from `jeit.inverse.compare_rules`, the L-curve
-    with all choices is drawn, if there were data, and the criterion of each; these plots are insets of the returned
-    axes. A choice at the edge of its grid is drawn hollow. Raises `ValueError` for hyperparameters that were given as
-    numbers, which have no curve, and for objects that are not choices.
+    For one choice, the L-curve is drawn for "l-curve", ‖residual‖ against ‖image‖ with the corner marked, and the
+    criterion against λ for other rules. For several choices, the L-curve with all choices is drawn, if there were data,
+    and the criterion of each; these plots are insets of the returned axes. A choice at the edge of its grid is drawn
+    hollow.
+
+    **Arguments:**
+
+    - `choices`: a `jeit.inverse.Choice`, or several by name, as from `jeit.inverse.compare_rules`.
+    - `title`: title of the plot.
+    - `ax`: axes to draw in; default: new ones.
+
+    Raises `ValueError` for hyperparameters that were given as numbers, which have no curve, and for objects that are
+    not choices.
+
+    **Example:**
+
+    ```python
+    from jeit.inverse import compare_rules
+    plot_choice(compare_rules(model, 1.0, difference=change, noise=1e-6))
+    ```
     """
     several = list(choices.values()) if isinstance(choices, Mapping) else [choices]
     for one in several:
@@ -184,10 +199,26 @@ def plot_figures_of_merit(
 ) -> Axes:
     """Draw the five GREIT figures of merit of one or several reconstructions against the distance of the targets.
 
-    `figures`: figures for T targets, from `jeit.image.figures_of_merit`, by name of the reconstruction for the legend.
     Lines connect the means of targets at the same distance; dashed grey lines show the values of a perfect image. The
-    five plots are insets of the returned axes. Raises `ValueError` without figures, for more than six reconstructions,
-    and for figures of a single image.
+    five plots are insets of the returned axes.
+
+    **Arguments:**
+
+    - `figures`: figures for T targets, from `jeit.image.figures_of_merit`, by name of the reconstruction for the
+      legend.
+    - `title`, `ax`: as for `plot_choice`.
+
+    Raises `ValueError` without figures, for more than six reconstructions, and for figures of a single image.
+
+    **Example:**
+
+    ```python
+    from jeit.image import Raster, figures_of_merit
+    raster = Raster.create(mesh, shape=(64, 64))
+    pixels = raster.sample(np.stack([image, image]))
+    targets = figures_of_merit(pixels, raster.extent, [[0.04, 0], [0.05, 0]], area=1e-3)
+    plot_figures_of_merit({"one step": targets})
+    ```
     """
     check_kind("figures", figures, Mapping, "{name: figures}, as of jeit.image.figures_of_merit")
     if not 1 <= len(figures) <= len(SERIES_COLOURS):

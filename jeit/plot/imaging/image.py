@@ -36,9 +36,22 @@ from jeit.plot.imaging.electrodes import draw_electrodes, draw_inclusions
 def plot_mesh(
     mesh: Mesh, electrodes: AbstractElectrodes | None = None, *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw a 2-D mesh with its outline, or the surface of a 3-D mesh as seen from above, and numbered `electrodes`.
+    """Draw a 2-D mesh with its outline, or the surface of a 3-D mesh as seen from above.
+
+    **Arguments:**
+
+    - `mesh`: the mesh.
+    - `electrodes`: drawn to scale and numbered.
+    - `title`: title of the plot.
+    - `ax`: axes to draw in; default: new ones.
 
     Raises `ValueError` for arguments of another type, and for a surface in space.
+
+    **Example:**
+
+    ```python
+    plot_mesh(mesh, electrodes)
+    ```
     """
     check_body(mesh, electrodes)
     ax = axes_or_new(ax)
@@ -102,16 +115,28 @@ def plot_image(
     height: float | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw `values` on a mesh, per cell (m,) or, interpolated, per node (n,).
+    """Draw values on a mesh.
 
+    **Arguments:**
+
+    - `mesh`: a plane mesh, or a solid, of which a slice is drawn.
+    - `values`: per cell (m,) or, interpolated, per node (n,).
     - `electrodes`: drawn to scale and numbered.
     - `inclusions`: marked by their sign and a circle.
     - `scale`: colour scale; default: for changes of conductivity in S (3-D: S/m). For conductivity itself, use
       `ColourScale(difference=False)`.
     - `height`: z in metres of the slice through a 3-D mesh; default: half the height.
+    - `title`: title of the plot.
+    - `ax`: axes to draw in; default: new ones.
 
     Raises `ValueError` for values that have another shape, are complex or not finite, for a height outside the mesh,
     and for arguments of another type.
+
+    **Example:**
+
+    ```python
+    plot_image(mesh, image, electrodes, title="change of conductivity")
+    ```
     """
     check_body(mesh, electrodes)
     check_scale(scale)
@@ -204,12 +229,25 @@ def plot_admittivity(
     figure: Figure | None = None,
     **options: Any,
 ) -> tuple[Axes, Axes]:
-    """Draw σ and ωε of complex `values`, (m,) or (n,) in S (3-D: S/m), side by side in one figure.
+    """Draw σ and ωε of complex values side by side in one figure.
 
-    `difference`: whether values are changes, with colours centred at zero. `limits`: values at the ends of the two
-    colour bars; default: the maximum magnitude of each part, so that a much smaller part is visible, too. `figure`: the
-    figure to draw in; default: a new one. Other options as for `plot_image`. Raises `ValueError` for values that are
-    not complex, and as `plot_image`.
+    **Arguments:**
+
+    - `mesh`, `electrodes`, `options`: as for `plot_image`.
+    - `values` (m,) or (n,): admittivity, S (3-D: S/m).
+    - `difference`: whether values are changes, with colours centred at zero.
+    - `limits`: values at the ends of the two colour bars; default: the maximum magnitude of each part, so that a much
+      smaller part is visible, too.
+    - `titles`: titles of the two plots.
+    - `figure`: the figure to draw in; default: a new one.
+
+    Raises `ValueError` for values that are not complex, and as `plot_image`.
+
+    **Example:**
+
+    ```python
+    plot_admittivity(mesh, image * (1 + 0.1j), electrodes)
+    ```
     """
     image: Any = np.asarray(values)
     if not np.iscomplexobj(image):

@@ -126,14 +126,23 @@ def plot_frames(
 ) -> Figure:
     """Draw a contact sheet of a stream: evenly spaced frames with titles and one colour scale.
 
-    - `changes`: (F, m), changes of conductivity, S (3-D: S/m, drawn at half the height); rows of NaN are refused
-      frames.
+    **Arguments:**
+
+    - `mesh`, `electrodes`: as for `plot_image`.
+    - `changes` (F, m): changes of conductivity, S (3-D: S/m, drawn at half the height); rows of NaN are refused frames.
     - `titles`: one per frame; default: the numbers of the frames from 0.
+    - `scale`: colour scale; default: for changes of conductivity.
     - `most`: maximum number of frames on the sheet.
     - `count`: counts of all frames, if `changes` has only some of them.
 
     The colour scale is fitted to all frames, not only those drawn. Raises `ValueError` for changes of another shape,
     another number of titles, and if every frame was refused.
+
+    **Example:**
+
+    ```python
+    plot_frames(mesh, np.outer(np.linspace(0, 1, 5), image), electrodes)
+    ```
     """
     check_body(mesh, electrodes)
     values = np.asarray(changes)

@@ -36,13 +36,25 @@ def plot_curved_skin(
 ) -> Axes:
     """Draw the surface of a curved skin in space, with its electrodes as discs on it.
 
+    **Arguments:**
+
+    - `layout`: the skin.
     - `values`: one per triangle or per node of `layout.surface`; without values, the surface is grey.
     - `marks`: points (p, 3) in metres by name in the legend, drawn at the nearest points of the surface. Points hidden
       by the surface are left out.
     - `camera`: direction of view.
     - `scale`: colour scale; default: for changes of sheet conductivity in S.
+    - `title`, `ax`: as for `plot_image`.
 
     Raises `ValueError` for values that have another shape or are not finite, and for arguments of another type.
+
+    **Example:**
+
+    ```python
+    from jeit.layout import SurfaceLayout
+    from jeit.mesh import tube
+    plot_curved_skin(SurfaceLayout.spread(tube(0.04, 0.1, num_points=300), 8, 0.01))
+    ```
     """
     check_kind("layout", layout, SurfaceLayout, "a SurfaceLayout, skin.layout of a curved skin")
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")

@@ -39,11 +39,23 @@ def view_solid(
     scale: ColourScale = CHANGE,
     off_screen: bool = False,
 ) -> pyvista.Plotter:
-    """Create an interactive view of a solid image: hull, isosurfaces, numbered electrodes, a slice that can be dragged
-    through the body, and a colour bar. Lengths are in millimetres.
+    """Create an interactive view of a solid image (extra `view`): hull, isosurfaces, numbered electrodes, a slice that
+    can be dragged through the body, and a colour bar. Lengths are in millimetres.
 
-    Arguments as for `plot_isosurfaces`. Call `show()` of the returned plotter, or, if created with `off_screen`,
-    `screenshot("view.png")`. Raises `ImportError` if PyVista is not installed, and `ValueError` as `plot_isosurfaces`.
+    Call `show()` of the returned plotter, or, if created with `off_screen`, `screenshot("view.png")`.
+
+    **Arguments:**
+
+    - `mesh`, `values`, `electrodes`, `levels`, `inclusions`, `scale`: as for `plot_isosurfaces`.
+    - `off_screen`: whether to draw without a window.
+
+    Raises `ImportError` if PyVista is not installed, and `ValueError` as `plot_isosurfaces`.
+
+    **Example:**
+
+    ```python
+    plotter = view_solid(solid, solid_image, off_screen=True)  # with pyvista
+    ```
     """
     check_drawn(mesh, electrodes, scale)
     surfaces = level_surfaces(mesh, values, levels, both=scale.difference)

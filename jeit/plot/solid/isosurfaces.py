@@ -79,6 +79,9 @@ def plot_isosurfaces(
 ) -> Axes:
     """Draw isosurfaces of a solid image, at given shares of the maximum change of each sign.
 
+    **Arguments:**
+
+    - `mesh`: a mesh of tetrahedra.
     - `values`: per cell (m,) or per node (n,); changes of conductivity in S/m, or as described by `scale`.
     - `electrodes`: drawn on the body and numbered.
     - `levels`: shares between 0 and 1. The surface of the highest level is opaque, others are translucent. A sign whose
@@ -86,9 +89,17 @@ def plot_isosurfaces(
       `ColourScale.difference`), levels are fractions of the range from minimum to maximum.
     - `inclusions`: drawn as their sign and the outline of their form, or of a ball of their volume.
     - `camera`: direction of view.
+    - `scale`: colour scale; default: for changes of conductivity in S/m.
+    - `ax`: axes to draw in; default: new ones.
 
     Raises `ValueError` for values of another shape, levels out of range, a mesh that is not a solid, and arguments of
     another type.
+
+    **Example:**
+
+    ```python
+    plot_isosurfaces(solid, solid_image, ends, levels=(0.3, 0.6))
+    ```
     """
     check_drawn(mesh, electrodes, scale)
     fitted = scale.of(np.asarray(values), "S/m")

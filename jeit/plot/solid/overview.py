@@ -41,7 +41,18 @@ def plot_solid(
     centroid of the first of `inclusions`, or else the cell with the maximum change. The outlines of the slices are
     drawn in space, too.
 
-    `figure`: the figure to draw in; default: a new one. Other arguments and errors as for `plot_isosurfaces`.
+    **Arguments:**
+
+    - `mesh`, `values`, `electrodes`, `levels`, `inclusions`, `camera`, `scale`: as for `plot_isosurfaces`.
+    - `figure`: the figure to draw in; default: a new one.
+
+    Raises `ValueError` as `plot_isosurfaces`.
+
+    **Example:**
+
+    ```python
+    plot_solid(solid, solid_image, ends)
+    ```
     """
     check_drawn(mesh, electrodes, scale)
     image = cell_values(mesh, values)

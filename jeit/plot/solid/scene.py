@@ -33,6 +33,12 @@ class Camera:
     angle of the viewer above the plane z = 0, in degrees. Azimuth −90 with elevation 0 is the view of the front, along
     y; elevation 90 is the view from above. Raises `ValueError` for values that are not angles, and for elevations
     beyond 90 degrees.
+
+    **Example:**
+
+    ```python
+    plot_isosurfaces(solid, solid_image, camera=Camera(azimuth=-30, elevation=40))
+    ```
     """
 
     azimuth: float = -60.0

@@ -30,13 +30,26 @@ def plot_surface(
 ) -> Axes:
     """Draw a surface in space.
 
-    - `points`: (n, 3), metres; `triangles`: (m, 3), indices of points.
+    **Arguments:**
+
+    - `points` (n, 3): metres.
+    - `triangles` (m, 3): indices of points.
     - `values`: one per triangle or per point; without values, the surface is grey.
     - `electrodes`: from `jeit.electrodes.shapes_of`, drawn on the surface and numbered.
     - `camera`: direction of view.
     - `scale`: colour scale; default: for changes of sheet conductivity in S.
+    - `title`: title of the plot.
+    - `ax`: axes to draw in; default: new ones.
 
     Raises `ValueError` for arrays of other shapes, values that are not finite, and arguments of another type.
+
+    **Example:**
+
+    ```python
+    from jeit.mesh import sphere
+    ball = sphere(0.05, num_points=162)
+    plot_surface(ball.points, ball.cells, ball.points[:, 2], scale=ColourScale(quantity="height", unit="m"))
+    ```
     """
     places, faces = checked_surface(points, triangles)
     check_kind("camera", camera, Camera, "a Camera, such as Camera(azimuth=-60, elevation=25)")

@@ -38,12 +38,24 @@ def plot_slice(
 ) -> Axes:
     """Draw the section of a solid image by a plane: the sections of all cells, and the outline of the body.
 
+    **Arguments:**
+
+    - `mesh`: a mesh of tetrahedra.
     - `values`: per cell (m,), or per node (n,), which are averaged in each cell; changes of conductivity in S/m, or as
       described by `scale`. The colour scale is fitted to the whole body.
+    - `plane`: the plane.
     - `electrodes`: drawn where the plane intersects them.
     - `inclusions`: drawn as the section of their form, or of a ball of their volume.
+    - `scale`, `ax`: as for `plot_isosurfaces`.
 
     Raises `ValueError` for a plane that misses the body, values of another shape, and arguments of another type.
+
+    **Example:**
+
+    ```python
+    from jeit.image import Plane
+    plot_slice(solid, solid_image, Plane.at("z", 0.03))
+    ```
     """
     check_drawn(mesh, electrodes, scale)
     image = cell_values(mesh, values)
@@ -66,10 +78,22 @@ def plot_slices(
     scale: ColourScale = CHANGE,
     figure: Figure | None = None,
 ) -> Figure:
-    """Draw a grid of slices perpendicular to `axis`, with common scales of lengths and colours.
+    """Draw a grid of slices of a solid image, with common scales of lengths and colours.
 
-    `at`: number of slices, evenly spaced over the body, or their coordinates on the axis in metres. Other arguments as
-    for `plot_slice`. Raises `ValueError` as `plot_slice`.
+    **Arguments:**
+
+    - `mesh`, `values`, `electrodes`, `inclusions`, `scale`: as for `plot_slice`.
+    - `axis`: "x", "y" or "z"; the slices are perpendicular to it.
+    - `at`: number of slices, evenly spaced over the body, or their coordinates on the axis in metres.
+    - `figure`: the figure to draw in; default: a new one.
+
+    Raises `ValueError` as `plot_slice`.
+
+    **Example:**
+
+    ```python
+    plot_slices(solid, solid_image, axis="z", at=[0.01, 0.03])
+    ```
     """
     check_drawn(mesh, electrodes, scale)
     planes = planes_along(mesh, axis, at)
