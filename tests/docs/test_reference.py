@@ -84,11 +84,10 @@ def parameters(thing: object) -> list[str]:
     if inspect.isclass(thing) and issubclass(thing, enum.Enum):
         return []
     try:
-        return [
-            one for one in inspect.signature(thing).parameters if not one.startswith("_") and one not in ("self", "cls")
-        ]  # type: ignore[arg-type]
+        names = inspect.signature(thing).parameters  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return []
+    return [one for one in names if not one.startswith("_") and one not in ("self", "cls")]
 
 
 def faults(name: str, thing: object) -> list[str]:
