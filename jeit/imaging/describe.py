@@ -161,10 +161,8 @@ def find_description(
     **Example:**
 
     ```python
-    from pathlib import Path
-    np.savetxt("tank.csv", np.concatenate([rest.voltages, pressed.voltages]), delimiter=",")
-    electrodes = {"layout": "ring", "kind": "boundary", "width": 0.008}
-    found = find_description(Path("tank.csv"), {"shape": "disk", "radius": 0.05}, electrodes)
+    geometry, electrodes = {"shape": "disk", "radius": 0.05}, {"layout": "ring", "kind": "boundary", "width": 0.008}
+    print(find_description(file, geometry, electrodes).text)
     ```
     """
     if (own := format_with_protocol(path)) is not None:
