@@ -14,8 +14,7 @@ from matplotlib import pyplot
 ROOMS = [one for one in public_api.rooms() if one != "jeit"]  # which repeats names of its rooms
 FENCE = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 # Names whose docstrings are still to be written, by room.
-KNOWN: dict[str, set[str]] = {
-}
+KNOWN: dict[str, set[str]] = {}
 
 
 def example(docstring: str) -> str:
