@@ -72,6 +72,7 @@ MOVED = _RENAMED | {
 
 # Modules that have moved as a whole.
 _MOVED_PAGES = {
+    "jeit.electrodes.body_mesh": "jeit.electrodes.face_patches",
     "jeit.report.study": "jeit.design.reports",
     "jeit.simulate.acoustic": "jeit.acoustic.simulate",
     "jeit.simulate.acoustic.people": "jeit.acoustic.simulate.people",
