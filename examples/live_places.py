@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import jeit.live
-from jeit.imaging.stream_preparation import StreamSettings
+from jeit.imaging import StreamSettings
 from jeit.live import ConductivityView, ContactsView, LiveFrame, Picture, simulated_tank
 
 SECONDS = 4.0

@@ -12,8 +12,7 @@ from jeit.design import Hemisphere, Skin, touches_away_from_the_edge
 from jeit.design.plots import plot_unrolled
 from jeit.inverse import one_step
 from jeit.layout import SurfaceLayout
-from jeit.mesh import forearm
-from jeit.mesh.geodesic import Geodesics, unroll
+from jeit.mesh import Geodesics, forearm, unroll
 from jeit.plot import Camera, ColourScale, plot_curved_skin
 from jeit.touch.contacts import CellFinder, find_contacts
 
