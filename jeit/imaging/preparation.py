@@ -15,7 +15,7 @@ from jeit.data import Measurement
 from jeit.data.imageable import FrameQuality, assess, check_same_setup, mask_spikes, rounding_of_difference
 from jeit.data.transfer import as_driven
 from jeit.electrodes import AbstractElectrodes
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.forward import ForwardModel
 from jeit.imaging.calibration import Clock, calibrated_model, estimated_positions, relative_misfit
 from jeit.imaging.wiring import Wiring, exchanges_message, find_wiring
