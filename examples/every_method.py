@@ -6,8 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, one_step, plot_image, reconstruct, ring
-from jeit.inverse import Gaussian, TotalVariation, back_projection, greit, posterior
-from jeit.inverse.nonlinear import GaussNewton
+from jeit.inverse import Gaussian, GaussNewton, TotalVariation, back_projection, greit, posterior
 from jeit.mesh import centroids, measures
 from jeit.plot import ColourScale
 

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, image_difference, ring
 from jeit.data import Measurement
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes import body_mesh
 from jeit.mesh import centroids
 
 RADIUS, BACKGROUND, NOISE = 0.1, 0.02, 0.003  # metres, siemens, relative

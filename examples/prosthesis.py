@@ -11,8 +11,7 @@ import numpy as np
 from jeit.design import Hemisphere, Skin, plot_unrolled, touches_away_from_the_edge
 from jeit.inverse import one_step
 from jeit.layout import SurfaceLayout
-from jeit.mesh import forearm
-from jeit.mesh.geodesic import Geodesics, unroll
+from jeit.mesh import Geodesics, forearm, unroll
 from jeit.plot import Camera, ColourScale, plot_curved_skin
 from jeit.touch import CellFinder, find_contacts
 

@@ -73,7 +73,7 @@ def run(options: Options) -> Result:
 def _problem(body: str, count: int) -> dict[str, np.ndarray]:
     """Matrices of a forward model of about so many nodes, of random conductivities, and the loads of its electrodes."""
     from jeit.electrodes import BoundaryElectrodes, FacePatches
-    from jeit.electrodes.body_mesh import body_mesh
+    from jeit.electrodes.face_patches import body_mesh
     from jeit.forward.system import System
     from jeit.layout import ring
     from jeit.mesh import Disk, Solid

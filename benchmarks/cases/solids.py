@@ -19,7 +19,7 @@ import itertools, time
 import numpy as np
 from benchmarks.harness.memory import peak_memory
 from jeit.electrodes import FacePatches
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.forward import ForwardModel
 from jeit.inverse import Gaussian, Laplace, Matern, Noser, TotalVariation, greit, one_step, posterior, reconstruct
 from jeit.mesh import Rectangle, Solid, centroids

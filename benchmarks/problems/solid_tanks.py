@@ -15,7 +15,7 @@ from scipy.optimize import linear_sum_assignment
 
 from jeit.data import Measurement
 from jeit.electrodes import FacePatches
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.forward import ForwardModel
 from jeit.forward.changes import solved_fields
 from jeit.mesh import Disk, Mesh, Rectangle, Solid, bisect, centroids, cut

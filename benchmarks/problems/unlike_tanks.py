@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from benchmarks.problems.solid_tanks import Ball, mesh_along
 from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes, FacePatches
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.forward import ForwardModel
 from jeit.forward.changes import solved_fields
 from jeit.image import Inclusion

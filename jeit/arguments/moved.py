@@ -90,6 +90,7 @@ MOVED = {f"{page}.{old}": f"{home}.{new}" for page, home, names in _RENAMED for 
 
 # Modules that have moved as a whole.
 _MOVED_PAGES = {
+    "jeit.electrodes.body_mesh": "jeit.electrodes.face_patches",
     "jeit.report.study": "jeit.design.reports",
     "jeit.simulate.acoustic": "jeit.acoustic.simulate",
     "jeit.simulate.acoustic.people": "jeit.acoustic.simulate.people",

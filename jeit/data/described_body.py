@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jeit.electrodes import AbstractElectrodes, BoundaryElectrodes, FaceDiscs, FacePatches, PointElectrodes, SheetDiscs
-from jeit.electrodes.body_mesh import check_apart, check_on_surface, check_size
+from jeit.electrodes.face_patches import check_apart, check_on_surface, check_size
 from jeit.electrodes.facets import plates
 from jeit.files import check_electrodes
 from jeit.layout import perimeter, ring

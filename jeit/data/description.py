@@ -47,7 +47,7 @@ import numpy as np
 from jeit.data.described_body import described_body, described_electrodes
 from jeit.data.described_protocol import described_protocol, variants
 from jeit.electrodes import AbstractElectrodes
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.files import read_toml
 from jeit.forward import ForwardModel
 from jeit.inverse import Uncertainty

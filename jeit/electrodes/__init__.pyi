@@ -1,8 +1,8 @@
-from .body_mesh import FacePatches, body_mesh
 from .boundary import BoundaryElectrodes
 from .discs import FaceDiscs, SheetDiscs, SurfaceDiscs
 from .electrode_shapes import CombinedElectrodes, ElectrodeShapes, shapes_of
 from .electrodes import AbstractElectrodes
+from .face_patches import FacePatches, body_mesh
 from .facets import FacetElectrodes, electrodes_from_nodes, plates
 from .point import NodeElectrodes, PointElectrodes
 

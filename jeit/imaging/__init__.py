@@ -1,10 +1,10 @@
 """Imaging in one call: `image_difference` images the difference of two frames, `compare_on_data` compares the rules for
 the hyperparameter λ on it.
 
-`preparation` checks the data, builds the mesh and calibrates the model; `wiring` detects wiring that differs from its
-description; `method` holds the settings and the imaging methods; `automatic` chooses a method; `difference` finds
-inclusions; `sequence` images many frames at once; `stream_preparation` prepares imaging frame by frame. Streams of
-tactile skins are in `jeit.touch`.
+`preparation` checks the data and builds the mesh; `calibration` calibrates the model; `wiring` detects wiring that
+differs from its description; `method` holds the settings and the imaging methods; `automatic` chooses a method;
+`difference` finds inclusions; `sequence` images many frames at once; `stream_preparation` prepares imaging frame by
+frame. Streams of tactile skins are in `jeit.touch`.
 """
 
 from __future__ import annotations

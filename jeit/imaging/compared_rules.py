@@ -15,8 +15,9 @@ from jaxtyping import Array, Float
 from jeit.arguments import check_name
 from jeit.data import Measurement
 from jeit.image import Inclusion, find_inclusions
+from jeit.imaging.calibration import Clock
 from jeit.imaging.method import ImagingSettings, as_settings, prior_for, rule_for
-from jeit.imaging.preparation import Clock, PreparedDifference, check_real, prepare_difference
+from jeit.imaging.preparation import PreparedDifference, check_real, prepare_difference
 from jeit.inverse import RULES
 from jeit.inverse.hyperparameter.choice import Choice
 from jeit.inverse.hyperparameter.rules import choose

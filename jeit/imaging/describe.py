@@ -24,7 +24,7 @@ from jeit.data.formats.text import Frames, frames_in_table, frames_in_text, read
 from jeit.data.quality import reciprocity_error
 from jeit.data.registry import format_with_protocol
 from jeit.data.unstated import channel_gains, with_signs
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.files import matlab, npy_array, npz_arrays
 from jeit.forward import ForwardModel
 from jeit.imaging.wiring import Wiring, find_wiring
@@ -161,10 +161,8 @@ def find_description(
     **Example:**
 
     ```python
-    from pathlib import Path
-    np.savetxt("tank.csv", np.concatenate([rest.voltages, pressed.voltages]), delimiter=",")
-    electrodes = {"layout": "ring", "kind": "boundary", "width": 0.008}
-    found = find_description(Path("tank.csv"), {"shape": "disk", "radius": 0.05}, electrodes)
+    geometry, electrodes = {"shape": "disk", "radius": 0.05}, {"layout": "ring", "kind": "boundary", "width": 0.008}
+    print(find_description(file, geometry, electrodes).text)
     ```
     """
     if (own := format_with_protocol(path)) is not None:

@@ -21,8 +21,9 @@ from jeit.image import Inclusion, Raster, SolidForm
 from jeit.image.inclusions import inclusion_regions
 from jeit.image.merit import CONDUCTIVE, RESISTIVE
 from jeit.imaging.automatic import image_automatically
+from jeit.imaging.calibration import Clock, threads_for
 from jeit.imaging.method import AUTO, METHODS, Asked, ImagingSettings, as_settings
-from jeit.imaging.preparation import Clock, prepare_difference, threads_for
+from jeit.imaging.preparation import prepare_difference
 from jeit.imaging.wiring import Wiring
 from jeit.inverse.calibration import Calibration
 from jeit.inverse.linear.one_step import LinearReconstruction

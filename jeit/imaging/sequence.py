@@ -19,10 +19,10 @@ from jeit.data import Measurement
 from jeit.data.imageable import check_same_setup, mask_spikes
 from jeit.files import check_memory
 from jeit.image.image_series import ImageSeries
+from jeit.imaging.calibration import Clock
 from jeit.imaging.difference import ImagedDifference, image_difference
 from jeit.imaging.method import AUTO, METHODS, Asked, ImagingSettings, as_settings
 from jeit.imaging.preparation import (
-    Clock,
     PreparedDifference,
     check_measurement,
     check_real,

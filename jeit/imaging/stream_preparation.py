@@ -12,11 +12,10 @@ from jeit.arguments import check_kind
 from jeit.data import Measurement, screen
 from jeit.data.description import Description
 from jeit.forward import ForwardModel
+from jeit.imaging.calibration import Clock, calibrated_model
 from jeit.imaging.method import NamedPrior, check_body, check_hyperparameter, check_prior, prior_for
 from jeit.imaging.preparation import (
-    Clock,
     body_of,
-    calibrated_model,
     check_measurement,
     check_real,
     check_wiring,

@@ -166,7 +166,12 @@ def electrode_misfits(
     return np.where((count > 0) & (typical > 0), missed / max(typical, 1e-300), 1.0)
 
 
-def repeated_noise(frames, mask=None, *, prior_frames: float = 4.0) -> Float[np.ndarray, " M"]:
+def repeated_noise(
+    frames: Float[Array | np.ndarray, "F M"],
+    mask: Bool[Array | np.ndarray, "*F M"] | None = None,
+    *,
+    prior_frames: float = 4.0,
+) -> Float[np.ndarray, " M"]:
     """Standard deviation (M,) of the channels of a single frame, in volts, estimated from repeated frames of an
     unchanged body.
 

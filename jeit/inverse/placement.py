@@ -120,7 +120,7 @@ class ModelError(NamedTuple):
     factor: Float[np.ndarray, "p p"]
     drift: float = Uncertainty().drift
 
-    def voltages(self, model: ForwardModel, conductivity, background) -> Float[np.ndarray, "M q"]:
+    def voltages(self, model: ForwardModel, conductivity: ArrayLike, background: ArrayLike) -> Float[np.ndarray, "M q"]:
         """Errors (M, q) of the difference v(`conductivity`) - v(`background`), volts, for unit coefficients.
 
         `conductivity` and `background` per cell, S/m (2-D: S). The covariance of the difference is the product of the

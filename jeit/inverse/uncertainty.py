@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.special
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jeit.arguments import check_has_values, check_key, check_kind
@@ -79,7 +80,7 @@ class Posterior(Module):
         link = self.inversion.link
         return link.conductivity(estimate - reach * deviation), link.conductivity(estimate + reach * deviation)
 
-    def region(self, cells) -> tuple[float | Float[Array, ""], float | Float[Array, ""]]:
+    def region(self, cells: ArrayLike) -> tuple[float | Float[Array, ""], float | Float[Array, ""]]:
         """Mean conductivity of the given cells, weighted by area (3-D: volume), and its standard deviation, S/m
         (2-D: S).
 

@@ -26,6 +26,13 @@ class KMeans(Module):
     **Fields**: `centres`: (k, d) means of the clusters; `labels`: (n,) cluster of each point; `inertia`: sum of the
     squared distances of points to their centres; `steps`: number of iterations of the best restart; `converged`:
     whether the best restart converged.
+
+    **Example:**
+
+    ```python
+    found = kmeans(jax.random.normal(jax.random.key(0), (100, 2)), 3, jax.random.key(1))
+    found.centres, found.labels
+    ```
     """
 
     centres: Float[Array, "k d"]
@@ -44,7 +51,7 @@ def kmeans(
     max_steps: int = 300,
     tolerance: float = 0.0,
 ) -> KMeans:
-    """Partition `points` (n, d) into `num_clusters` k clusters of minimum inertia: the best of several local minima.
+    """Partition points into k clusters of minimum inertia: the best of several local minima.
 
     Lloyd's algorithm (IEEE Trans. Inf. Theory 28, 1982) from greedy k-means++ starts (Arthur and Vassilvitskii 2007).
     Clusters that lose all points receive the points farthest from their centres; a cluster can remain empty only if
@@ -53,6 +60,8 @@ def kmeans(
 
     **Arguments:**
 
+    - `points` (n, d): the points.
+    - `num_clusters`: k.
     - `key`: from `jax.random.key`; the same key gives the same clusters.
     - `restarts`: number of starts.
     - `max_steps`: maximum number of iterations of Lloyd's algorithm for each start.
@@ -60,6 +69,12 @@ def kmeans(
       no point changes its cluster.
 
     Raises `ValueError` for invalid shapes, counts, tolerances, keys and points.
+
+    **Example:**
+
+    ```python
+    found = kmeans(jax.random.normal(jax.random.key(0), (100, 2)), 3, jax.random.key(1))
+    ```
     """
     if np.ndim(points) != 2 or 0 in np.shape(points):
         raise ValueError(f"points has shape {np.shape(points)}; give (n, d), one row for each point.")

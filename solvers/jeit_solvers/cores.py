@@ -31,7 +31,14 @@ _THREAD_NAME = "jeit-core"
 
 
 def number_of_cores() -> int:
-    """Number of cores that this process may use."""
+    """Number of cores that this process may use.
+
+    **Example:**
+
+    ```python
+    number_of_cores()
+    ```
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -44,13 +51,23 @@ def memory_of_machine() -> float:
 
 
 def over_cores(function: Callable[[Int[np.ndarray, "c s"]], Array], num_parts: int, group_size: int) -> Array:
-    """Compute `function` for the parts 0 … `num_parts` - 1 on all cores, `group_size` parts at a time, and concatenate
-    the rows that it returns. If `num_parts` is not divisible into equal groups, the rows of the last part are repeated
-    at the end.
+    """Compute a function for the parts 0 … `num_parts` - 1 on all cores, and concatenate the rows that it returns. If
+    `num_parts` is not divisible into equal groups, the rows of the last part are repeated at the end.
 
-    `function`: maps the indices (c, s) of c groups of s parts to an array (c s, …); it is compiled once, because every
-    core processes the same number c of groups. The results of a group must not depend on other groups; then they do not
-    depend on the number of cores.
+    The function is compiled once, because every core processes the same number c of groups. The results of a group must
+    not depend on other groups; then they do not depend on the number of cores.
+
+    **Arguments:**
+
+    - `function`: maps the indices (c, s) of c groups of s parts to an array (c s, …).
+    - `num_parts`: number of parts.
+    - `group_size`: number of parts s that are computed at a time.
+
+    **Example:**
+
+    ```python
+    squares = over_cores(lambda indices: indices.ravel() ** 2, 10, 5)
+    ```
     """
     groups = -(-num_parts // group_size)
     cores = min(number_of_cores(), groups)
@@ -67,6 +84,18 @@ def on_cores(function: Callable[[Any], Any], parts: Sequence[Any]) -> None:
     A single part, a call from inside another part, and a call while another thread has the cores, are processed in the
     calling thread: parts may wait for compiled programs, which call NumPy from threads of their own. Floating-point
     warnings are suppressed, because NaN is reported elsewhere.
+
+    **Arguments:**
+
+    - `function`: function of a part.
+    - `parts`: one for each call.
+
+    **Example:**
+
+    ```python
+    squares = np.zeros(4)
+    on_cores(lambda part: squares.__setitem__(part, part**2), range(4))
+    ```
     """
 
     def quietly(part: Any) -> None:
@@ -118,7 +147,15 @@ _limits_lock = threading.Lock()
 @contextlib.contextmanager
 def one_thread_of_blas() -> Iterator[None]:
     """Limit the BLAS to one thread while this context, or another one of this kind, is active. Takes a few
-    microseconds."""
+    microseconds.
+
+    **Example:**
+
+    ```python
+    with one_thread_of_blas():
+        np.linalg.inv(chain)
+    ```
+    """
     with _limits_lock:
         if not _active_limits:
             _take_control()

@@ -33,7 +33,18 @@ def inverse_cholesky(matrices: Inexact[Array, "batch s s"]) -> Inexact[Array, "b
 
 
 def lower_cholesky(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
-    """Lower triangular L with A = L Lᵀ; NaN if there is no such matrix."""
+    """Lower triangular L with A = L Lᵀ; NaN if there is no such matrix.
+
+    **Arguments:**
+
+    - `matrix` (s, s): A, symmetric positive definite.
+
+    **Example:**
+
+    ```python
+    lower = lower_cholesky(dense)
+    ```
+    """
     if not isinstance(matrix, np.ndarray):
         return jnp.linalg.cholesky(matrix)
     try:
@@ -43,7 +54,18 @@ def lower_cholesky(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
 
 
 def symmetric_eigen(matrix: Inexact[Array, "s s"]) -> tuple[Inexact[Array, " s"], Inexact[Array, "s s"]]:
-    """Eigenvalues in ascending order, and eigenvectors in columns; NaN if the matrix is not finite."""
+    """Eigenvalues in ascending order, and eigenvectors in columns; NaN if the matrix is not finite.
+
+    **Arguments:**
+
+    - `matrix` (s, s): symmetric, or Hermitian.
+
+    **Example:**
+
+    ```python
+    eigenvalues, eigenvectors = symmetric_eigen(dense)
+    ```
+    """
     if not isinstance(matrix, np.ndarray):
         return jnp.linalg.eigh(matrix)
     if not np.isfinite(matrix).all():
@@ -52,7 +74,18 @@ def symmetric_eigen(matrix: Inexact[Array, "s s"]) -> tuple[Inexact[Array, " s"]
 
 
 def symmetric_inverse(matrix: Inexact[Array, "s s"]) -> Inexact[Array, "s s"]:
-    """A^-1 of a single matrix of the kind that `inverse_cholesky` accepts; NaN if it is singular or not finite."""
+    """Inverse of a single symmetric matrix; NaN if it is singular or not finite.
+
+    **Arguments:**
+
+    - `matrix` (s, s): of the kind that `inverse_cholesky` accepts.
+
+    **Example:**
+
+    ```python
+    symmetric_inverse(dense)
+    ```
+    """
     if not isinstance(matrix, np.ndarray):
         return _symmetric_inverse(matrix)
     if not np.isfinite(matrix).all():
@@ -197,8 +230,23 @@ def ridge_model(
     covariance: Float[Array, "M M"],
     precision: Float[Array, "M M"],
 ) -> QuadraticModel:
-    """The cost ½ rᵀ C⁻¹ r + ½ ‖c‖² at a point c, with the `residual` r, and its `step` function for `Descent`.
-    `covariance`: C, of the data; `precision`: its inverse; `jacobian`: derivative of r with respect to c."""
+    """The cost ½ rᵀ C⁻¹ r + ½ ‖c‖² at a point c, with the residual r, and its `step` function for `Descent`.
+
+    **Arguments:**
+
+    - `residual` (M,): r at the point.
+    - `jacobian` (M, n): derivative of r with respect to c.
+    - `point` (n,): c.
+    - `covariance` (M, M): C, of the data.
+    - `precision` (M, M): its inverse.
+
+    **Example:**
+
+    ```python
+    cost, step = ridge_model(jnp.ones(5), jnp.eye(5), jnp.zeros(5), jnp.eye(5), jnp.eye(5))
+    direction, slope, curvature = step(0.0)
+    ```
+    """
     if not isinstance(jacobian, np.ndarray):
         jacobian = jax.lax.optimization_barrier(jacobian)
     weighted = precision @ residual
@@ -221,11 +269,25 @@ def ridge_step(
     precision: Float[Array, "M M"],
     ridge: Float[Array, ""] | float = 1.0,
 ) -> Float[Array, " n"]:
-    """Solve (JᵀC⁻¹J + ridge · 1) δ = -(JᵀC⁻¹r + c) for δ, by a linear system of min(M, n) unknowns. J: `jacobian`; r:
-    `residual`; c: `point`; C: `covariance` of the data, with the inverse `precision`.
+    """Solve (JᵀC⁻¹J + ridge · 1) δ = -(JᵀC⁻¹r + c) for δ, by a linear system of min(M, n) unknowns.
 
     With fewer data than unknowns, δ = -c / ridge - Jᵀ (JJᵀ + ridge · C)⁻¹ (r - J c / ridge) by Woodbury's identity, in
     a form without cancellation of large terms, however small the ridge is relative to J.
+
+    **Arguments:**
+
+    - `jacobian` (M, n): J.
+    - `residual` (M,): r.
+    - `point` (n,): c.
+    - `covariance` (M, M): C, of the data.
+    - `precision` (M, M): its inverse.
+    - `ridge`: weight of the penalty.
+
+    **Example:**
+
+    ```python
+    change = ridge_step(jnp.eye(5), jnp.ones(5), jnp.zeros(5), jnp.eye(5), jnp.eye(5))
+    ```
     """
     rows, columns = jacobian.shape
     if columns <= rows:
@@ -237,7 +299,19 @@ def ridge_step(
 
 
 def solve_definite(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Solution A⁻¹ b for a dense symmetric positive definite A; NaN if A is not positive definite."""
+    """Solution A⁻¹ b for a dense symmetric positive definite A; NaN if A is not positive definite.
+
+    **Arguments:**
+
+    - `matrix` (n, n): A.
+    - `vector` (n,): b.
+
+    **Example:**
+
+    ```python
+    solve_definite(dense, jnp.ones(5))
+    ```
+    """
     if isinstance(matrix, np.ndarray):
         try:
             return scipy.linalg.cho_solve(

@@ -35,6 +35,16 @@ def in_turn(function: Callable[..., Any]) -> Callable[..., Any]:
 
     On accelerators, and without `vmap`, the function is not changed. This is useful for functions, such as those with a
     factorisation, whose whole batch would not fit in the cache.
+
+    **Arguments:**
+
+    - `function`: function of arrays.
+
+    **Example:**
+
+    ```python
+    inverses = jax.vmap(in_turn(jnp.linalg.inv))(jnp.stack([dense, 2 * dense]))
+    ```
     """
     return differentiable_batches(function, one_by_one)
 

@@ -26,6 +26,7 @@ def test_an_old_name_is_found_and_warned_of(old):
         ("jeit.simulate.acoustic.people import SoundingPerson", "jeit.acoustic.simulate.people.SoundingPerson"),
         ("jeit.simulate.people import Person", "jeit.touch.simulate.people.Person"),
         ("jeit.simulate.damage import Cut", "jeit.touch.simulate.damage.Cut"),
+        ("jeit.electrodes.body_mesh import FacePatches", "jeit.electrodes.face_patches.FacePatches"),
         ("jeit.report.study import write_study_report", "jeit.design.reports.write_study_report"),
     ],
 )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jeit.electrodes import FacePatches
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.electrodes.facets import covered_moments
 from jeit.forward import ForwardModel
 from jeit.mesh import Disk, Rectangle, Solid, layer, measures, rectangle

@@ -13,7 +13,7 @@ from jeit.data import Measurement
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.image import find_inclusions
-from jeit.imaging import ImagingSettings, automatic, preparation, prepare_difference
+from jeit.imaging import ImagingSettings, automatic, calibration, prepare_difference
 from jeit.imaging.automatic import unsound
 from jeit.imaging.method import METHODS
 from jeit.inverse import Gaussian, calibrate, reconstruct
@@ -66,10 +66,10 @@ def test_sheets_are_imaged_with_one_thread_of_blas(monkeypatch):
         entered.append(True)
         return nullcontext()
 
-    monkeypatch.setattr(preparation, "one_thread_of_blas", context)
+    monkeypatch.setattr(calibration, "one_thread_of_blas", context)
     image(20.0, method="one-step", raster_shape=(16, 16))
     assert len(entered) == 2  # while it is calibrated, and while it is imaged
-    with preparation.threads_for(cylinder(0.1, 0.1, cell_size=0.05)):
+    with calibration.threads_for(cylinder(0.1, 0.1, cell_size=0.05)):
         assert len(entered) == 2
 
 

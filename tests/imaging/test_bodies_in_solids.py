@@ -10,7 +10,7 @@ import pytest
 from jeit import image_difference
 from jeit.data import Measurement
 from jeit.electrodes import FacePatches
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.forward import ForwardModel
 from jeit.image import Raster
 from jeit.image.segmentation import CONDUCTIVE

@@ -9,7 +9,7 @@ from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, ring
 from jeit.data import Measurement
 from jeit.data.imageable import rounding_of_difference
 from jeit.electrodes import FaceDiscs, FacePatches, NodeElectrodes, SheetDiscs
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.forward.changes import PlacementSensitivity, shift_electrodes
 from jeit.imaging import preparation
 from jeit.imaging.preparation import prepare_difference

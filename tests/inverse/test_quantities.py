@@ -8,7 +8,7 @@ import pytest
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, image_difference, ring
 from jeit.cli.console import with_interval
 from jeit.data import Measurement
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.image import Inclusion
 from jeit.inverse.channels import Data
 from jeit.inverse.placement import ModelError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.electrodes import FacePatches
-from jeit.electrodes.body_mesh import body_mesh
+from jeit.electrodes.face_patches import body_mesh
 from jeit.layout import ring
 from jeit.mesh import Disk, Rectangle, Refine, Solid, box, cylinder, disk, layer, polygon, quality, rectangle
 

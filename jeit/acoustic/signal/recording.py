@@ -6,14 +6,11 @@ microphone (NaN, zeros, clipped peaks) are accepted here; `jeit.acoustic.signal.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import equinox as eqx
 import numpy as np
-import scipy.io.wavfile
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
@@ -30,97 +27,13 @@ from jeit.acoustic.signal._arrays import (
     short_text,
 )
 from jeit.acoustic.signal.faults import intensity_faults
-from jeit.arguments.extras import optional
-from jeit.files import check_memory, need, npz_arrays, read_as, reason, written_whole
+from jeit.acoustic.signal.sound_file import read_sound
+from jeit.files import need, npz_arrays, written_whole
 from jeit.mesh.topology import check_loop
 from jeit_solvers.module import Module
 
-# Bytes of memory needed per byte of a file with eight bits per sample.
-_IN_MEMORY = 16
-# First bytes of the formats read by `soundfile`: FLAC, Ogg, AIFF, CAF, AU, Wave64, VOC, MP3 with a tag.
-_SOUNDFILE_STARTS = (b"fLaC", b"OggS", b"FORM", b"caff", b".snd", b"riff", b"Creative", b"ID3")
-# Bytes that identify formats which `soundfile` does not read: MP4 (from the fifth byte on); WebM, WMA and AMR.
-_MP4, _UNREADABLE_STARTS = b"ftyp", (b"\x1aE\xdf\xa3", b"0&\xb2u", b"#!AMR")
-
-
-def read_sound(path: Path) -> tuple[np.ndarray, float, float | None] | None:
-    """Read the samples (M, S), the sampling rate in Hz and the full scale of a sound file. Returns None if the format
-    is unknown.
-
-    Integer samples are converted to fractions of full scale, from -1 to 1. Floats are unchanged; if any exceeds 1, the
-    full scale is None (unknown). Raises `ValueError` for broken files, for formats that cannot be read, and if
-    `soundfile` is needed but not installed.
-    """
-    check_memory(path.name, _IN_MEMORY * path.stat().st_size)
-    with path.open("rb") as file:
-        start = file.read(8)
-    if start.startswith((b"RIFF", b"RIFX", b"RF64")):
-        return _read_wav(path)
-    if start.startswith(_SOUNDFILE_STARTS) or _is_mp3(start):
-        return _read_with_soundfile(path)
-    if start[4:] == _MP4 or start.startswith(_UNREADABLE_STARTS):
-        raise ValueError(
-            f"a format that is not read (M4A, MP4, WebM, WMA, AMR); convert it: ffmpeg -i '{path.name}' "
-            f"'{path.stem}.wav'."
-        )
-    return None
-
-
-def _is_mp3(start: bytes) -> bool:
-    """Whether the bytes are the start of an MPEG layer III frame: eleven set bits, any version, and the layer."""
-    return len(start) > 1 and start[0] == 0xFF and start[1] & 0xE6 == 0xE2
-
-
-def _read_wav(path: Path) -> tuple[np.ndarray, float, float | None]:
-    problem, rate, data = None, 0, np.zeros(0)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        try:
-            rate, data = scipy.io.wavfile.read(path)
-        except Exception as error:  # damaged files raise exceptions of many types
-            problem = error
-    # SciPy only warns of a truncated file, or fails later. Its other warnings concern chunks without sound.
-    if any("prematurely" in str(one.message) for one in said):
-        raise ValueError("the WAV file is cut off: it holds fewer samples than its header says. Copy it again.")
-    if "Unknown wave file format" in str(problem):  # A-law or ADPCM, for example
-        return _read_with_soundfile(path)
-    if problem is not None:
-        raise ValueError(f"not a readable WAV file, or cut off ({reason(problem)}); write it as plain PCM or float.")
-    samples = data.T if data.ndim == 2 else data[None]
-    if data.dtype == np.uint8:
-        return (samples - 128.0) / 128.0, rate, 1.0
-    if data.dtype.kind == "i":
-        # SciPy returns 24-bit samples in the upper bits of 32-bit integers, so this scale is right for them too.
-        return samples / -float(np.iinfo(data.dtype.name).min), rate, 1.0
-    return samples, rate, _full_scale(samples)
-
-
-def _read_with_soundfile(path: Path) -> tuple[np.ndarray, float, float | None]:
-    try:
-        soundfile: Any = optional("soundfile", "a format that is not plain WAV", "Or convert it to plain WAV.")
-    except ImportError as error:
-        raise ValueError(str(error)) from None  # like other faults of this file: the caller may read further files
-    unread = "not a sound file that soundfile reads"
-    with read_as(unread):
-        file = soundfile.SoundFile(path)
-    with file:
-        check_memory(path.name, 16.0 * file.frames * file.channels)
-        with read_as(unread):
-            data, rate, kind = file.read(file.frames, "float64", always_2d=True), file.samplerate, file.subtype
-    # Decoded samples of compressed formats may slightly exceed 1, although their full scale is 1.
-    return data.T, rate, _full_scale(data) if kind in ("FLOAT", "DOUBLE") else 1.0
-
-
-def _full_scale(samples: np.ndarray) -> float | None:
-    """Full scale of float samples: 1; or None (unknown) if the magnitude of any sample exceeds 1, since the samples are
-    then in another unit."""
-    return None if (np.abs(samples[np.isfinite(samples)]) > 1.0).any() else 1.0
-
-
 # Error message for files of an unknown format.
 _UNKNOWN_FORMAT = "neither an NPZ nor a sound file"
-
-
 # Maximum magnitude of a sample in any unit; squares of larger samples would overflow in single precision.
 _LOUDEST = 1e15
 

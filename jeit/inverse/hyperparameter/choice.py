@@ -5,6 +5,8 @@ GREIT and filtered back-projection scale λ differently and have their own defau
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import equinox as eqx
 import numpy as np
 from jax.typing import ArrayLike
@@ -53,7 +55,7 @@ class Choice(Module):
     edge: str = eqx.field(static=True, default="")
 
     @classmethod
-    def given(cls, hyperparameter) -> "Choice":
+    def given(cls, hyperparameter: ArrayLike) -> "Choice":
         """Create from a given number."""
         value = as_array(hyperparameter, float)
         nothing = as_array(np.zeros(0))
@@ -61,7 +63,15 @@ class Choice(Module):
 
     @classmethod
     def among(
-        cls, rule: str, candidates, index: int, criterion, curves, *, target: float | None = None, between=None
+        cls,
+        rule: str,
+        candidates: Float[np.ndarray, " K"],
+        index: int,
+        criterion: Float[np.ndarray, " K"],
+        curves: Iterable[ArrayLike],
+        *,
+        target: float | None = None,
+        between: float | None = None,
     ) -> "Choice":
         """Create from a rule's result: candidate number `index`, or `between`, a λ between that candidate and the next.
 
@@ -82,7 +92,7 @@ class Choice(Module):
             "for: the choice is not to be trusted."
         )
 
-    def read(self, curve: ArrayLike, hyperparameter=None) -> float:
+    def read(self, curve: ArrayLike, hyperparameter: ArrayLike | None = None) -> float:
         """Interpolate one of the curves (K,) at `hyperparameter`, by default the chosen λ.
 
         Raises `ValueError` if the curve is empty.

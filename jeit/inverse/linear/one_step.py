@@ -80,7 +80,7 @@ class LinearReconstruction:
         cls,
         model: ForwardModel,
         factors: tuple[Inexact[np.ndarray, "m r"], Inexact[np.ndarray, "r M"]],
-        hyperparameter,
+        hyperparameter: ArrayLike,
         rule: str,
         method: str,
         choice: Choice | None = None,
@@ -101,7 +101,15 @@ class LinearReconstruction:
         return cls(model.mesh, *places, *given)
 
     @classmethod
-    def create(cls, model: ForwardModel, matrix, hyperparameter, rule: str, method: str, choice: Choice | None = None):
+    def create(
+        cls,
+        model: ForwardModel,
+        matrix: Inexact[Array | np.ndarray, "m M"],
+        hyperparameter: ArrayLike,
+        rule: str,
+        method: str,
+        choice: Choice | None = None,
+    ):
         """Create from a full reconstruction matrix (m, M)."""
         if not has_values(model.protocol, matrix, hyperparameter):
             # It is unknown which columns of a traced matrix are proportional, so no channels are combined.

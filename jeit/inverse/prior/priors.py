@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 import scipy.sparse
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from scipy.spatial.distance import cdist
 
@@ -92,7 +93,7 @@ class AbstractPrior(Module):
         self,
         mesh: Mesh,
         reference: Float[Array, " m"],
-        hyperparameter,
+        hyperparameter: ArrayLike,
         *,
         jacobian: Float[Array, "M m"] | None = None,
         regions: Regions | None = None,

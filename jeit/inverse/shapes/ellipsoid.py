@@ -115,16 +115,12 @@ class EllipsoidPrior(BodyPrior):
     **Arguments:**
 
     - `modes`: 2, or 1 for balls.
-    - `place`: standard deviation of each coordinate of a body's centre about its start, in units of the longest side of
-      the domain; small, because smooth images of solids locate bodies well.
-    - `radius`, `radius_spread`: median of the mean radius, in the same unit, and standard deviation of its logarithm.
+    - `place`, `radius`, `radius_spread`, `drift`, `apart`: as in `StarPrior`; `place` is small, because smooth images
+      of solids locate bodies well.
     - `roughness`: standard deviation of the five coefficients of S, the log stretches.
-    - `drift`: standard deviation of the change of the bath's log conductivity between the two frames.
-    - `apart`: reciprocal of the standard deviation of the overlap of two bodies, as a fraction of the domain.
     - `contrast`, `contrast_spread`: median of the contrast in log σ, and standard deviation of its logarithm.
     - `odds_for_columns`: prior odds of a column relative to an ellipsoid; most tanks hold columns.
-    - `odds_for_one_material`: prior odds that all bodies more conductive than the bath (or all less conductive) are of
-      the same material, relative to a material of its own for each.
+    - `odds_for_one_material`: prior odds that all bodies of one sign are of one material, relative to one for each.
     - `kinds`: kinds of bodies considered, one of `KINDS`.
 
     Raises `ValueError` if a number is not positive or `kinds` is not in `KINDS`.

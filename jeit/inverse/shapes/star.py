@@ -33,7 +33,11 @@ class StarPrior(BodyPrior):
     **Arguments:**
 
     - `modes`: N, number of the highest mode of an outline; 1 gives disks.
-    - `place`, `radius`, `radius_spread`, `drift`, `apart`: as in `EllipsoidPrior`.
+    - `place`: standard deviation of each coordinate of a body's centre about its start, in units of the longest side of
+      the domain.
+    - `radius`, `radius_spread`: median of the mean radius, in the same unit, and standard deviation of its logarithm.
+    - `drift`: standard deviation of the change of the bath's log conductivity between the two frames.
+    - `apart`: reciprocal of the standard deviation of the overlap of two bodies, as a fraction of the domain.
     - `roughness`: standard deviation of a₂ and b₂; for aₙ and bₙ it is multiplied by 2/n.
     - `contrast`, `contrast_spread`: mean and standard deviation of the contrast in log σ of a strong body, ten times as
       conductive or resistive as the bath or more. Data hardly distinguish its contrast from a higher one, so the mean

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from enum import StrEnum
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -290,7 +291,7 @@ class StreamState:
         self._estimate(self.expected)  # compiles
         self.coefficients = np.asarray(imager.start)
 
-    def image(self, number: int, frame) -> FrameImage:
+    def image(self, number: int, frame: Any) -> FrameImage:
         """Image of one frame, or the reason why it was refused."""
         begin = time.perf_counter()
         values, usable, status, reason = self.check(frame)

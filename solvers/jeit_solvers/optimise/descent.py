@@ -30,7 +30,14 @@ from jeit_solvers.module import Module
 
 class Status(StrEnum):
     """Status with which a minimisation ended. Each member equals its word, so `status == "converged"` works; details
-    such as the number of steps are reported in a separate sentence."""
+    such as the number of steps are reported in a separate sentence.
+
+    **Example:**
+
+    ```python
+    scipy_lbfgsb(jax.value_and_grad(bowl), np.zeros(3), 0.0, 1.0, tolerance=1e-8)[2] == Status.CONVERGED
+    ```
+    """
 
     CONVERGED = "converged"
     """The next step would change the result by less than the tolerance."""
@@ -63,12 +70,34 @@ class Status(StrEnum):
 
 
 def ended(result: optx.RESULTS) -> Status:
-    """Status of an optimistix result. Works only outside `jax.jit`; see `ended_number`."""
+    """Status of an optimistix result. Works only outside `jax.jit`; see `ended_number`.
+
+    **Arguments:**
+
+    - `result`: the `result` of an optimistix solution.
+
+    **Example:**
+
+    ```python
+    ended(optx.RESULTS.successful)
+    ```
+    """
     return Status.of_number(ended_number(result))
 
 
 def ended_number(result: optx.RESULTS) -> Int[Array, ""]:
-    """`Status.number` of an optimistix result; works inside `jax.jit`, too."""
+    """`Status.number` of an optimistix result; works inside `jax.jit`, too.
+
+    **Arguments:**
+
+    - `result`: the `result` of an optimistix solution.
+
+    **Example:**
+
+    ```python
+    Status.of_number(ended_number(optx.RESULTS.successful))
+    ```
+    """
     limit = result == optx.RESULTS.nonlinear_max_steps_reached
     other = jnp.where(limit, Status.STEP_LIMIT.number, Status.STALLED.number)
     return jnp.where(result == optx.RESULTS.successful, Status.CONVERGED.number, other)
@@ -79,7 +108,15 @@ Objective = Callable[[Float[Array, " n"]], Float[Array, ""]]
 
 class BoundedMinimum(Module):
     """Result of a minimisation with bounds. **Fields**: `x`: (n,) the minimum; `steps`: number of steps; `converged`:
-    whether a step along the projected gradient would change no coordinate by more than the tolerance."""
+    whether a step along the projected gradient would change no coordinate by more than the tolerance.
+
+    **Example:**
+
+    ```python
+    found = lbfgsb(bowl, jnp.zeros(3), 0.0, 1.0, max_steps=100, tolerance=1e-8)
+    found.x, found.converged
+    ```
+    """
 
     x: Float[Array, " n"]
     steps: Int[Array, ""]
@@ -103,7 +140,22 @@ def lbfgsb(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """Minimise with bounds (n,) by L-BFGS-B, inside `jax.jit`; coordinates should be of similar magnitude."""
+    """Minimise with bounds by L-BFGS-B, inside `jax.jit`.
+
+    **Arguments:**
+
+    - `objective`: function of (n,) that returns a number; coordinates should be of similar magnitude.
+    - `start` (n,): point to start from.
+    - `lower`, `upper` (n,): bounds.
+    - `max_steps`: maximum number of steps.
+    - `tolerance`: maximum change of a coordinate in a step along the projected gradient at convergence.
+
+    **Example:**
+
+    ```python
+    found = lbfgsb(bowl, jnp.zeros(3), 0.0, 1.0, max_steps=100, tolerance=1e-8)
+    ```
+    """
     solver = _jaxopt().LBFGSB(objective, maxiter=max_steps, tol=tolerance, history_size=20)
     solution = solver.run(start, bounds=(lower, upper))
     return BoundedMinimum(solution.params, solution.state.iter_num, solution.state.error <= tolerance)
@@ -118,7 +170,18 @@ def projected_gradient(
     max_steps: int,
     tolerance: float,
 ) -> BoundedMinimum:
-    """Minimise with bounds (n,) by accelerated projected gradients, with more but cheaper steps than `lbfgsb`."""
+    """Minimise with bounds by accelerated projected gradients, with more but cheaper steps than `lbfgsb`.
+
+    **Arguments:**
+
+    - `objective`, `start`, `lower`, `upper`, `max_steps`, `tolerance`: as for `lbfgsb`.
+
+    **Example:**
+
+    ```python
+    found = projected_gradient(bowl, jnp.zeros(3), 0.0, 1.0, max_steps=100, tolerance=1e-8)
+    ```
+    """
     jaxopt = _jaxopt()
     solver = jaxopt.ProjectedGradient(
         objective, jaxopt.projection.projection_box, maxiter=max_steps, tol=tolerance, acceleration=True
@@ -139,8 +202,22 @@ def scipy_lbfgsb(
 ) -> tuple[Float[np.ndarray, "*shape"], float, Status]:
     """Minimise with bounds by SciPy's L-BFGS-B; returns the minimum, the value there, and the status.
 
-    `value_and_gradient`: function of an array of the shape of `start`, compiled by the caller. `callback`: called with
-    every accepted point. Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16 (1995) 1190-1208.
+    Byrd, Lu, Nocedal and Zhu, SIAM J. Sci. Comput. 16 (1995) 1190-1208.
+
+    **Arguments:**
+
+    - `value_and_gradient`: function of an array of the shape of `start` that returns both, compiled by the caller.
+    - `start`: point to start from.
+    - `lower`, `upper`: bounds, which broadcast to the shape of `start`.
+    - `tolerance`: given to SciPy as `ftol` and `gtol`.
+    - `max_steps`: maximum number of steps.
+    - `callback`: called with every accepted point.
+
+    **Example:**
+
+    ```python
+    x, value, status = scipy_lbfgsb(jax.value_and_grad(bowl), np.zeros(3), 0.0, 1.0, tolerance=1e-8)
+    ```
     """
     shape = np.shape(start)
     ends = [np.broadcast_to(np.asarray(end, float), shape).ravel() for end in (lower, upper)]
@@ -198,8 +275,16 @@ class Descent(optx.AbstractLeastSquaresSolver):
     **Arguments:**
 
     - `rtol`, `atol`: stop when the predicted decrease of the cost in the next step is less than rtol·cost + atol.
+    - `norm`: required by optimistix's interface, and not used.
     - `damping`: 0 for Gauss-Newton; a positive value is the initial damping of Levenberg-Marquardt.
     - `history`: number of costs to store, one for every accepted point; unused entries are NaN.
+
+    **Example:**
+
+    ```python
+    expand = lambda x, _: ridge_model(2 * x - 3, 2 * jnp.eye(4), x, jnp.eye(4), jnp.eye(4))
+    optx.least_squares(lambda x, _: (2 * x - 3, x), Descent(), jnp.zeros(4), options={"expand": expand})
+    ```
     """
 
     rtol: float = 1e-6

@@ -36,15 +36,30 @@ Preconditioner = Callable[[Float[Array, " n"], Any], LinearMap]
 def as_minimum(
     point: Float[Array, " n"], problem: Any, gradient: Gradient, precondition: Preconditioner
 ) -> Float[Array, " n"]:
-    """`point` (n,) unchanged, with the derivatives that the nearby minimum has with respect to the arrays in the pytree
-    `problem`.
+    """Give a minimum that a solver has found the derivatives that it has with respect to the problem. Returns `point`
+    unchanged.
 
-    `gradient(x, problem)`: gradient (n,) of the cost, zero at the minimum; its derivative with respect to x must be
-    symmetric and positive definite there. `precondition(x, problem)`: a function of a vector that applies the inverse
-    of a model of this derivative. The computation of `point` is not differentiated. Derivatives are evaluated at the
-    minimum itself, found by a few Newton steps from `point`, so they are as accurate as the gradient even if the solver
-    stopped early; if the Newton steps fail, they are evaluated at `point`. Differentiable any number of times, in
-    forward and reverse mode, and under `jax.vmap`.
+    The computation of `point` is not differentiated. Derivatives are evaluated at the minimum itself, found by a few
+    Newton steps from `point`, so they are as accurate as the gradient even if the solver stopped early; if the Newton
+    steps fail, they are evaluated at `point`. Differentiable any number of times, in forward and reverse mode, and
+    under `jax.vmap`.
+
+    **Arguments:**
+
+    - `point` (n,): near the minimum.
+    - `problem`: a pytree, with respect to whose arrays the minimum is differentiated.
+    - `gradient`: function of (x, problem) that returns the gradient (n,) of the cost, zero at the minimum; its
+      derivative with respect to x must be symmetric and positive definite there.
+    - `precondition`: function of (x, problem) that returns a function of a vector, which applies the inverse of a model
+      of this derivative.
+
+    **Example:**
+
+    ```python
+    gradient = lambda x, target: 2 * (x - target)
+    minimum = lambda target: as_minimum(jnp.full(3, 2.0), target, gradient, lambda x, target: lambda vector: vector / 2)
+    jax.jacobian(minimum)(2.0)
+    ```
     """
     return _minimum(jax.lax.stop_gradient(point), problem, gradient, precondition)
 

@@ -34,7 +34,18 @@ _DIFFERENCE_STEP = 1e-6
 
 class Minimum(Module):
     """Result of the batch. **Fields**: `x`: (n, F) minima; `value`: (F,); `converged`: (F,); `steps`: maximum number of
-    steps of any function."""
+    steps of any function.
+
+    **Example:**
+
+    ```python
+    found = minimise_small(
+        lambda x, _: (jnp.sum(x**2, axis=0) / 2, x, jnp.repeat(jnp.eye(3)[:, :, None], x.shape[1], axis=2)),
+        jnp.ones((3, 100)), lower=-jnp.ones((3, 1)), upper=jnp.ones((3, 1)), largest_step=jnp.ones((3, 1)),
+    )
+    found.x, found.converged
+    ```
+    """
 
     x: Float[Array, "n F"]
     value: Float[Array, " F"]
@@ -43,7 +54,19 @@ class Minimum(Module):
 
 
 def solve_small(matrix: Float[Array, "n n F"], right_hand_sides: Float[Array, "n F"]) -> Float[Array, "n F"]:
-    """Solve F symmetric positive definite systems of n unknowns by Cholesky's method in explicit formulas."""
+    """Solve F symmetric positive definite systems of n unknowns by Cholesky's method in explicit formulas.
+
+    **Arguments:**
+
+    - `matrix` (n, n, F): the matrices.
+    - `right_hand_sides` (n, F): one for each matrix.
+
+    **Example:**
+
+    ```python
+    solve_small(small, jnp.ones((3, 100)))
+    ```
+    """
     number, lower = matrix.shape[0], _cholesky(matrix)
     forward: list[Array] = []
     for i in range(number):
@@ -57,16 +80,37 @@ def solve_small(matrix: Float[Array, "n n F"], right_hand_sides: Float[Array, "n
 
 
 def gradient_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n F"]:
-    """Gradients at x of F functions, one per column. `value`: maps (n, F) to (F,), analytic."""
+    """Gradients (n, F) at x of F functions, one per column.
+
+    **Arguments:**
+
+    - `value`: function that maps (n, F) to (F,), analytic.
+    - `x` (n, F): the points.
+
+    **Example:**
+
+    ```python
+    gradient_small(lambda x: (x**2).sum(axis=0), jnp.ones((3, 100)))
+    ```
+    """
     if isinstance(x, np.ndarray):
         return host.stack(slopes(value, x)[1])
     return jax.grad(lambda at: jnp.sum(value(at)))(x)
 
 
 def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Float[Array, "n n F"]:
-    """Hessians at x of F functions, one per column. `value`: maps (n, F) to (F,), analytic.
+    """Hessians (n, n, F) at x of F functions, one per column. NumPy uses central differences of complex steps, which
+    are accurate to about eight digits.
 
-    NumPy uses central differences of complex steps, which are accurate to about eight digits.
+    **Arguments:**
+
+    - `value`, `x`: as for `gradient_small`.
+
+    **Example:**
+
+    ```python
+    hessian_small(lambda x: (x**2).sum(axis=0), jnp.ones((3, 100)))
+    ```
     """
     if isinstance(x, np.ndarray):
         apart = _DIFFERENCE_STEP * np.eye(len(x))[:, :, None]
@@ -81,7 +125,18 @@ def hessian_small(value: Callable[[Array], Array], x: Float[Array, "n F"]) -> Fl
 
 
 def definite_small(matrix: Float[Array, "n n F"]) -> Bool[Array, " F"]:
-    """Whether each of F symmetric matrices is positive definite."""
+    """Whether each of F symmetric matrices is positive definite.
+
+    **Arguments:**
+
+    - `matrix` (n, n, F): symmetric matrices.
+
+    **Example:**
+
+    ```python
+    definite_small(small)
+    ```
+    """
     lower, xp = _cholesky(matrix), namespace(matrix)
     diagonal = xp.stack([lower[i, i] for i in range(len(matrix))])
     return xp.all(xp.isfinite(diagonal) & (diagonal > 0), axis=0)
@@ -97,13 +152,36 @@ def _cholesky(matrix: Float[Array, "n n F"]) -> dict[tuple[int, int], Array]:
 
 
 def symmetric_small(rows: Sequence[Sequence[Array]]) -> Float[Array, "n n F"]:
-    """Symmetric matrices with the lower triangles `rows`, whose entries have shape (F,)."""
+    """Symmetric matrices (n, n, F) with given lower triangles.
+
+    **Arguments:**
+
+    - `rows`: rows of the lower triangles; each entry has shape (F,).
+
+    **Example:**
+
+    ```python
+    one = jnp.ones(100)
+    matrices = symmetric_small([[2 * one], [one, 2 * one]])
+    ```
+    """
     number, xp = len(rows), namespace(rows)
     return xp.stack([xp.stack([rows[max(i, j)][min(i, j)] for j in range(number)]) for i in range(number)])
 
 
 def inverse_small(matrix: Float[Array, "n n F"]) -> Float[Array, "n n F"]:
-    """The inverses of F symmetric positive definite matrices."""
+    """The inverses of F symmetric positive definite matrices.
+
+    **Arguments:**
+
+    - `matrix` (n, n, F): symmetric positive definite matrices.
+
+    **Example:**
+
+    ```python
+    inverse_small(small)
+    ```
+    """
     xp = namespace(matrix)
     identity = xp.eye(len(matrix))[:, :, None] * xp.ones_like(matrix[0])
     return xp.stack([solve_small(matrix, column) for column in identity])
@@ -147,15 +225,35 @@ def minimise_small(
 ) -> Minimum:
     """Minimise F functions of n unknowns with bounds by projected, damped Newton steps (Bertsekas 1982).
 
-    `expand(x, data)`: see `Expansion`; `data`: arrays whose last axis is F. An unknown at a bound is held there if its
-    gradient points outwards; the others take a step. Damping is that of Levenberg and Marquardt, scaled by the
-    diagonal. A function has converged when the predicted decrease of its value in the next step is less than
-    `tolerance` · (1 + |value|). Functions that are not finite at their start stay there, not converged, with an
-    infinite value; the same holds for functions marked in `skip`.
+    An unknown at a bound is held there if its gradient points outwards; the others take a step. Damping is that of
+    Levenberg and Marquardt, scaled by the diagonal. Functions that are not finite at their start stay there, not
+    converged, with an infinite value; the same holds for functions marked in `skip`.
 
-    All functions take eight steps together. The unfinished ones, usually few, are then gathered and continue, with the
-    expansion `finish` if it is given, for example a costlier one with the exact Hessian. In a compiled program, whose
-    arrays have fixed sizes, a quarter of the batch is gathered at a time.
+    All functions take eight steps together. The unfinished ones, usually few, are then gathered and continue. In a
+    compiled program, whose arrays have fixed sizes, a quarter of the batch is gathered at a time.
+
+    **Arguments:**
+
+    - `expand`: function of (x, data) that returns values (F,), gradients (n, F) and positive definite Hessians (n, n,
+      F), or approximations of these.
+    - `start` (n, F): points to start from.
+    - `data`: arrays whose last axis is F.
+    - `finish`: expansion of the gathered functions, for example a costlier one with the exact Hessian; by default
+      `expand`.
+    - `lower`, `upper` (n, 1): bounds.
+    - `largest_step` (n, 1): maximum step of each unknown.
+    - `max_steps`: maximum number of steps.
+    - `tolerance`: a function has converged when the predicted decrease of its value in the next step is less than
+      tolerance · (1 + |value|).
+    - `skip` (F,): True for functions that are not minimised.
+
+    **Example:**
+
+    ```python
+    bowls = lambda x, _: (jnp.sum(x**2, axis=0) / 2, x, jnp.repeat(jnp.eye(3)[:, :, None], x.shape[1], axis=2))
+    ones = jnp.ones((3, 1))
+    minimise_small(bowls, jnp.ones((3, 100)), lower=-ones, upper=ones, largest_step=ones).x
+    ```
     """
     limits = _Limits(lower, upper, largest_step, max_steps, tolerance)
     xp = namespace(start, data, lower, upper)

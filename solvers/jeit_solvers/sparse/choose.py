@@ -35,15 +35,26 @@ _DIRECT_TIME_FACTOR = 1.5
 class ConjugateGradient(MatrixSolver):
     """Conjugate gradients, preconditioned with the diagonal, for `SparseSymmetric` operators.
 
-    Iteration stops when |M^-1 (b - A x)| <= `tolerance` |M^-1 b|, where M is the diagonal. The criterion is scaled by M
+    Iteration stops when |M^-1 (b - A x)| <= tolerance |M^-1 b|, where M is the diagonal. The criterion is scaled by M
     because the right-hand side may be dominated by rows with large entries, such as those of good contacts, and a
-    residual that is small relative to these may be large elsewhere. `max_steps` defaults to ten steps per unknown, with
-    a maximum of 10,000. The result is `RESULTS.max_steps_reached` after the last step, and `RESULTS.breakdown` for a
-    direction p with p^T A p <= 0, which does not exist for a positive definite matrix. Complex symmetric systems are
-    solved by the conjugate orthogonal variant, with p^T in place of p^* (van der Vorst and Melissen, IEEE Trans. Magn.
-    26, 1990).
+    residual that is small relative to these may be large elsewhere. The result is `RESULTS.max_steps_reached` after the
+    last step, and `RESULTS.breakdown` for a direction p with p^T A p <= 0, which does not exist for a positive definite
+    matrix. Complex symmetric systems are solved by the conjugate orthogonal variant, with p^T in place of p^* (van der
+    Vorst and Melissen, IEEE Trans. Magn. 26, 1990).
+
+    **Arguments:**
+
+    - `tolerance`: of the residual, see above.
+    - `max_steps`: maximum number of steps, by default ten per unknown, at most 10,000.
+    - `reason`: why this solver is used, in words.
 
     Raises `ValueError` for a tolerance that is not between 0 and 1, and for a maximum of less than one step.
+
+    **Example:**
+
+    ```python
+    solution = lineax.linear_solve(operator, loads[:, 0], ConjugateGradient())
+    ```
     """
 
     tolerance: float = 1e-10
@@ -131,6 +142,17 @@ class SparseCholesky(lineax.AbstractLinearSolver[Factor]):
 
     `init` factorises the matrix and `compute` solves. The same factor serves the adjoint, so `lineax.linear_solve` is
     differentiated without another factorisation. A matrix that is not positive definite gives `RESULTS.singular`.
+
+    **Arguments:**
+
+    - `plan`: from `analyse`.
+    - `reason`: why this solver is used, in words.
+
+    **Example:**
+
+    ```python
+    solution = lineax.linear_solve(operator, loads[:, 0], SparseCholesky(plan))
+    ```
     """
 
     plan: FactorisationPlan
@@ -177,6 +199,17 @@ class FrontalCholesky(MatrixSolver):
     `find_fronts`. It runs in NumPy: compiled programs call it, which keeps their compilation short.
 
     A matrix that is not positive definite gives `RESULTS.singular`.
+
+    **Arguments:**
+
+    - `fronts`: from `find_fronts`.
+    - `reason`: why this solver is used, in words.
+
+    **Example:**
+
+    ```python
+    solution = lineax.linear_solve(operator, loads[:, 0], FrontalCholesky(find_fronts(pattern)))
+    ```
     """
 
     fronts: Fronts = eqx.field(static=True)
@@ -230,9 +263,16 @@ def choose_solver(
     **Arguments:**
 
     - `pattern`: sparsity pattern of the matrices.
-    - `coordinates`: (n, d) of the unknowns, as for `analyse`.
+    - `coordinates` (n, d): of the unknowns, as for `analyse`.
     - `memory_limit`: maximum memory of a factorisation in bytes; default: half of that of the machine.
     - `tolerance`: tolerance of iterative solvers.
+
+    **Example:**
+
+    ```python
+    solver = choose_solver(pattern, coordinates)
+    solver.reason
+    ```
     """
     fronts = find_fronts(pattern, coordinates)
     limit = memory_of_machine() / 2 if memory_limit is None else memory_limit

@@ -62,6 +62,13 @@ class Fronts:
     fronts; `steps`: for each step the slices of fronts that can be eliminated in parallel, first the subtrees and then
     the fronts of each level above them; `top`: number of the first row that a front above the subtrees eliminates;
     `key`: digest of the pattern and the order, by which objects are compared.
+
+    **Example:**
+
+    ```python
+    fronts = find_fronts(pattern, coordinates)
+    fronts.num_operations, fronts.order
+    ```
     """
 
     size: int
@@ -109,8 +116,19 @@ def _num_front_operations(pivots: Any, border: Any) -> Any:
 
 def find_fronts(pattern: SparsityPattern, coordinates: Any = None) -> Fronts:
     """Find the order of elimination of a sparsity pattern and its fronts, in NumPy and SciPy, once per pattern.
-    `coordinates` (n, d) of the unknowns give a better order than the pattern alone. Raises `ValueError` if their shape
-    does not fit or they are not finite."""
+
+    **Arguments:**
+
+    - `pattern`, `coordinates`: as for `analyse`.
+
+    Raises `ValueError` if the shape of the coordinates does not fit or they are not finite.
+
+    **Example:**
+
+    ```python
+    fronts = find_fronts(pattern, coordinates)
+    ```
+    """
     coordinates = checked_coordinates(pattern, coordinates)
     rows, columns = (np.asarray(one, dtype=np.int64) for one in (pattern.rows, pattern.columns))
     found = hashlib.blake2b(digest_size=16)

@@ -32,7 +32,15 @@ _MAX_CACHED_ENTRIES = 100_000_000
 class FrontalFactor(NamedTuple):
     """A factorised matrix A = L Lᵀ. **Fields**: `fronts`: the fronts of its pattern; `panels`: for each front the rows
     (p, p + b) of Lᵀ that belong to its pivots. `panels` is None if A (for a complex matrix, its real part) is not
-    positive definite; solutions are then NaN."""
+    positive definite; solutions are then NaN.
+
+    **Example:**
+
+    ```python
+    factor = factorise_fronts(find_fronts(pattern), values)
+    factor.solve(np.eye(50)[:, :2]), factor.positive_definite
+    ```
+    """
 
     fronts: Fronts
     panels: list[Any] | None
@@ -126,9 +134,21 @@ class FrontalFactor(NamedTuple):
 
 
 def factorise_fronts(fronts: Fronts, values: Inexact[np.ndarray, " nnz"]) -> FrontalFactor:
-    """Factorise the matrix with the given values (nnz,), in the order of the pattern that `fronts` was made for.
+    """Factorise a sparse symmetric matrix in NumPy.
+
+    **Arguments:**
+
+    - `fronts`: from `find_fronts`.
+    - `values` (nnz,): of the matrix, in the order of the pattern that the fronts were made for.
 
     Raises `ValueError` for values of another shape.
+
+    **Example:**
+
+    ```python
+    factor = factorise_fronts(find_fronts(pattern), values)
+    factor.solve(np.eye(50)[:, :2])
+    ```
     """
     if np.shape(values) != (fronts.num_entries,):
         raise ValueError(

@@ -55,15 +55,28 @@ class Hierarchy(NamedTuple):
 class Multigrid(NumpySolver):
     """Conjugate gradients preconditioned by multigrid, for large real or complex `SparseSymmetric` operators.
 
-    Iteration ends when the residual is less than `tolerance` times the right-hand side, and the preconditioned
-    residual, which is about the error, less than `tolerance` times the preconditioned right-hand side: rows with large
-    entries, such as those of good contacts, dominate the former alone. A column for which that takes more than
-    `max_steps` is NaN, and so are all solutions if the matrix is not positive definite. It runs in NumPy: compiled
-    programs call it. Complex symmetric systems are solved by the conjugate orthogonal variant, preconditioned by their
-    real part.
+    Iteration ends when the residual is less than the tolerance times the right-hand side, and the preconditioned
+    residual, which is about the error, less than the tolerance times the preconditioned right-hand side: rows with
+    large entries, such as those of good contacts, dominate the former alone. A column for which that takes more than
+    the maximum number of steps is NaN, and so are all solutions if the matrix is not positive definite. It runs in
+    NumPy: compiled programs call it. Complex symmetric systems are solved by the conjugate orthogonal variant,
+    preconditioned by their real part.
+
+    **Arguments:**
+
+    - `tolerance`: of the residual, see above.
+    - `max_steps`: maximum number of steps.
+    - `reason`: why this solver is used, in words.
 
     Raises `ValueError` for a tolerance that is not between 0 and 1, and for a maximum of less than one step;
     `ImportError` if PyAMG (the extra `large`) is not installed.
+
+    **Example:**
+
+    ```python
+    solver = Multigrid(tolerance=1e-8)  # with pyamg
+    solution = lineax.linear_solve(operator, loads[:, 0], solver)
+    ```
     """
 
     tolerance: float = eqx.field(static=True, default=1e-10)

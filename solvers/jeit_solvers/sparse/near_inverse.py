@@ -37,6 +37,13 @@ class Strips(Module):
     **Fields**: `position`: (n,) strip · `strip_size` + index within the strip; `num_strips`: number of strips;
     `strip_size`: maximum number of unknowns in a strip; `selected_per_strip`: maximum number of selected unknowns in a
     strip, rounded up. The `place` of a selected unknown is strip · `selected_per_strip` + index within the strip.
+
+    **Example:**
+
+    ```python
+    strips = Strips.create(pattern, coordinates, np.ones(50, bool))
+    strips.num_strips, strips.place
+    ```
     """
 
     position: Int[np.ndarray, " n"]
@@ -88,7 +95,15 @@ class Strips(Module):
 class NearInverse(Module):
     """Entries of the inverse G = A⁻¹ between places that are at most a few strips apart. **Fields**: `band`: (strips,
     selected unknowns, columns) blocks G_ij with j ≥ i, because G is symmetric; `left`, `right`: (p, r) factors of a
-    matrix left rightᵀ that is added to G."""
+    matrix left rightᵀ that is added to G.
+
+    **Example:**
+
+    ```python
+    strips = Strips.create(pattern, coordinates, np.ones(50, bool))
+    near_inverse(strips, operator, 2).blocks(strips.place[:, None])
+    ```
+    """
 
     band: Inexact[Array, "s p q"]
     left: Inexact[Array, "p r"]
@@ -113,8 +128,22 @@ class NearInverse(Module):
 
 @partial(jax.jit, static_argnums=2)
 def near_inverse(strips: Strips, operator: SparseSymmetric, max_distance: int) -> NearInverse:
-    """Compute the entries of A⁻¹ between selected unknowns whose strip numbers differ by at most `max_distance`. They
-    are NaN if A is not positive definite."""
+    """Compute the entries of A⁻¹ between selected unknowns that are at most a few strips apart. They are NaN if A is
+    not positive definite.
+
+    **Arguments:**
+
+    - `strips`: partition of the unknowns.
+    - `operator`: the matrix A.
+    - `max_distance`: maximum difference of strip numbers.
+
+    **Example:**
+
+    ```python
+    strips = Strips.create(pattern, coordinates, np.ones(50, bool))
+    near = near_inverse(strips, operator, 2)
+    ```
+    """
     size, selected = strips.strip_size, strips.selected_per_strip
     blocks, couplings = _strip_blocks(strips, operator)
 

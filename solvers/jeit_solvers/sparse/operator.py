@@ -22,8 +22,20 @@ class SparseSymmetric(lineax.AbstractLinearOperator):
     """The symmetric (n, n) matrix with the given values (nnz,) in a sparsity pattern, as a lineax operator.
 
     Real matrices are assumed to be positive definite, as the solvers of this package require. Complex matrices are
-    symmetric, not Hermitian. Differentiable with respect to `values`. Raises `ValueError` for values of another shape
+    symmetric, not Hermitian. Differentiable with respect to the values. Raises `ValueError` for values of another shape
     than that of the pattern, and for values that are not floating point.
+
+    **Arguments:**
+
+    - `values` (nnz,): in the order of the pattern, diagonal first.
+    - `pattern`: sparsity pattern.
+
+    **Example:**
+
+    ```python
+    operator = SparseSymmetric(jnp.asarray(values), pattern)
+    operator.mv(jnp.ones(50))
+    ```
     """
 
     values: Inexact[Array, " nnz"]
@@ -138,7 +150,16 @@ class MatrixSolver(lineax.AbstractLinearSolver[SparseSymmetric]):
 
 
 class NumpySolver(MatrixSolver):
-    """Solver for several right-hand sides at once, in NumPy: compiled programs call it."""
+    """Base of solvers for several right-hand sides at once, in NumPy: compiled programs call them.
+
+    A solver is a subclass with `solve_in_numpy`.
+
+    **Example:**
+
+    ```python
+    isinstance(Multigrid(), NumpySolver)  # with pyamg
+    ```
+    """
 
     @abc.abstractmethod
     def solve_in_numpy(self, pattern: SparsityPattern, values: np.ndarray, columns: np.ndarray) -> np.ndarray:

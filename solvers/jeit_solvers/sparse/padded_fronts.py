@@ -177,7 +177,16 @@ class Stage(NamedTuple):
 class FactorisationPlan(Module):
     """Order of elimination and index maps of a sparsity pattern for `factorise` and `solve`; made by `analyse`.
 
-    The index maps are one leaf of the pytree; pass a plan to a jitted function as an argument.
+    **Fields**: `indices` (total,): all index maps; `layout`: which part of `indices` each of them is; `size`: number of
+    rows n; `num_entries`: number of entries of the pattern. The index maps are one leaf of the pytree; pass a plan to a
+    jitted function as an argument.
+
+    **Example:**
+
+    ```python
+    plan = analyse(pattern, coordinates)
+    plan.num_factor_entries, plan.num_operations
+    ```
     """
 
     indices: Int[Array, " total"]
@@ -216,10 +225,21 @@ class FactorisationPlan(Module):
 
 
 def analyse(pattern: SparsityPattern, coordinates: Any = None) -> FactorisationPlan:
-    """Find the order of elimination and the index maps of the direct solver for a sparsity pattern.
+    """Find the order of elimination and the index maps of the direct solver for a sparsity pattern. Runs in NumPy and
+    SciPy, outside `jit`, once per pattern.
 
-    Runs in NumPy and SciPy, outside `jit`, once per pattern. `coordinates` (n, d) of the unknowns give a better order
-    than the pattern alone. Raises a ValueError if their shape does not fit or they are not finite.
+    **Arguments:**
+
+    - `pattern`: sparsity pattern of n unknowns.
+    - `coordinates` (n, d): of the unknowns; they give a better order than the pattern alone.
+
+    Raises a ValueError if the shape of the coordinates does not fit or they are not finite.
+
+    **Example:**
+
+    ```python
+    plan = analyse(pattern, coordinates)
+    ```
     """
     return _plan_of_tree(pattern, EliminationTree(pattern, checked_coordinates(pattern, coordinates)))
 

@@ -33,6 +33,13 @@ class Factor(Module):
     **Fields**: `inverses`: (batch, pivots, pivots) inverses of the diagonal blocks of L; `lowers`: (batch, border,
     pivots) blocks below them. Solving therefore needs only matrix products. For a complex symmetric A, transposes are
     not conjugated.
+
+    **Example:**
+
+    ```python
+    factor = factorise(plan, jnp.asarray(values))
+    factor.positive_definite
+    ```
     """
 
     inverses: tuple[Inexact[Array, "batch pivots pivots"], ...]
@@ -59,11 +66,23 @@ class Factor(Module):
 
 
 def factorise(plan: FactorisationPlan, values: Inexact[Array, " nnz"]) -> Factor:
-    """Factorise the matrix with the given values (nnz,), in the order of the pattern that `plan` was made for.
+    """Factorise a sparse symmetric matrix.
 
     Real values must form a positive definite matrix. Complex values form a complex *symmetric* matrix, whose real part
     must be positive definite (an admittivity). Otherwise the factor is NaN and `positive_definite` is false. Raises
     `ValueError` for values of another shape.
+
+    **Arguments:**
+
+    - `plan`: from `analyse`.
+    - `values` (nnz,): of the matrix, in the order of the pattern that the plan was made for.
+
+    **Example:**
+
+    ```python
+    factor = factorise(plan, jnp.asarray(values))
+    solve(plan, factor, loads)
+    ```
     """
     if values.shape != (plan.num_entries,):
         raise ValueError(
@@ -151,7 +170,22 @@ def _eliminate_fronts(
 
 
 def solve(plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n *k"]) -> Inexact[Array, "n *k"]:
-    """Solution x of A x = b for one right-hand side (n,) or several (n, k). Raises `ValueError` for other shapes."""
+    """Solution x of A x = b.
+
+    **Arguments:**
+
+    - `plan`: from `analyse`.
+    - `factor`: from `factorise`.
+    - `right_hand_sides` (n,) or (n, k): one or several b.
+
+    Raises `ValueError` for other shapes.
+
+    **Example:**
+
+    ```python
+    solution = solve(plan, factor, loads)
+    ```
+    """
     vectors = _check_columns(plan, right_hand_sides, "solve")
     if isinstance(vectors, np.ndarray):
         return _solve_stages(plan.layout, plan.indices, factor, vectors).reshape(right_hand_sides.shape)
@@ -185,7 +219,20 @@ def half_solve(
 ) -> Inexact[Array, "rows k"]:
     """Y = L^-1 P b, with rows in the order of elimination and rows of zeros for padding, so that Y^T Y = b^T A^-1 b.
 
-    Takes half the work of `solve`, if only products with the inverse are needed. Raises `ValueError` for other shapes.
+    Takes half the work of `solve`, if only products with the inverse are needed.
+
+    **Arguments:**
+
+    - `plan`, `factor`, `right_hand_sides` (n, k): as for `solve`.
+
+    Raises `ValueError` for other shapes.
+
+    **Example:**
+
+    ```python
+    half = half_solve(plan, factor, loads)
+    half.T @ half
+    ```
     """
     vectors = _check_columns(plan, right_hand_sides, "half_solve")
     forward = _forward_stages if isinstance(vectors, np.ndarray) else _compiled_forward
@@ -196,7 +243,18 @@ def half_solve(
 def quadratic_form(
     plan: FactorisationPlan, factor: Factor, right_hand_sides: Inexact[Array, "n k"]
 ) -> Inexact[Array, "k k"]:
-    """b^T A^-1 b, symmetric (for complex values not conjugated), by the forward half of a solve."""
+    """b^T A^-1 b, symmetric (for complex values not conjugated), by the forward half of a solve.
+
+    **Arguments:**
+
+    - `plan`, `factor`, `right_hand_sides` (n, k): as for `solve`.
+
+    **Example:**
+
+    ```python
+    energy = quadratic_form(plan, factor, loads)
+    ```
+    """
     half = half_solve(plan, factor, right_hand_sides)
     return half.T @ half
 
@@ -205,7 +263,20 @@ def inverse_root(plan: FactorisationPlan, factor: Factor, rows: Inexact[Array, "
     """P^T L^-T times vectors, with rows as returned by `half_solve`. Standard normal vectors are mapped to vectors with
     covariance A^-1.
 
+    **Arguments:**
+
+    - `plan`: from `analyse`.
+    - `factor`: from `factorise`.
+    - `rows` (rows, k): the vectors, with `plan.num_pivots` rows.
+
     Raises `ValueError` for another number of rows.
+
+    **Example:**
+
+    ```python
+    normal = jax.random.normal(jax.random.key(0), (plan.num_pivots, 10))
+    samples = inverse_root(plan, factor, normal)
+    ```
     """
     if rows.ndim != 2 or rows.shape[0] != plan.num_pivots:
         raise ValueError(f"inverse_root: rows must have shape ({plan.num_pivots}, k); got {rows.shape}.")
@@ -220,6 +291,17 @@ def inverse_entries(plan: FactorisationPlan, factor: Factor) -> Inexact[Array, "
     They are computed from the factor by a recursion from the root of the elimination tree down, in about the time of a
     factorisation; all of A^-1 would take as many solves as there are rows. Takahashi, Fagan and Chin, Proc. 8th PICA
     Conf. (1973) 63-69; Erisman and Tinney, Commun. ACM 18 (1975) 177-179.
+
+    **Arguments:**
+
+    - `plan`: from `analyse`.
+    - `factor`: from `factorise`.
+
+    **Example:**
+
+    ```python
+    variances = inverse_entries(plan, factor)[:50]
+    ```
     """
     if isinstance(factor.inverses[0], np.ndarray):
         return _inverse_entries(plan.layout, plan.num_entries, plan.indices, factor)

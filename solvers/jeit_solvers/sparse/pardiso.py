@@ -29,7 +29,17 @@ class Pardiso(NumpySolver):
     The last factorisation is kept, and used again for the same matrix, as derivatives do. All solutions are NaN if a
     real matrix is not positive definite, or if PARDISO fails. It runs on the CPU: compiled programs call it.
 
+    **Arguments:**
+
+    - `reason`: why this solver is used, in words.
+
     Raises `ImportError` if pypardiso (the extra `mkl`) is not installed.
+
+    **Example:**
+
+    ```python
+    solution = lineax.linear_solve(operator, loads[:, 0], Pardiso())  # with pypardiso
+    ```
     """
 
     reason: str = eqx.field(static=True, default="chosen by the user")

@@ -25,8 +25,17 @@ class SparsityPattern(Module):
     `(rows[k], columns[k])` and at `(columns[k], rows[k])`. The diagonal comes first, `values[:n]`, then the entries
     below it, row by row.
 
-    Build a pattern with `from_elements`, `from_entries` or `from_matrix`. Its indices are one leaf of the pytree, so
-    they are not compiled into a jitted function to which the pattern is passed as an argument.
+    **Fields**: `indices` (total,): row and column of every entry, and the index maps of `assemble`; `layout`: which
+    part of `indices` each of them is; `size`: number of rows n. Build a pattern with `from_elements`, `from_entries` or
+    `from_matrix`. Its indices are one leaf of the pytree, so they are not compiled into a jitted function to which the
+    pattern is passed as an argument.
+
+    **Example:**
+
+    ```python
+    pattern = SparsityPattern.from_elements([np.array([[0, 1, 2], [1, 2, 3]])], size=4)
+    pattern.num_entries, pattern.rows
+    ```
     """
 
     indices: Int[Array, " total"]

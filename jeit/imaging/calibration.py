@@ -1,0 +1,147 @@
+"""Calibration of a forward model on a frame of the undisturbed body, with timing of the steps."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
+
+import jax
+import numpy as np
+
+from jeit.data import Measurement
+from jeit.electrodes.electrodes import AbstractMovableElectrodes
+from jeit.forward import ForwardModel
+from jeit.inverse import calibrate, relative_noise
+from jeit.inverse.calibration import Calibration
+from jeit.inverse.placement import Placement, Uncertainty, place_electrodes
+from jeit.mesh import Mesh
+from jeit_solvers import one_thread_of_blas
+from jeit_solvers.engines import as_array
+
+# Misfit of the reference up to which described electrode positions are taken as they are; standard deviation of these
+# positions, relative to the width of the body: 2° of a disk; and the ratios of misfits below which estimated positions
+# are used, each channel relative to its noise, and all volts alike.
+_EXPLAINED, _MISPLACED, _BETTER, _WORSE = 0.01, 0.0175, 0.7, 2.0
+
+
+class Clock:
+    """Timer of steps: reports the start of each step to `progress`, and stores its duration in `seconds`."""
+
+    def __init__(self, progress: Callable[[str], None] | None):
+        self.progress = progress
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, step: str):
+        if self.progress is not None:
+            self.progress(step)
+        start = time.perf_counter()
+        yield
+        self.seconds[step] = time.perf_counter() - start
+
+
+def calibrated_model(
+    model: ForwardModel, base: Measurement, *, contact: str | None = None, clock: Clock | None = None
+) -> tuple[Calibration, str]:
+    """Calibrate the forward model on a frame of the undisturbed body; return the `Calibration`, and which calibration
+    of the contact impedance was used.
+
+    **Arguments:**
+
+    - `model`: the forward model.
+    - `base`: a frame of the undisturbed body.
+    - `contact`: "each", "common" or "fixed"; default: `default_contact`, or "common" if the data do not determine the
+      contact impedance of each electrode.
+    - `clock`: measures the duration of each step.
+
+    Raises `ValueError` if the calibration fails.
+
+    **Example:**
+
+    ```python
+    fit, contact = calibrated_model(skin.model(), rest)
+    fit.conductivity, fit.misfit
+    ```
+    """
+    clock = Clock(None) if clock is None else clock
+    with clock("calibrate"), threads_for(model.mesh):
+        chosen = contact or default_contact(base)
+        voltages, mask = np.asarray(base.voltages)[0], np.asarray(base.mask)[0]
+        calibration = calibrate(model, voltages, mask=mask, contact=chosen)
+        if contact is None and chosen == "each" and not calibration.distinguishes_contacts:
+            chosen = "common"  # the data do not determine one impedance per electrode
+            calibration = calibrate(model, voltages, mask=mask, contact=chosen)
+        position = (base.uncertainty or Uncertainty()).position
+        calibration = _with_places(calibration, model, voltages, mask, position)
+        calibration = jax.block_until_ready(calibration)
+        if not np.isfinite(calibration.misfit):
+            raise ValueError(
+                f"'{base.name}': calibration on it failed ({calibration.reason}); is this a frame of the empty body, "
+                "and are geometry and protocol right?"
+            )
+    return calibration, chosen
+
+
+def threads_for(mesh: Mesh) -> AbstractContextManager:
+    """Context in which the BLAS has one thread for a sheet: its matrices are small, and on a busy machine threads that
+    wait for each other take ten times as long."""
+    return one_thread_of_blas() if mesh.dimension == 2 else nullcontext()
+
+
+def _with_places(calibration: Calibration, model: ForwardModel, voltages, mask, deviation: float | None) -> Calibration:
+    """The calibration with electrode positions estimated along, if that explains the reference far better.
+
+    Described positions that explain the reference are kept. So are they where a misfit has other causes: estimated
+    positions explain little of a deep tank under a two-dimensional model. The background is estimated with the
+    positions, from the channels in proportion to what they show: fitted to the largest voltages, those at the drives,
+    it would follow what a two-dimensional model misses there.
+    """
+    described = relative_misfit(calibration.voltages, voltages, mask)
+    if not described > _EXPLAINED or (placed := estimated_positions(model, voltages, mask, deviation)) is None:
+        return calibration
+    predicted = np.asarray(placed.model.voltages(placed.conductivity))
+    misfit = float(np.linalg.norm((predicted - voltages)[mask]) / np.linalg.norm(voltages[mask]))
+    better = relative_misfit(predicted, voltages, mask) < _BETTER * described
+    if not (better and misfit < _WORSE * float(calibration.misfit)):
+        return replace(calibration, model_error=placed.error)
+    return replace(
+        calibration,
+        model=placed.model,
+        conductivity=as_array(placed.conductivity),
+        voltages=as_array(predicted),
+        misfit=as_array(misfit),
+        contact_deviation=as_array(np.linalg.norm(placed.error.factor, axis=1)[placed.shift.size :]),
+        shift=as_array(placed.shift),
+        model_error=placed.error,
+    )
+
+
+def relative_misfit(predicted, measured, mask) -> float:
+    """Misfit of predicted voltages (M,), each channel relative to its expected noise, as a share of the voltages."""
+    noise = np.asarray(relative_noise(measured, mask))[mask]
+    off = (np.asarray(predicted) - measured)[mask]
+    return float(np.linalg.norm(off / noise) / np.linalg.norm(measured[mask] / noise))
+
+
+def estimated_positions(model: ForwardModel, voltages, mask, deviation: float | None) -> Placement | None:
+    """Electrode positions estimated from a reference frame; None if they cannot be. `deviation` of their description,
+    metres, or None for the default."""
+    if not isinstance(model.electrodes, AbstractMovableElectrodes) or np.iscomplexobj(voltages):
+        return None
+    if deviation is None:
+        deviation = _MISPLACED * float(np.ptp(np.asarray(model.mesh.points), axis=0).max())
+    try:
+        return place_electrodes(model, voltages, deviation=deviation, mask=mask)
+    except ValueError:
+        return None
+
+
+def default_contact(measurement: Measurement) -> str:
+    """Default calibration of contact impedances: "each" if voltages are measured on driven electrodes, else "fixed".
+
+    Voltage drops only across the contacts of electrodes that carry current. Without channels on these electrodes, the
+    fit would distort contact impedances to explain other effects.
+    """
+    return "each" if measurement.protocol.channels_on_driven_electrodes().any() else "fixed"
