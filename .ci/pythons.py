@@ -147,8 +147,19 @@ def alone(extra: str, wheel: Path, uv: Path, python: str) -> list[tuple]:
     ]
 
 
+def from_sources(archive: Path, uv: Path, python: str, folder: Path) -> None:
+    """Install the source distribution as pip does from an index, and call the command that it brings."""
+    its_own = folder / "sources" / "bin" / "python"
+    for command in (
+        (uv, "venv", "--quiet", "--python", python, its_own.parents[1]),
+        (uv, "pip", "install", "--quiet", "--python", its_own, archive),
+        (its_own.with_name("jeit"), "--version"),
+    ):
+        subprocess.run([str(one) for one in command], check=True)
+
+
 def main() -> int:
-    """Build a wheel through the source distribution, make the rows, print the table."""
+    """Build and check a source distribution and a wheel made of it, make the rows, print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     every = [*PYTHONS, f"least-{PYTHONS[0]}"]
     parser.add_argument("names", nargs="*", default=every, help="such as 3.12, or least-3.11")
@@ -164,14 +175,16 @@ def main() -> int:
     if strange := [one for one in (*asked.names, *asked.tested) if one not in known]:
         parser.error(f"{', '.join(strange)}: give some of {', '.join(known)}")
     uv = shutil.which("uv", path=os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")]))
-    if uv is None or find_spec("build") is None:
-        parser.error("uv and build are needed: pip install '.[dev]'")
+    if uv is None or find_spec("build") is None or find_spec("twine") is None:
+        parser.error("uv, build and twine are needed: pip install '.[dev]'")
     rows: list[Row] = []
     try:
         with tempfile.TemporaryDirectory() as kept:
             building = [sys.executable, "-m", "build", "--outdir", kept, str(ROOT)]
             subprocess.run(building, check=True, stdout=subprocess.DEVNULL)
-            wheel = next(Path(kept).glob("*.whl"))
+            wheel, archive = next(Path(kept).glob("*.whl")), next(Path(kept).glob("*.tar.gz"))
+            subprocess.run([sys.executable, "-m", "twine", "check", "--strict", wheel, archive], check=True)
+            from_sources(archive, Path(uv), first(PYTHONS[::-1]) or sys.executable, Path(kept))
             for name in asked.names:
                 with tempfile.TemporaryDirectory() as folder:
                     rows.append(Row(name, Path(folder), Path(uv)))

@@ -6,13 +6,13 @@ The same presses are told on the bent skin by what was learnt bent, and by what 
 
 import matplotlib.pyplot as plt
 import numpy as np
+from sklearn.discriminant_analysis import LinearDiscriminantAnalysis
 
 from jeit.design import Bell, Skin
 from jeit.layout import SurfaceLayout, grid
 from jeit.mesh import Mesh, Rectangle, bend
 from jeit.plot import ColourScale, plot_curved_skin
 from jeit.protocol import opposite
-from jeit.touch.learnt.methods import linear_discriminant
 
 SIDE, RADIUS, THICKNESS = 0.13, 0.03, 5e-3  # metres
 JITTER, NOISE = 1e-3, 1e-5  # metres, volts
@@ -54,7 +54,10 @@ def main() -> float:
         options = {"thickness": THICKNESS, "num_layers": 3, "protocol": opposite(16)}
         skins[name] = Skin.create(layout, **options), lay
     learnt = {
-        name: linear_discriminant(features(skin, lay, places[label], rng), label) for name, (skin, lay) in skins.items()
+        name: LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(
+            features(skin, lay, places[label], rng), label
+        )
+        for name, (skin, lay) in skins.items()
     }
     asked = np.repeat(np.arange(len(places)), 6)
     tested = {name: features(skin, lay, places[asked], rng) for name, (skin, lay) in skins.items()}

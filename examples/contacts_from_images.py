@@ -13,9 +13,20 @@ from jeit.inverse import back_projection, one_step
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts, track_contacts
-from jeit.touch.plots import plot_contact_stages, plot_contacts
-from jeit.touch.simulate import Disc, MovingPress, Press, PressedSkin, material
+from jeit.touch import (
+    CellFinder,
+    DiscIndenter,
+    ImageNoise,
+    MovingPress,
+    Press,
+    PressedSkin,
+    RasterFinder,
+    find_contacts,
+    material,
+    plot_contact_stages,
+    plot_contacts,
+    track_contacts,
+)
 
 GRAMS = np.array([100, 300, 700, 1200, 2000, 3000, 3900])
 
@@ -38,7 +49,7 @@ def main() -> float:
         return images, [find_contacts(finder, image, noise[name]) for image in images]
 
     def weight(grams, place, radius=0.0115):
-        return Press(Disc(2 * radius), 9.81e-3 * grams, place)
+        return Press(DiscIndenter(2 * radius), 9.81e-3 * grams, place)
 
     radii, turns = np.arange(0, 0.0401, 0.005), np.radians([0, 45, 90])
     places = np.array([[r * np.cos(a), r * np.sin(a)] for a in turns for r in radii])
@@ -78,7 +89,9 @@ def main() -> float:
     # Two fingers at once, on paths of their own.
     seconds = np.arange(30) / 30
     along = np.linspace(-0.025, 0.025, 30)
-    strokes = [MovingPress(Disc(0.007), 2.0, np.stack([s * along, s * 0.016 + 0 * along], axis=-1)) for s in (1, -1)]
+    strokes = [
+        MovingPress(DiscIndenter(0.007), 2.0, np.stack([s * along, s * 0.016 + 0 * along], axis=-1)) for s in (1, -1)
+    ]
     touches = track_contacts(seconds, found("one-step", skin.record(jax.random.key(4), strokes, seconds))[1])
     for path in touches:
         moved.plot(*1e3 * path.position.T, ".-", label=f"touch {path.number + 1}, {1e3 * path.length:.0f} mm")

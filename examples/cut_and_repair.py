@@ -12,10 +12,21 @@ from jeit.forward import ForwardModel
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.protocol import two_terminal
-from jeit.touch import CellFinder, SkinHealth, find_contacts, watch
-from jeit.touch.plots import plot_health
-from jeit.touch.simulate import MovingPress, PressedSkin, ball, material
-from jeit.touch.simulate.damage import Cut, Mishap, mended, record_mishaps
+from jeit.touch import (
+    CellFinder,
+    Cut,
+    Mishap,
+    MovingPress,
+    PressedSkin,
+    SkinHealth,
+    ball_indenter,
+    find_contacts,
+    material,
+    mend_cut,
+    plot_health,
+    record_mishaps,
+    watch,
+)
 
 RATE, CUT_AT, MENDED_AT = 5.0, 30.0, 75.0
 
@@ -33,7 +44,7 @@ def main() -> float:
     # It stands for a skin of your own: whole, then cut, then glued.
     whole = PressedSkin(jax.random.key(0), fine, material("hydrogel"))
     torn = eqx.tree_at(lambda one: one.conductivity, whole, cut.conductivity(fine.mesh, whole.conductivity))
-    values, glue = mended(fine.mesh, whole.conductivity, cut, whole.material, 0.95)
+    values, glue = mend_cut(fine.mesh, whole.conductivity, cut, whole.material, 0.95)
     glued = eqx.tree_at(lambda one: (one.conductivity, one.material), whole, (values, glue))
 
     def film(key: int, last: float, mishaps: list[Mishap]) -> tuple[np.ndarray, np.ndarray]:
@@ -41,7 +52,7 @@ def main() -> float:
         seconds = np.arange(0, last, 1 / RATE)
         places = np.random.default_rng(key).uniform(-0.08, 0.08, (int(last / 6) + 1, 2))
         load = np.interp(seconds % 6, [2, 2.4, 3.2, 3.6], [0, 5, 5, 0])
-        press = MovingPress(ball(0.02), load, places[(seconds / 6).astype(int)])
+        press = MovingPress(ball_indenter(0.02), load, places[(seconds / 6).astype(int)])
         return seconds, record_mishaps(jax.random.key(key), whole, press, seconds, mishaps)
 
     seconds, frames = film(1, 60.0, [])
@@ -58,7 +69,7 @@ def main() -> float:
     states = ((health, whole, "whole"), (before, torn, "cut: its new rest"), (after, glued, "mended"))
     for ax, (known, skin, said) in zip(axes, states, strict=False):
         place = np.array([-0.05, -0.03])
-        touched = skin.touched_in_time(MovingPress(ball(0.02), np.array([5.0]), place), np.zeros(1))
+        touched = skin.touched_in_time(MovingPress(ball_indenter(0.02), np.array([5.0]), place), np.zeros(1))
         conductivity = np.array(np.broadcast_to(skin.conductivity, fine.mesh.num_cells))
         np.multiply.at(conductivity, np.asarray(touched.cells)[0], 1 + np.asarray(touched.change)[0])
         rest, pressed = (np.asarray(skin.model.voltages(one)) for one in (skin.conductivity, conductivity))

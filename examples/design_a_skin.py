@@ -2,8 +2,7 @@
 
 from matplotlib.figure import Figure
 
-from jeit.design import Skin, compare_layouts
-from jeit.design.plots import plot_sensitivity_map, plot_taxels
+from jeit.design import Skin, compare_layouts, plot_sensitivity_map, plot_taxels
 from jeit.layout import named_layout
 
 

@@ -4,11 +4,24 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities, locate
+from jeit.acoustic import (
+    Burst,
+    Localiser,
+    Recording,
+    SoundingSkin,
+    Taps,
+    calibrate_microphones,
+    intensities,
+    locate,
+    map_brightness,
+    overlay_images,
+    plot_track,
+    simulate_calibration_taps,
+    simulate_pat,
+    simulate_stroke,
+    simulate_tickle,
+)
 from jeit.acoustic import track as follow
-from jeit.acoustic.localisation.pixels import brightness, overlay
-from jeit.acoustic.plots import plot_track
-from jeit.acoustic.simulate import Burst, SoundingSkin, calibration_taps, pat, stroke, tickle
 from jeit.layout import grid
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
@@ -18,20 +31,22 @@ LASTS = 1.5  # seconds, each touch
 
 def main() -> float:
     skin = SoundingSkin(jax.random.key(0))
-    taps = calibration_taps(skin, KEYS[0], grid(0.18, 0.18, 10, 10), repeats=2)
+    taps = simulate_calibration_taps(skin, KEYS[0], grid(0.18, 0.18, 10, 10), repeats=2)
     known = Taps(skin.microphones, OUTLINE, taps.positions, samples=taps.samples, rate=taps.rate)
     calibration = calibrate_microphones(known).calibration
 
     touches = {
-        "pat": pat(skin, KEYS[1], (0.03, 0.02), duration=LASTS),
-        "tickle": tickle(skin, KEYS[2], (-0.04, 0.03), burst=Burst(1.5, 0.04), duration=LASTS),
-        "stroke": stroke(skin, KEYS[3], [(-0.07, -0.06), (0.0, 0.06), (0.07, -0.05)], strength=1.5, duration=LASTS),
+        "pat": simulate_pat(skin, KEYS[1], (0.03, 0.02), duration=LASTS),
+        "tickle": simulate_tickle(skin, KEYS[2], (-0.04, 0.03), burst=Burst(1.5, 0.04), duration=LASTS),
+        "stroke": simulate_stroke(
+            skin, KEYS[3], [(-0.07, -0.06), (0.0, 0.06), (0.07, -0.05)], strength=1.5, duration=LASTS
+        ),
     }
     samples = np.concatenate([touch.samples for touch in touches.values()], axis=1)
     heard = intensities(Recording(samples, skin.rate))
     found = locate(heard, calibration)
     localiser = Localiser.create(calibration.microphone_array, method="consistency", map_shape=(100, 100))
-    images = brightness(localiser.maps(heard.power), method="consistency") * found.has_position[:, None, None]
+    images = map_brightness(localiser.maps(heard.power), method="consistency") * found.has_position[:, None, None]
 
     figure = Figure(figsize=(13.5, 4.8), layout="compressed")
     paths = {}
@@ -39,7 +54,7 @@ def main() -> float:
         during = heard.times // LASTS == number
         places = jax.tree.map(lambda values, during=during: values[during], found)
         path = paths[name] = follow(places)
-        seen = overlay(images[during], path.times, time_constant=0.7)[path.touches[-1].last]
+        seen = overlay_images(images[during], path.times, time_constant=0.7)[path.touches[-1].last]
         plot_track(path, places, calibration, overlay=seen, title=name.capitalize(), ax=ax)
     figure.savefig("hear_a_stroke.png", dpi=120)
 

@@ -4,9 +4,19 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jeit.acoustic import Localiser, Recording, Taps, calibrate_microphones, intensities
-from jeit.acoustic.plots import Marks, plot_loss_map
-from jeit.acoustic.simulate import Burst, SoundingSkin, calibration_taps, tap
+from jeit.acoustic import (
+    Burst,
+    Localiser,
+    MapMarks,
+    Recording,
+    SoundingSkin,
+    Taps,
+    calibrate_microphones,
+    intensities,
+    plot_loss_map,
+    simulate_calibration_taps,
+    simulate_tap,
+)
 from jeit.layout import grid
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
@@ -15,12 +25,12 @@ TITLES = {"consistency": "Intensity consistency (Park 2022)", "likelihood": "Lik
 
 def main() -> float:
     skin = SoundingSkin(jax.random.key(0))
-    taps = calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 10, 10), repeats=2)
+    taps = simulate_calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 10, 10), repeats=2)
     known = Taps(skin.microphones, OUTLINE, taps.positions, samples=taps.samples, rate=taps.rate)
     microphone_array = calibrate_microphones(known).calibration.microphone_array
 
     truth = np.array([0.031, -0.022])
-    light = tap(skin, jax.random.key(2), truth, burst=Burst(0.7), duration=0.5)
+    light = simulate_tap(skin, jax.random.key(2), truth, burst=Burst(0.7), duration=0.5)
     heard = intensities(Recording(light.samples, light.rate))
     loudest = heard.power[[heard.power.sum(axis=1).argmax()]]
 
@@ -31,7 +41,7 @@ def main() -> float:
         found, maps = localiser.with_maps(loudest)
         place, spread = np.asarray(found.position[0]), found.covariance[0]
         error[method] = float(np.hypot(*(place - truth)))
-        marks = Marks(truth, estimate=place, covariance=spread)
+        marks = MapMarks(truth, estimate=place, covariance=spread)
         title = f"{title}: {1e3 * error[method]:.1f} mm off"
         plot_loss_map(maps[0], microphone_array, received=loudest[0], marks=marks, method=method, title=title, ax=ax)
     figure.savefig("hear_a_touch.png", dpi=120)

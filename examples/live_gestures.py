@@ -15,8 +15,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import perimeter
 from jeit.mesh import Rectangle
 from jeit.protocol import reference_electrode
-from jeit.touch import learn_gestures
-from jeit.touch.simulate import Person, PressedSkin, material, simulate_gesture_stream, simulate_gestures
+from jeit.touch import Person, PressedSkin, learn_gestures, material, simulate_gesture_stream, simulate_gestures
 
 SHEET = Rectangle(0.32, 0.2)
 PLACES = np.vstack([perimeter(Rectangle(0.3, 0.18), 16, start=0.03), [[0.0, 0.0]]])

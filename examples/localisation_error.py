@@ -4,9 +4,16 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from jeit.acoustic import Intensities, Taps, calibrate_microphones, locate, tap_intensities
-from jeit.acoustic.plots import plot_pairs
-from jeit.acoustic.simulate import SoundingSkin, calibration_taps
+from jeit.acoustic import (
+    Intensities,
+    SoundingSkin,
+    Taps,
+    calibrate_microphones,
+    locate,
+    plot_position_errors,
+    simulate_calibration_taps,
+    tap_intensities,
+)
 from jeit.layout import grid
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
@@ -16,7 +23,7 @@ BURSTS = 10  # a second at 10 Hz
 
 def tapped(skin: SoundingSkin, key, places, repeats: int) -> Taps:
     """What is heard of so many taps at each place."""
-    taps = calibration_taps(skin, key, places, repeats=repeats)
+    taps = simulate_calibration_taps(skin, key, places, repeats=repeats)
     return Taps(skin.microphones, OUTLINE, taps.positions, samples=taps.samples, rate=taps.rate)
 
 
@@ -38,7 +45,7 @@ def main() -> float:
         found = locate(vibrations, calibration, method=method).position
         error[method] = np.linalg.norm(found - truth, axis=1)
         told = f"{1e3 * np.nanmean(error[method]):.1f} ± {1e3 * np.nanstd(error[method]):.1f} mm"
-        plot_pairs(truth, found, skin.microphones, OUTLINE, title=f"{title}: {told}", ax=ax)
+        plot_position_errors(truth, found, skin.microphones, OUTLINE, title=f"{title}: {told}", ax=ax)
     figure.savefig("localisation_error.png", dpi=120)
     return float(np.nanmean(error["likelihood"]))
 

@@ -9,7 +9,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.touch.simulate import Bar, JoinedIndenters, MovingPress, PlacedIndenter, PressedSkin, ball, material
+from jeit.touch import BarIndenter, JoinedIndenters, MovingPress, PlacedIndenter, PressedSkin, ball_indenter, material
 
 
 def main() -> float:
@@ -17,7 +17,7 @@ def main() -> float:
     model = ForwardModel(Disk(0.05).mesh(num_points=3000), electrodes, adjacent(16))
     skin = PressedSkin(jax.random.key(0), model, material("velostat"))
     tool = JoinedIndenters(
-        PlacedIndenter(ball(0.016), (0.012, 0.0)), PlacedIndenter(Bar(0.016, 0.005), (-0.01, 0.0), 0.6)
+        PlacedIndenter(ball_indenter(0.016), (0.012, 0.0)), PlacedIndenter(BarIndenter(0.016, 0.005), (-0.01, 0.0), 0.6)
     )
 
     # Pressed for four seconds, held, lifted; read 20 times a second.

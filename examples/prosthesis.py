@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 
-from jeit.design import Hemisphere, Skin, touches_away_from_the_edge
-from jeit.design.plots import plot_unrolled
+from jeit.design import Hemisphere, Skin, plot_unrolled, touches_away_from_the_edge
 from jeit.inverse import one_step
 from jeit.layout import SurfaceLayout
 from jeit.mesh import Geodesics, forearm, unroll
 from jeit.plot import Camera, ColourScale, plot_curved_skin
-from jeit.touch.contacts import CellFinder, find_contacts
+from jeit.touch import CellFinder, find_contacts
 
 NOISE = 2e-5  # volts, 80 dB below what is measured
 

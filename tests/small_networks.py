@@ -7,9 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.touch.networks import Preset, learn, linear_channels
-from jeit.touch.simulate import Disc
-from jeit.touch.training import Plan
+from jeit.touch.networks import NetworkPreset, learn, linear_channels
+from jeit.touch.simulate import DiscIndenter
+from jeit.touch.training import TrainingPlan
 
 SKIN = """
 [skin]
@@ -20,7 +20,7 @@ layout = "grid-4x4"
 [mesh]
 cell_mm = 8
 """
-PRESET = Preset(100, 30, Plan(rate=2e-3, batch=25, epochs=10, patience=10, decay=0.9, seconds=0.0))
+PRESET = NetworkPreset(100, 30, TrainingPlan(rate=2e-3, batch=25, epochs=10, patience=10, decay=0.9, seconds=0.0))
 SHAPE = (24, 24)
 
 
@@ -32,7 +32,7 @@ def small_maps():
         patch.setattr(learn, "_PLACES", 5)
         patch.setattr(linear_channels, "_PLACES", 5)
         patch.setattr(linear_channels, "_AT_ONCE", 1)
-        patch.setattr(linear_channels, "touching_bodies", lambda: [Disc(0.02)])
+        patch.setattr(linear_channels, "touching_bodies", lambda: [DiscIndenter(0.02)])
         yield
 
 

@@ -8,14 +8,14 @@ import pytest
 
 from jeit import acoustic, design, imaging, inverse, report, touch
 from jeit.acoustic import Taps, calibrate_microphones
-from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid
+from jeit.acoustic.simulate import SoundingSkin, microphone_grid, simulate_calibration_taps
 from jeit.electrodes import BoundaryElectrodes
 from jeit.forward import ForwardModel
 from jeit.inverse import compare_rules
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.touch.simulate import MovingPress, Press, PressedSkin, ball, material
+from jeit.touch.simulate import MovingPress, Press, PressedSkin, ball_indenter, material
 
 KEY = jax.random.key(0)
 LONG = [
@@ -56,20 +56,20 @@ def test_rules_are_named(model):
 
 def test_presses_are_counted(model):
     skin, told = PressedSkin(KEY, model, material("velostat")), []
-    presses = [Press(ball(0.02), 1.0, (0.001 * k, 0.0)) for k in range(5)]
+    presses = [Press(ball_indenter(0.02), 1.0, (0.001 * k, 0.0)) for k in range(5)]
     frames = skin.frames(KEY, presses, progress=told.append)
     assert told[-1] == "voltages: 5 of 5"
     assert "pressure: 5 of 5" in told
     np.testing.assert_array_equal(frames, skin.frames(KEY, presses))
     told.clear()
-    skin.record(KEY, MovingPress(ball(0.02), np.ones(5)), np.arange(5.0), progress=told.append)
+    skin.record(KEY, MovingPress(ball_indenter(0.02), np.ones(5)), np.arange(5.0), progress=told.append)
     assert told[-1] == "voltages: 5 of 5"
 
 
 @pytest.mark.slow
 def test_taps_and_their_calibration_tell_their_steps():
     skin, told, steps = SoundingSkin(KEY), [], []
-    taps = calibration_taps(skin, KEY, microphone_grid(5), repeats=1, duration=0.08, progress=told.append)
+    taps = simulate_calibration_taps(skin, KEY, microphone_grid(5), repeats=1, duration=0.08, progress=told.append)
     assert told[-1] == "25 of 25 places"
     corners = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
     given = Taps(skin.microphones, corners, taps.positions, samples=taps.samples, rate=taps.rate)

@@ -160,7 +160,7 @@ def test_single_precision_is_warned_of(told, said):
 
 
 def test_single_precision_that_jax_has_been_told_of_is_taken_for_its_default():
-    """JAX does not say whether it was told; so a False before the import does not last, as docs/conventions.md says."""
+    """JAX does not say whether it was set; a False before the import is lost: docs/reference/conventions.md."""
     program = (
         "import jax; jax.config.update('jax_enable_x64', False); import jeit; assert jax.config.jax_enable_x64; "
         "jax.config.update('jax_enable_x64', False); assert jax.numpy.ones(1).dtype == 'float32'"

@@ -22,7 +22,16 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.touch.simulate import Disc, HalfSpace, MovingPress, PressDraws, PressedSkin, Prism, ball, material
+from jeit.touch.simulate import (
+    DiscIndenter,
+    HalfSpace,
+    MovingPress,
+    PressDraws,
+    PressedSkin,
+    PrismIndenter,
+    ball_indenter,
+    material,
+)
 
 HEADER = ["task", "nodes", "jeit", "touches a second", "SciPy", "times jeit's", "compile", "agreement"]
 KEY = jax.random.key(0)
@@ -38,7 +47,7 @@ def run(options: Options) -> Result:
     mesh = Disk(RADIUS).mesh(num_points=nodes)
     model = ForwardModel(mesh, BoundaryElectrodes(ring(RADIUS, 16), 0.008, 300.0), adjacent(16))
     skin = PressedSkin(KEY, model, material("velostat"))
-    shapes = [ball(0.015), Disc(0.01), Prism(0.02, 0.01, 0.005)]
+    shapes = [ball_indenter(0.015), DiscIndenter(0.01), PrismIndenter(0.02, 0.01, 0.005)]
     sets = {
         BALLS: PressDraws(shapes[:1], Disk(RADIUS), LOADS, margin=0.008),
         MIXED: PressDraws(shapes, Disk(RADIUS), LOADS, margin=0.01),
@@ -82,7 +91,7 @@ def _plainly(skin: PressedSkin, touches: list, sample: int) -> tuple[float, floa
 def _stroke(skin: PressedSkin, number: int, rounds: int) -> list[str]:
     """A row: a disc over the skin at 60 Hz, with creep and hysteresis of all that it leaves."""
     along = np.linspace(-0.03, 0.03, number)
-    stroke = MovingPress(Disc(0.01), np.full(number, 3.0), np.stack([along, 0 * along], axis=-1))
+    stroke = MovingPress(DiscIndenter(0.01), np.full(number, 3.0), np.stack([along, 0 * along], axis=-1))
     seconds = np.arange(number) / 60
     spent = timed(lambda: skin.record(KEY, stroke, seconds), rounds)
     row = [f"a stroke of {number} frames", str(skin.model.mesh.num_points), duration(spent.median)]
@@ -91,7 +100,7 @@ def _stroke(skin: PressedSkin, number: int, rounds: int) -> list[str]:
 
 def _half_space(rounds: int) -> list[str]:
     """A row: one contact, whose greatest pressure is Hertz's."""
-    support, indenter, load = HalfSpace(1e6, 0.5, 128), ball(0.02), 0.05
+    support, indenter, load = HalfSpace(1e6, 0.5, 128), ball_indenter(0.02), 0.05
     spent = timed(lambda: support.pressure(indenter, load).values.max(), rounds)
     radius = (3 * load * 0.01 / (4 * support.plane_modulus)) ** (1 / 3)
     error = float(spent.answer) / (3 * load / (2 * np.pi * radius**2)) - 1

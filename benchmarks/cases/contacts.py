@@ -14,7 +14,7 @@ from benchmarks.harness.timing import say
 from benchmarks.problems.contact_frames import RADIUS, SINGLE, ContactFrames, weight
 from jeit.mesh import measures
 from jeit.touch.contacts import CellFinder, RasterFinder, find_contacts
-from jeit.touch.simulate import Disc, Press
+from jeit.touch.simulate import DiscIndenter, Press
 
 METHODS = ("one-step", "back-projection")
 # Beyond this a contact found is none of those that are there, metres.
@@ -157,7 +157,7 @@ def _layers(frames, single, finder) -> list[str]:
         told = []
         for own, load in ((frames, 0.5), (single, 60.0)):
             mine = Images(own, method)
-            read = own.frames(600, [Press(Disc(2 * radius), load, (0.0, 0.0))])
+            read = own.frames(600, [Press(DiscIndenter(2 * radius), load, (0.0, 0.0))])
             found = mine.found(finder, read)[0]
             strongest = (own.images(mine.reconstruction, read)[0] / mine.noise.deviation).max()
             off = f"{1e3 * _nearest(found, np.zeros(2)):.1f} mm off" if found else "not found"

@@ -18,7 +18,7 @@ from benchmarks.opponents.scipy_localiser import PlainLocaliser
 from jeit.acoustic import Localiser, MicrophoneArray, Recording, Taps, calibrate_microphones, locate, track
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.noise import IntensityNoise
-from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid, stroke
+from jeit.acoustic.simulate import SoundingSkin, microphone_grid, simulate_calibration_taps, simulate_stroke
 from jeit.acoustic.simulate.microphones import Readout
 from jeit.acoustic.simulate.propagation import expected_power, noise_power
 from jeit.acoustic.surface import make_surface
@@ -126,13 +126,13 @@ def recording(rounds: int) -> tuple[Timed, int]:
     """From samples at 40 kHz to a smoothed track, and samples of a channel."""
 
     skin = SoundingSkin(jax.random.key(0), readout=Readout(multiplexed=False))
-    taps = calibration_taps(skin, jax.random.key(1), microphone_grid(9), repeats=1)
+    taps = simulate_calibration_taps(skin, jax.random.key(1), microphone_grid(9), repeats=1)
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.1
     array = np.asarray(skin.microphones)
     calibration = calibrate_microphones(
         Taps(array, corners, taps.positions, samples=taps.samples, rate=taps.rate)
     ).calibration
-    sound = stroke(skin, jax.random.key(2), np.array([[-0.07, -0.06], [0.07, 0.05]]), strength=2.0)
+    sound = simulate_stroke(skin, jax.random.key(2), np.array([[-0.07, -0.06], [0.07, 0.05]]), strength=2.0)
     heard = Recording(sound.samples, sound.rate)
     return timed(lambda: track(locate(heard, calibration, compiled=True)), rounds), sound.samples.shape[1]
 

@@ -20,7 +20,7 @@ from jeit.image import find_inclusions
 from jeit.inverse import Laplace, one_step
 from jeit.touch import PlacedMap, SelfOrganisingMap
 from jeit.touch.kohonen import (
-    Schedule,
+    MapSchedule,
     drawn_map,
     learning_curves,
     map_quality,
@@ -28,21 +28,21 @@ from jeit.touch.kohonen import (
     time_constant,
     touches_reported,
 )
-from jeit.touch.simulate import Bar, Disc, Press, Prism, Ring
+from jeit.touch.simulate import BarIndenter, DiscIndenter, Press, PrismIndenter, RingIndenter
 
 LEARNT, JUDGED, TRIALS = 10_000, 1000, 200
 RATES, THEIR_SECONDS = (0.01, 0.005, 0.001), (4.2, 7.7, 19.6)
 SHAPES = ((13, 16), (32, 32), (64, 64))
 # ε and ρ as published; how long, they do not say: frames of each phase for one round of ten thousand.
-PUBLISHED = Schedule(2000, 8000, (0.01, 0.001), (16.0, 1.0))
+PUBLISHED = MapSchedule(2000, 8000, (0.01, 0.001), (16.0, 1.0))
 GRAMS, WEIGHTS = (2.3, 6.3, 20.3, 52.3, 102.3), (100.0, 50.0, 20.0)
 APART, NEAR = 0.06, 0.02  # m: between weights, and of a touch from its weight
 ASKED = {1: 0.9, 2: 0.8, 3: 0.6}
 OBJECTS = {
-    "prism": Prism(0.06, 0.04, 0.02),
-    "cube": Bar(0.03, 0.03),
-    "ruler": Bar(0.09, 0.02),
-    "tube": Ring(0.06, 0.05),
+    "prism": PrismIndenter(0.06, 0.04, 0.02),
+    "cube": BarIndenter(0.03, 0.03),
+    "ruler": BarIndenter(0.09, 0.02),
+    "tube": RingIndenter(0.06, 0.05),
 }
 MIDDLE, MARKED = np.array([0.0, 0.02]), "#d1495b"  # of the objects, m; what is true, in pictures
 
@@ -73,7 +73,7 @@ def run(options: Options) -> Result:
     frames, places = disk.presses(10, learnt)
     fresh, right = disk.presses(20, judged_by)
     rest = disk.skin.rest()
-    schedule = Schedule(1000, 1000) if quick else Schedule()
+    schedule = MapSchedule(1000, 1000) if quick else MapSchedule()
     say("learning curves")
     curves = learning_curves(frames, jax.random.key(0), RATES, steps=1000 if quick else 10_000)
     tables, asked = [], []
@@ -104,7 +104,7 @@ def run(options: Options) -> Result:
         own = SelfOrganisingMap.fit(frames, jax.random.key(1), shape=shape, schedule=schedule)
         maps[shape] = PlacedMap.learn(own, frames, places)
         place_rows.append(_row(f"map, {shape[0]} × {shape[1]}", maps[shape].locate(fresh)[0], right))
-    published = SelfOrganisingMap.fit(frames, jax.random.key(1), schedule=Schedule(300, 300) if quick else PUBLISHED)
+    published = SelfOrganisingMap.fit(frames, jax.random.key(1), schedule=MapSchedule(300, 300) if quick else PUBLISHED)
     winners = PlacedMap.learn(published, frames, places).locate(fresh)[0]
     place_rows.append(_row("map, 32 × 32, published ε, 10,000 frames once", winners, right))
     images = _imaged(disk, fresh, rest, quick)
@@ -195,7 +195,7 @@ def _imaged(disk: WeighedSkin, fresh: np.ndarray, rest: np.ndarray, quick: bool)
 def _sensitivity(disk: WeighedSkin, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Places (10,) along a diameter, metres, and the mean change (5, 10) of transfer resistance under five weights."""
     along = np.array([*np.linspace(-0.08, 0.08, 9), 0.09])
-    touches = [[Press(Disc(DISC), grams * GRAVITY, (x, 0.0)) for x in along] for grams in GRAMS]
+    touches = [[Press(DiscIndenter(DISC), grams * GRAVITY, (x, 0.0)) for x in along] for grams in GRAMS]
     read = [disk.skin.voltages_under(disk.skin.touched(some)) * disk.skin.gain for some in touches]
     return along, np.array([np.abs(one - rest).mean(axis=1) for one in read]) / CURRENT
 
@@ -331,7 +331,7 @@ def _draw(folder: Path, curves, located, drawings, multi, pressed, sensed) -> No
     where = np.array([[-0.05, 0.03], [0.05, 0.04], [0.0, -0.06]])
     for number, ax in zip((1, 2, 3), axes[1], strict=False):
         touch = tuple(
-            Press(Disc(DISC), one * GRAVITY, place) for one, place in zip(WEIGHTS[:number], where, strict=False)
+            Press(DiscIndenter(DISC), one * GRAVITY, place) for one, place in zip(WEIGHTS[:number], where, strict=False)
         )
         frame = disk.skin.frames(jax.random.key(60), [touch])[0]
         activity = placed.learnt.activity(frame)[0]

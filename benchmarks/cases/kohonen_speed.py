@@ -18,7 +18,7 @@ from benchmarks.harness.timing import say, timed
 from benchmarks.problems.weighed_skins import WeighedSkin
 from jeit.inverse import one_step
 from jeit.touch import PlacedMap, SelfOrganisingMap
-from jeit.touch.kohonen import Schedule
+from jeit.touch.kohonen import MapSchedule
 from jeit.touch.kohonen.training import train
 
 FRAMES, SHAPE, ASKED_S, TIMES, FRAME_S = 10_000, (32, 32), 5.0, 20.0, 0.2e-3
@@ -30,7 +30,7 @@ def run(options: Options) -> Result:
     skin = WeighedSkin("disk", nodes)
     frames, places = skin.presses(10, number)
     random = np.random.default_rng(0)
-    schedule = Schedule(number // 5, number - number // 5, (0.3, 0.02))
+    schedule = MapSchedule(number // 5, number - number // 5, (0.3, 0.02))
     order, start = random.permutation(number), 1e-3 * random.normal(size=(*SHAPE, frames.shape[1]))
     rates, radii = schedule.rates(), schedule.radii(SHAPE)
     given = jnp.asarray(start), jnp.asarray(frames), order, rates, radii

@@ -26,7 +26,7 @@ from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit.touch import LearntSkin, Presses
 from jeit.touch.learnt.numbers import METHODS
-from jeit.touch.simulate import Disc, Press, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, Press, PressedSkin, material
 
 RADIUS, FINGER, LOADS = 0.05, 0.016, (0.5, 8.0)  # m; a disc's diameter, m; N
 PRESSES, FRAMES, FRESH = 2000, 10_000, 500
@@ -79,7 +79,7 @@ def _skin(number: int, fresh: int):
     )
     places = distance[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
     loads = np.exp(rng.uniform(*np.log(LOADS), number + fresh))
-    drawn = [Press(Disc(FINGER), load, place) for load, place in zip(loads, places, strict=True)]
+    drawn = [Press(DiscIndenter(FINGER), load, place) for load, place in zip(loads, places, strict=True)]
     frames = np.asarray(skin.frames(jax.random.key(2), drawn))
     presses = Presses.create(frames[:number], reference=reference, positions=places[:number])
     return model, presses, frames[number:], reference, places[number:]

@@ -19,7 +19,7 @@ from benchmarks.harness.case import Asked, Case, Headline, Options, Result, Tabl
 from benchmarks.harness.timing import say
 from jeit.acoustic import Intensities, Localiser, Taps, calibrate_microphones, cramer_rao, locate, tap_intensities
 from jeit.acoustic.localisation.locate import microphones_in_use
-from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid
+from jeit.acoustic.simulate import SoundingSkin, microphone_grid, simulate_calibration_taps
 from jeit.acoustic.simulate.microphones import MicrophoneModel
 from jeit.acoustic.simulate.propagation import expected_power, noise_power
 from jeit.layout import grid
@@ -37,7 +37,7 @@ def calibrated(skin, given=None):
     """The calibration of a skin from taps; `given`: positions (M, 2) in metres at which its microphones are said to be,
     by default where they are."""
 
-    sound = calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 13, 13))
+    sound = simulate_calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 13, 13))
     array = np.asarray(skin.microphones) if given is None else given
     taps = Taps(array, CORNERS, sound.positions, samples=sound.samples, rate=sound.rate)
     return calibrate_microphones(taps).calibration
@@ -46,7 +46,7 @@ def calibrated(skin, given=None):
 def heard(skin, places, bursts: int):
     """Intensities (P, M) at places (P, 2), averaged over some bursts; floor (M,), ν, and which can be used (P, M)."""
 
-    sound = calibration_taps(skin, jax.random.key(2), places, repeats=bursts)
+    sound = simulate_calibration_taps(skin, jax.random.key(2), places, repeats=bursts)
     taps = Taps(np.asarray(skin.microphones), CORNERS, sound.positions, samples=sound.samples, rate=sound.rate)
     found = tap_intensities(taps)
     power = found.power.reshape(len(places), bursts, -1).mean(axis=1)

@@ -80,7 +80,8 @@ def readme_table(known: dict[str, str]) -> str:
     """At most eight rows for the README."""
     rows = list(headlines(known).values())[:MOST_ROWS]
     header = ["job", "jeit", "best opponent", "times jeit's", "accuracy"]
-    return markdown(header, [[one.job, one.jeit, one.opponent, one.ratio, one.accuracy] for one in rows])
+    cells = [[one.job, one.jeit, one.opponent, one.ratio, one.accuracy] for one in rows]
+    return markdown(header, cells, padded=False)
 
 
 def write(case: Case, result: Result, heading: list[str], order: tuple[str, ...], root: Path = ROOT) -> list[str]:

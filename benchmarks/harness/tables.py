@@ -43,9 +43,10 @@ def megabytes(*figures: Figures | None) -> str:
     return " / ".join("–" if one is None or one.peak is None else f"{one.peak:.0f} MB" for one in figures)
 
 
-def markdown(header: list[str], rows: list[list[str]]) -> str:
-    """A Markdown table, padded so that it reads as plain text too."""
-    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
+def markdown(header: list[str], rows: list[list[str]], *, padded: bool = True) -> str:
+    """A Markdown table, `padded` so that it reads as plain text too."""
+    shown = [header, *rows] if padded else [["---"] * len(header)]
+    widths = [max(len(row[column]) for row in shown) for column in range(len(header))]
     lines = [header, ["-" * width for width in widths], *rows]
     return "\n".join(
         "| " + " | ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)) + " |" for line in lines

@@ -22,7 +22,7 @@ from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit.touch.contacts import ImageNoise
-from jeit.touch.simulate import Disc, Press, PressDraws, PressedSkin, ball, material
+from jeit.touch.simulate import DiscIndenter, Press, PressDraws, PressedSkin, ball_indenter, material
 
 RADIUS, GRAVITY, SECONDS = 0.05, 9.81, 20.0
 SINGLE = 0.01
@@ -92,7 +92,13 @@ class ContactFrames:
 
     def touches(self, key: int, number: int) -> list[tuple[Press, ...]]:
         """One to three discs and balls at once, of many sizes, loads and places, told apart at all."""
-        shapes = [Disc(0.006), Disc(0.008), Disc(0.0115), ball(0.02), ball(0.03)]
+        shapes = [
+            DiscIndenter(0.006),
+            DiscIndenter(0.008),
+            DiscIndenter(0.0115),
+            ball_indenter(0.02),
+            ball_indenter(0.03),
+        ]
         draws = PressDraws(shapes, Disk(RADIUS), LOADS[self.name], margin=MARGIN, at_once=3)
         drawn = draws.draw(self._key(key), number)
         return [one for one in drawn if np.min(_distances(one), initial=1.0) > APART]
@@ -103,7 +109,7 @@ class ContactFrames:
 
 def weight(grams: float, place, radius: float = 0.0115) -> Press:
     """A weight on a flat disc of a `radius`, at a place, metres."""
-    return Press(Disc(2 * radius), 1e-3 * grams * GRAVITY, place)
+    return Press(DiscIndenter(2 * radius), 1e-3 * grams * GRAVITY, place)
 
 
 def _distances(touch: tuple[Press, ...]) -> list[float]:

@@ -20,8 +20,8 @@ from jeit.layout import named_layout, ring
 from jeit.mesh import Disk, Domain, Rectangle
 from jeit.protocol import adjacent
 from jeit.touch import CellFinder, SkinHealth, find_contacts
-from jeit.touch.simulate import Disc, Press, PressDraws, PressedSkin, ball, material
-from jeit.touch.simulate.damage import Cut, ElectrodeFault, draw_cut, mended
+from jeit.touch.simulate import DiscIndenter, Press, PressDraws, PressedSkin, ball_indenter, material
+from jeit.touch.simulate.damage import Cut, ElectrodeFault, draw_cut, mend_cut
 
 RATE, PATIENCE = 5.0, 30.0
 # Shares of the load while a touch comes and goes; seconds that it lasts, median and spread of the logarithm; and those
@@ -86,7 +86,7 @@ class DamagedSkin:
     def presses(self, number: int, count: int) -> list[Press]:
         loads = (2.0, 10.0) if self.name == "park" else (0.5, 6.0)
         size = 0.02 * self.scale
-        shapes = [ball(size), ball(1.5 * size), Disc(0.7 * size)]
+        shapes = [ball_indenter(size), ball_indenter(1.5 * size), DiscIndenter(0.7 * size)]
         draws = PressDraws(shapes, self.outline, loads, margin=0.6 * size)
         return [one for (one,) in draws.draw(self.key(number), count)]
 
@@ -147,7 +147,7 @@ class DamagedSkin:
         mesh = whole.model.mesh
         torn = cut.conductivity(mesh, whole.conductivity, self.material.thickness)
         share = float(np.random.default_rng(int(1e6 * cut.length)).uniform(0.9, 1.1))
-        glued, other = mended(mesh, whole.conductivity, cut, self.material, share)
+        glued, other = mend_cut(mesh, whole.conductivity, cut, self.material, share)
         return (
             whole,
             eqx.tree_at(lambda one: one.conductivity, whole, torn),

@@ -27,7 +27,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import perimeter
 from jeit.mesh import Rectangle
 from jeit.protocol import opposite
-from jeit.touch.simulate import Disc, Press, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, Press, PressedSkin, material
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
 
 REPETITIONS, PRESSES, TESTS, DAYS = 6, 20, 20, 5
@@ -89,7 +89,7 @@ class Fabric:
         self.noise = own.noise * float(np.sqrt(np.mean(self._rest**2))) * 1.25 / np.sqrt(SAMPLES)
         x, y = ((np.arange(count) - (count - 1) / 2) * target for count in squares or SQUARES[target])
         self.middles = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-        finger: AbstractIndenter = Disc(CONTACT * target)
+        finger: AbstractIndenter = DiscIndenter(CONTACT * target)
         if np.isfinite(bend):
             finger = OnCylinder(finger, bend)
         rng = np.random.default_rng(0)

@@ -13,14 +13,14 @@ import numpy as np
 from jeit.design import Skin, touches_away_from_the_edge
 from jeit.layout import Layout, named_layout
 from jeit.touch.simulate import (
-    Bar,
-    DepthMap,
-    Disc,
+    BarIndenter,
+    DepthMapIndenter,
+    DiscIndenter,
     Indent,
     JoinedIndenters,
     PlacedIndenter,
-    Ring,
-    ball,
+    RingIndenter,
+    ball_indenter,
     relative_changes,
 )
 from jeit.touch.simulate.contact.indents import relative_to
@@ -83,13 +83,13 @@ class JudgedSkins:
 def grid_touches() -> tuple[list[list[Indent]], np.ndarray]:
     """A ball of 15 mm, 7.5 mm deep, at 15 × 15 places; and these."""
     places = touches_away_from_the_edge(park_skin().outline, TIP / 2, PLACES, PLACES).places
-    return [[Indent(ball(TIP), TIP_DEPTH, place)] for place in places], places
+    return [[Indent(ball_indenter(TIP), TIP_DEPTH, place)] for place in places], places
 
 
 def tuning_touches(number: int = 60) -> tuple[list[list[Indent]], np.ndarray]:
     """The same ball elsewhere: what rivals choose their hyperparameters by."""
     places = np.random.default_rng(5).uniform(-0.09, 0.09, (number, 2))
-    return [[Indent(ball(TIP), TIP_DEPTH, place)] for place in places], places
+    return [[Indent(ball_indenter(TIP), TIP_DEPTH, place)] for place in places], places
 
 
 def pair_touches(number: int, apart: float = APART, seed: int = 9) -> tuple[list[list[Indent]], np.ndarray]:
@@ -100,7 +100,7 @@ def pair_touches(number: int, apart: float = APART, seed: int = 9) -> tuple[list
         other = one + apart * np.array([np.cos(angle), np.sin(angle)])
         if np.abs(other).max() < 0.085:
             places.append((one, other))
-    touches = [[Indent(ball(TIP), 6e-3, place) for place in pair] for pair in places]
+    touches = [[Indent(ball_indenter(TIP), 6e-3, place) for place in pair] for pair in places]
     return touches, np.array(places)
 
 
@@ -109,17 +109,21 @@ def unseen_shapes() -> dict[str, object]:
     along = np.linspace(-1, 1, 41)
     x, y = np.meshgrid(along, along)
     triangle = np.where((y > -0.5) & (y < 1 - 1.732 * np.abs(x)), 0.0, np.nan)
-    bar = Bar(0.06, 0.012)
+    bar = BarIndenter(0.06, 0.012)
     return {
-        "ring": Ring(0.060, 0.036),
+        "ring": RingIndenter(0.060, 0.036),
         "cross": JoinedIndenters(bar, PlacedIndenter(bar, (0.0, 0.0), np.pi / 2)),
         "L": JoinedIndenters(
-            PlacedIndenter(Bar(0.06, 0.014), (0.0, -0.023)), PlacedIndenter(Bar(0.06, 0.014), (-0.023, 0.0), np.pi / 2)
+            PlacedIndenter(BarIndenter(0.06, 0.014), (0.0, -0.023)),
+            PlacedIndenter(BarIndenter(0.06, 0.014), (-0.023, 0.0), np.pi / 2),
         ),
-        "triangle": DepthMap(triangle, 0.0018),
+        "triangle": DepthMapIndenter(triangle, 0.0018),
         "hand": JoinedIndenters(
-            Disc(0.045),
-            *(PlacedIndenter(Disc(0.016), (0.05 * np.cos(a), 0.05 * np.sin(a))) for a in (0.2, 0.9, 1.6, 2.3, 3.3)),
+            DiscIndenter(0.045),
+            *(
+                PlacedIndenter(DiscIndenter(0.016), (0.05 * np.cos(a), 0.05 * np.sin(a)))
+                for a in (0.2, 0.9, 1.6, 2.3, 3.3)
+            ),
         ),
     }
 

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jeit.acoustic import Recording
-from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, sound_clips
+from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, simulate_sound_clips
 from jeit.acoustic.simulate.people import MODALITIES, SOUND_MANNERS
 from jeit.touch.listening import SoundImages, sound_images
 
@@ -74,7 +74,7 @@ def _simulated(people: int, each: int, seed: int) -> HeardPeople:
     drawn = [SoundingPerson.draw(key) for key in jax.random.split(for_people, people)]
     parts: dict[tuple[float, int], list[SoundImages]] = {one: [] for one in _variants()}
     right, person = [], []
-    for clip in sound_clips(for_clips, skin, drawn, each):
+    for clip in simulate_sound_clips(for_clips, skin, drawn, each):
         for louder, number in parts:
             heard = clip.noisier(louder)[list(FEWER[number])]
             parts[louder, number].append(sound_images(Recording(heard, skin.rate))[::_EVERY])

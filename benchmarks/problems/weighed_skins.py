@@ -17,7 +17,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import perimeter
 from jeit.mesh import Disk, Domain, Rectangle
 from jeit.protocol import adjacent
-from jeit.touch.simulate import Disc, Press, PressDraws, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, Press, PressDraws, PressedSkin, material
 
 RADIUS, DISC, CURRENT, GRAVITY = 0.1, 16.25e-3, 200e-6, 9.81e-3
 GRAMS = 100.0
@@ -46,7 +46,7 @@ class WeighedSkin:
     def presses(self, seed: int, number: int, grams: float = GRAMS) -> tuple[np.ndarray, np.ndarray]:
         """Frames (number, 208) under one weight, and its places (number, 2)."""
         load = grams * GRAVITY
-        draws = PressDraws([Disc(DISC)], OUTLINES[self.name], (load, load), margin=DISC / 2)
+        draws = PressDraws([DiscIndenter(DISC)], OUTLINES[self.name], (load, load), margin=DISC / 2)
         drawn = draws.draw(jax.random.key(seed), number)
         places = np.array([one[0].position for one in drawn])
         return self.skin.frames(jax.random.key(seed + 1), drawn), places
@@ -61,7 +61,7 @@ class WeighedSkin:
             if (np.asarray(inside(tried)) > 0.015).all() and off.min() > apart:
                 places.append(tried)
         touches = [
-            tuple(Press(Disc(DISC), one * GRAVITY, place) for one, place in zip(grams, some, strict=True))
+            tuple(Press(DiscIndenter(DISC), one * GRAVITY, place) for one, place in zip(grams, some, strict=True))
             for some in places
         ]
         return self.skin.frames(jax.random.key(seed + 1), touches), np.array(places)

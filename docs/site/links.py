@@ -1,5 +1,6 @@
 """Links that guides do not write: names in code style lead to the reference, files outside `docs/` to their pages."""
 
+import posixpath
 import re
 from collections import Counter
 from functools import cache
@@ -63,6 +64,7 @@ def on_page_markdown(markdown, page, config, files):
     inside = {page: path for path, page in OUTSIDE.items()}
     uri = page.file.src_uri
     here = ROOT / inside.get(uri, f"docs/{uri}")
+    folder = posixpath.dirname(uri) or "."
 
     def moved(match: re.Match) -> str:
         words, anchor, path = match[1], match[3] or "", (here.parent / match[2]).resolve()
@@ -70,7 +72,7 @@ def on_page_markdown(markdown, page, config, files):
         if told.startswith("docs/"):
             return f"[{words}]({told.removeprefix('docs/')}{anchor})" if uri in inside else match[0]
         if told in OUTSIDE and path.is_file():
-            return f"[{words}]({OUTSIDE[told]}{anchor})"
+            return f"[{words}]({posixpath.relpath(OUTSIDE[told], folder)}{anchor})"
         return words if path.exists() else match[0]
 
     return markdown if uri.startswith("api/") else _LINK.sub(moved, markdown)

@@ -229,10 +229,14 @@ def menu() -> list:
 
 
 def on_config(config):
-    """Hang the reference into the menu, under the entry that is called so."""
-    for entry in config.nav:
-        if isinstance(entry, dict) and "API reference" in entry:
-            entry["API reference"] = menu()
+    """Hang the reference into the menu, under the entry that is called so, in whatever section it stands."""
+    entries = list(config.nav)
+    for entry in entries:
+        for title, below in entry.items() if isinstance(entry, dict) else ():
+            if title == "API reference":
+                entry[title] = menu()
+            elif isinstance(below, list):
+                entries += below
     return config
 
 

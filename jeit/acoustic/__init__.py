@@ -5,10 +5,8 @@
 `intensities`, `locate` and `track`. The underlying estimator is `Localiser`, which is batched and differentiable.
 `cramer_rao` computes the Cramér-Rao bound.
 
-Subpackages: `signal` (recordings, faults, intensities), `calibration` (fits to taps), `localisation` (objectives,
-their minimisation, maps, two sources), `simulate` (simulated recordings), `plots`. Modules: `decay` (decay models),
-`microphones` (the array), `surface` (the surface on which sources lie), `noise` (the error model of intensities),
-`tracking` (smoothing over time), `touches` (all steps in one call).
+Recordings are simulated by a `SoundingSkin` and the functions `simulate_…`; results are drawn by `plot_…` and written
+to files by `write_…`. What users need of the subpackages is exported here.
 """
 
 from __future__ import annotations

@@ -20,6 +20,13 @@ class MicrophoneArray(Module):
 
     **Fields**: `microphones`: positions (M, d) in metres; `surface`: surface on which sources lie; `decay`: decay model
     of each microphone; `noise`: noise of the intensities.
+
+    **Example:**
+
+    ```python
+    array = calibration.microphone_array
+    response = array.response(np.array([0.03, 0.02]))
+    ```
     """
 
     microphones: Float[Array, "M d"]

@@ -12,15 +12,28 @@ from jeit.acoustic import Localiser, LocatedTouches
 from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.acoustic.localisation.locate import microphones_in_use
 from jeit.acoustic.localisation.locations import Locations, LocationStatus
-from jeit.acoustic.localisation.pixels import brightness, fade
+from jeit.acoustic.localisation.pixels import fade, map_brightness
 from jeit.acoustic.tracking import Track
 from jeit.report.folder import as_plain_values, results, version_of, write_json, write_rows
 
 
 def write_calibration(fit: CalibrationFit, path: str | Path) -> None:
-    """Write the calibration to the JSON file `path`, for `Calibration.load`, and a plot of it to the same path with the
-    suffix `.png`. The folder is created if needed. Raises `ValueError` if `path` is a folder, has the suffix `.png`, or
-    is in a folder that cannot be created."""
+    """Write a calibration to a JSON file for `Calibration.load`, and a plot of it beside it.
+
+    **Arguments:**
+
+    - `fit`: result of `calibrate_microphones`.
+    - `path`: path of the JSON file, whose folder is created if needed; the plot has the suffix `.png` instead.
+
+    Raises `ValueError` if `path` is a folder, has the suffix `.png`, or is in a folder that cannot be created.
+
+    **Example:**
+
+    ```python
+    write_calibration(fit, "skin.json")
+    calibration = Calibration.load("skin.json")
+    ```
+    """
     path, picture = calibration_files(path)
     with results(path.parent, (path.name, picture.name)) as made:
         fit.calibration.save(made / path.name)
@@ -56,14 +69,27 @@ _PIXELS, _FRAMES = 100, 256
 
 
 def write_track(found: LocatedTouches, folder: str | Path) -> None:
-    """Write the result of `locate_touches` to the files `track.csv`, `report.json` and `track.png` in `folder`, which
-    is created if needed.
+    """Write the result of `locate_touches` to the files `track.csv`, `report.json` and `track.png` of a folder.
 
     The table has a row for each frame, with these columns: `time_s`; the estimated position `x_m`, `y_m`, its standard
     deviations `std_x_m`, `std_y_m`, and the `covariance` of x and y in m²; `strength` in the unit of intensity;
     `status`; the smoothed position `track_x_m`, `track_y_m` and its standard deviations `track_std_x_m`,
     `track_std_y_m`; and the number of the `touch`, from 1. For a surface in space, columns for z follow. Missing values
-    are empty. Raises `ValueError` if the folder cannot be created.
+    are empty.
+
+    **Arguments:**
+
+    - `found`: result of `locate_touches`.
+    - `folder`: the folder, which is created if needed.
+
+    Raises `ValueError` if the folder cannot be created.
+
+    **Example:**
+
+    ```python
+    located = locate_touches(recording, calibration)
+    write_track(located, "out")
+    ```
     """
     with results(folder, ("track.csv", "report.json", "track.png")) as made:
         columns = _column_names(found.locations.position.shape[1])
@@ -157,7 +183,7 @@ def _overlay_maps(touches: LocatedTouches) -> np.ndarray | None:
     image = np.zeros((_PIXELS, _PIXELS))
     for start in range(0, located.size, _FRAMES):
         some = located[start : start + _FRAMES]
-        bright = brightness(localiser.maps(intensities.power[some], use[some]), method=touches.method)
+        bright = map_brightness(localiser.maps(intensities.power[some], use[some]), method=touches.method)
         image = np.maximum(image, fade(bright, locations.times[some], at=times[-1], time_constant=time_constant))
     return image
 

@@ -25,6 +25,13 @@ class LocatedTouches(Module):
 
     **Fields**: `intensities`: intensities of the recording; `locations`: position and status of each frame; `track`:
     smoothed positions and touches; `calibration`, `method`: the calibration and method used.
+
+    **Example:**
+
+    ```python
+    located = locate_touches(recording, calibration)
+    print([(touch.onset, touch.offset) for touch in located.track.touches])
+    ```
     """
 
     intensities: Intensities
@@ -45,18 +52,30 @@ def locate_touches(
     gain_drift: float = GAIN_DRIFT,
     progress: Callable[[str], None] | None = None,
 ) -> LocatedTouches:
-    """Locate every touch in a recording. The command `jeit locate` calls this function;
-    `jeit.acoustic.reports.write_track` writes its output files.
+    """Locate every touch in a recording, like the command `jeit locate`.
 
-    `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022, minimised on a map of 200 ×
-    200 pixels and then refined. `gap`: time in seconds without a position after which a touch has ended. `intensity`:
-    band and windows, for recordings of samples; by default those of the calibration. `silence`: recording of the
-    untouched array, from which the noise floor is estimated if touches never pause. `gain_drift`: standard deviation of
-    the changes of the gains since the calibration, as a fraction of the intensities; see `locate`. `progress` is called
-    with the name of each step when it begins.
+    **Arguments:**
+
+    - `recording`: samples or intensities of the calibrated microphones.
+    - `calibration`: the calibrated array.
+    - `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022, minimised on a map of 200
+      × 200 pixels and then refined.
+    - `gap`: time without a position after which a touch has ended, seconds.
+    - `intensity`: band and windows, for recordings of samples; by default those of the calibration.
+    - `silence`: recording of the untouched array, from which the noise floor is estimated if touches never pause.
+    - `gain_drift`: standard deviation of the changes of the gains since the calibration, as a fraction of the
+      intensities; see `locate`.
+    - `progress`: called with the name of each step when it begins.
 
     Raises `ValueError` for a recording with another number of microphones, fewer than three usable microphones, frames
     farther apart than `gap`, `intensity` or `silence` given for a recording of intensities, and values out of range.
+
+    **Example:**
+
+    ```python
+    located = locate_touches(recording, calibration)
+    write_track(located, "out")
+    ```
     """
     said = progress or (lambda step: None)
     if intensity is not None and isinstance(recording, Intensities):

@@ -59,10 +59,22 @@ class Track(Module):
 def track(locations: Locations, *, gap: float = 0.15, acceleration: float | None = None) -> Track:
     """Smooth the positions of each touch in a recording.
 
-    `gap`: time in seconds without a position after which a touch has ended. `acceleration`: spectral density q of the
-    random acceleration in m²/s³; by default the most likely value in a range. Covariances are multiplied by
-    `locations.overlap`, since the errors of overlapping windows are correlated. Raises `ValueError` for values that are
-    not positive, and if `locations` is not a `Locations`.
+    Covariances are multiplied by `locations.overlap`, since the errors of overlapping windows are correlated.
+
+    **Arguments:**
+
+    - `locations`: positions of the frames, as from `locate`.
+    - `gap`: time without a position after which a touch has ended, seconds.
+    - `acceleration`: spectral density q of the random acceleration, m²/s³; by default the most likely value in a range.
+
+    Raises `ValueError` for values that are not positive, and if `locations` is not a `Locations`.
+
+    **Example:**
+
+    ```python
+    smoothed = track(locations)
+    print([(touch.onset, touch.length) for touch in smoothed.touches])
+    ```
     """
     check_kind("locations", locations, Locations, "Locations, as of locate(recording, calibration)")
     if not (np.isfinite(gap) and gap > 0):

@@ -1,4 +1,4 @@
-"""Public names of version 0.2 that have moved. They still work until the next version, with a `DeprecationWarning` that
+"""Public names of version 0.2 that have moved. They work until version 1.1, with a `DeprecationWarning` that
 names the new place."""
 
 from __future__ import annotations
@@ -17,52 +17,70 @@ _MOVED = {
         "learn_health untouched_frames",
     },
     "jeit.plot": {
-        "jeit.acoustic.plots": "Marks plot_error_curve plot_loss_map plot_pairs plot_receptive_fields plot_track",
-        "jeit.design.plots": "plot_sensitivity_histograms plot_sensitivity_map plot_taxel_areas plot_taxels "
-        "plot_travel plot_unrolled",
-        "jeit.touch.plots": "plot_answers plot_changes plot_confusion plot_contact_stages plot_contacts "
-        "plot_depth_map plot_force_errors plot_health plot_health_course "
-        "plot_key_errors plot_losses plot_map plot_place_errors plot_places plot_timeline "
-        "plot_touch_paths plot_tried",
+        "jeit.acoustic": "plot_error_curve plot_loss_map plot_receptive_fields plot_track",
+        "jeit.design": "plot_sensitivity_histograms plot_sensitivity_map plot_taxel_areas plot_taxels plot_travel "
+        "plot_unrolled",
+        "jeit.touch": "plot_confusion plot_contact_stages plot_contacts plot_depth_map plot_health plot_health_course "
+        "plot_map plot_timeline plot_touch_paths",
+        "jeit.touch.plots": "plot_answers plot_changes plot_force_errors plot_key_errors plot_losses plot_place_errors "
+        "plot_places plot_tried",
     },
     "jeit.report": {
-        "jeit.acoustic.reports": "draw_calibration draw_track report_track write_calibration write_track",
+        "jeit.acoustic": "write_calibration write_track",
+        "jeit.acoustic.reports": "draw_calibration draw_track report_track",
+        "jeit.design": "write_improved_layout write_layout_comparison write_study_report",
         "jeit.design.reports": "draw_improved_layout draw_layout_comparison report_improved_layout "
-        "report_layout_comparison write_improved_layout write_layout_comparison "
-        "write_study_report",
-        "jeit.touch.reports": "draw_health draw_watch report_gestures report_health "
-        "report_learnt_images report_learnt_skin report_listener report_watch write_depths "
-        "write_gestures write_health write_learnt_images write_learnt_skin "
-        "write_listener write_touches write_watch",
+        "report_layout_comparison",
+        "jeit.touch": "write_listener",
+        "jeit.touch.reports": "draw_health draw_watch report_gestures report_health report_learnt_images "
+        "report_learnt_skin report_listener report_watch write_depths write_gestures write_health write_learnt_images "
+        "write_learnt_skin write_touches write_watch",
     },
     "jeit.simulate": {
-        "jeit.acoustic.simulate": "Burst SoundClip SoundingPerson SoundingSkin calibration_taps microphone_grid "
-        "pat quiet room_sound sound_clips stroke tap tickle wind",
+        "jeit.acoustic": "Burst SoundingPerson SoundingSkin microphone_grid",
+        "jeit.acoustic.simulate": "SoundClip",
         "jeit.data": "RoundSkin simulate_press",
-        "jeit.touch.simulate": "Bar DepthMap Disc Foundation GestureStream HalfSpace Indent IndentDraws IndentSet "
-        "Material MovingPress Person Press PressDraws PressSet PressedSkin Prism Revolved "
-        "Ring TwoSheets ball depth_maps indented_cells material open_presses relative_changes "
-        "simulate_gesture_stream simulate_gestures simulate_presses",
+        "jeit.touch": "Foundation HalfSpace Indent IndentDraws Material MovingPress Person Press PressDraws PressSet "
+        "PressedSkin TwoSheets depth_maps material open_presses relative_changes simulate_gesture_stream "
+        "simulate_gestures simulate_presses",
+        "jeit.touch.simulate": "GestureStream IndentSet indented_cells",
     },
 }
-_RENAMED = {
-    "jeit.touch.attributes.least_told": "jeit.touch.attributes.least_detected",
-    "jeit.touch.kohonen.touches_told": "jeit.touch.kohonen.touches_reported",
-    "jeit.touch.training.Trained": "jeit.touch.training.TrainingResult",
-    "jeit.touch.listening.Heard": "jeit.touch.listening.SoundLabels",
-    "jeit.plot.plot_heard": "jeit.touch.plots.plot_sound_labels",
-    **{
-        f"{page}.{old}": f"{home}.{new}"
-        for page, home in (
-            ("jeit.simulate", "jeit.touch.simulate"),
-            ("jeit.touch.simulate", "jeit.touch.simulate"),
-            ("jeit.touch.simulate.contact", "jeit.touch.simulate.contact"),
-        )
-        for old, new in (("Joined", "JoinedIndenters"), ("Placed", "PlacedIndenter"))
-    },
-    **{f"jeit.report.{verb}_heard": f"jeit.touch.reports.{verb}_sound_labels" for verb in ("draw", "report", "write")},
+_INDENTERS = {
+    **{old: f"{old}Indenter" for old in ("Bar", "DepthMap", "Disc", "Prism", "Revolved", "Ring")},
+    "Joined": "JoinedIndenters",
+    "Placed": "PlacedIndenter",
+    "ball": "ball_indenter",
 }
-MOVED = _RENAMED | {
+_SOUNDS = {
+    **{old: f"simulate_{old}" for old in ("calibration_taps", "pat", "room_sound", "sound_clips", "stroke", "tap")},
+    "quiet": "simulate_silence",
+    "tickle": "simulate_tickle",
+    "wind": "simulate_wind",
+}
+_MARKS = {"Marks": "MapMarks", "plot_pairs": "plot_position_errors"}
+_TRAINING = {"Objective": "TrainingObjective", "Plan": "TrainingPlan", "fit": "fit_network"}
+# For each package, the room whose names its renamed names are now, and the new name for each old one.
+_RENAMED = (
+    ("jeit.acoustic.plots", "jeit.acoustic", _MARKS),
+    ("jeit.acoustic.simulate", "jeit.acoustic", _SOUNDS),
+    ("jeit.plot", "jeit.acoustic", _MARKS),
+    ("jeit.plot", "jeit.touch", {"plot_heard": "plot_sound_labels"}),
+    ("jeit.report", "jeit.touch.reports", {f"{verb}_heard": f"{verb}_sound_labels" for verb in ("draw", "report")}),
+    ("jeit.report", "jeit.touch", {"write_heard": "write_sound_labels"}),
+    ("jeit.simulate", "jeit.acoustic", _SOUNDS),
+    ("jeit.simulate", "jeit.touch", _INDENTERS),
+    ("jeit.touch.attributes", "jeit.touch.attributes", {"least_told": "least_detected"}),
+    ("jeit.touch.kohonen", "jeit.touch", {"Schedule": "MapSchedule", "touches_told": "touches_reported"}),
+    ("jeit.touch.listening", "jeit.touch", {"Heard": "SoundLabels"}),
+    ("jeit.touch.networks", "jeit.touch", {"Preset": "NetworkPreset"}),
+    ("jeit.touch.simulate", "jeit.touch", _INDENTERS),
+    ("jeit.touch.simulate.contact", "jeit.touch", _INDENTERS),
+    ("jeit.touch.simulate.damage", "jeit.touch", {"mended": "mend_cut"}),
+    ("jeit.touch.training", "jeit.touch", _TRAINING),
+    ("jeit.touch.training", "jeit.touch.training", {"Trained": "TrainingResult"}),
+)
+MOVED = {f"{page}.{old}": f"{home}.{new}" for page, home, names in _RENAMED for old, new in names.items()} | {
     f"{page}.{name}": f"{home}.{name}"
     for page, homes in _MOVED.items()
     for home, names in homes.items()
@@ -109,5 +127,5 @@ def with_moved_names(page: str, find: Callable[[str], Any] | None = None) -> Cal
 def _forward(old: str, new: str) -> Any:
     home, _, name = new.rpartition(".")
     found = getattr(importlib.import_module(home), name)
-    warnings.warn(f"{old} is now {new}; the old name goes with the next version.", DeprecationWarning, stacklevel=3)
+    warnings.warn(f"{old} is now {new}; the old name is removed in version 1.1.", DeprecationWarning, stacklevel=3)
     return found

@@ -5,13 +5,22 @@ from .optimisation.design_space import DesignSpace
 from .optimisation.optimise import optimise_layout
 from .optimisation.surface_optimise import optimise_surface_layout
 from .optimisation.variables import Objective
+from .plots import (
+    plot_sensitivity_histograms,
+    plot_sensitivity_map,
+    plot_taxel_areas,
+    plot_taxels,
+    plot_travel,
+    plot_unrolled,
+)
+from .reports import write_improved_layout, write_layout_comparison, write_study_report
 from .scores import TouchPrior, layout_scores
 from .sensitivity import sensitivity_map
 from .skin.indentation import Bell, Hemisphere
 from .skin.skin import Skin
 from .skin.skin_file import describes_skin, read_described_skin
 from .skin.touch_grid import touch_grid, touches_away_from_the_edge
-from .study import open_results, read_study, run_study
+from .study import open_results, read_study, run_study, study_progress
 from .taxels import find_taxels
 
 __all__ = [
@@ -31,12 +40,22 @@ __all__ = [
     "open_results",
     "optimise_layout",
     "optimise_surface_layout",
+    "plot_sensitivity_histograms",
+    "plot_sensitivity_map",
+    "plot_taxel_areas",
+    "plot_taxels",
+    "plot_travel",
+    "plot_unrolled",
     "read_described_skin",
     "read_study",
     "run_study",
     "select_measurements",
     "sensitivity_map",
     "skin_response",
+    "study_progress",
     "touch_grid",
     "touches_away_from_the_edge",
+    "write_improved_layout",
+    "write_layout_comparison",
+    "write_study_report",
 ]

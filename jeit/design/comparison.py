@@ -47,6 +47,7 @@ def skin_response(
 
     **Arguments:**
 
+    - `skin`: the skin; `grid`: the touched positions.
     - `key`: random key for the k-means clustering of the taxels, from `jax.random.key`.
     - `touched`: conductivity changes due to the touches, by default `skin.touched_cells(grid.places)`.
     - `num_taxels`: number of taxels, by default 90 or the number of positions if that is smaller.
@@ -55,6 +56,13 @@ def skin_response(
 
     Raises `ValueError` for more taxels than positions, if `touched` and `grid` have different numbers of positions, and
     as `Skin.touched_cells` and `Skin.voltage_changes` do.
+
+    **Example:**
+
+    ```python
+    response = skin_response(sheet, touches, num_taxels=4, key=key)
+    print(response.sensitivity.minimum, response.taxels.mean_area)
+    ```
     """
     check_skin("skin", skin)
     check_grid(grid)
@@ -133,6 +141,13 @@ def compare_layouts(
 
     Raises `ValueError` for skins with different outlines and for a margin that leaves no position, before any response
     is computed, and as `skin_response` does.
+
+    **Example:**
+
+    ```python
+    comparison = compare_layouts(sheet, other, places=8, num_taxels=4)
+    write_layout_comparison(comparison, "out")
+    ```
     """
     check_skin("first", first)
     check_skin("second", second)

@@ -73,6 +73,7 @@ def improve_layout(
 
     **Arguments:**
 
+    - `layout`: the initial layout, with its outline.
     - `space`: the allowed layouts; by default all layouts on the skin whose centres are at least 8 mm apart.
     - `noise`: standard deviation of a voltage at 1 mA, volts.
     - `steps`, `starts`, `callback`: as in `optimise_layout`; `seed`: random seed of the starts.
@@ -82,6 +83,13 @@ def improve_layout(
     - `material`: thickness, conductivity and contact impedance, as in `Skin.create`.
 
     Raises `ValueError` if no layout satisfies the constraints, and as `Skin.create` and `optimise_layout` do.
+
+    **Example:**
+
+    ```python
+    improved = improve_layout(layout, DesignSpace(minimum_spacing=0.012), steps=1, num_points=400)
+    write_improved_layout(improved, "out")
+    ```
     """
     check_layout("layout", layout)
     report = progress or (lambda step: None)

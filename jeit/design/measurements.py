@@ -22,6 +22,13 @@ class Candidates(Module):
 
     **Fields**: `rows` (M, r): the whitened sensitivity f_i of each candidate; `weight` (r, r): the matrix V such that
     tr VC is the weighted sum of posterior variances for a covariance C of the r whitened coefficients.
+
+    **Example:**
+
+    ```python
+    candidates = Candidates.from_factor(changes.T, objective.prior.factor, noise=1e-4)
+    selection = select_measurements(candidates, 6)
+    ```
     """
 
     rows: Float[Array, "M r"]
@@ -154,15 +161,30 @@ def select_measurements(
     exchange: bool = True,
     max_swaps: int | None = None,
 ) -> Selection:
-    """Select `number` of the candidates so that their information is as large as possible.
+    """Select measurements of the candidates so that their information is as large as possible.
 
-    The selection is greedy: each step adds the candidate with the largest gain. With `exchange`, the best swap of a
-    chosen candidate for another one is then repeated until no swap increases the information (Fedorov's exchange) or
-    `max_swaps` (by default `number`) have been made. The result is deterministic. For "D", which is submodular, the
-    greedy set has at least 1 - 1/e of the maximum information; `information_bound` gives an upper bound for any set. A
-    greedy choice takes O(M r) operations, a swap O(N M r). Works under `jit` and `vmap`, for many layouts in one call.
+    The selection is greedy: each step adds the candidate with the largest gain. The result is deterministic. For "D",
+    which is submodular, the greedy set has at least 1 - 1/e of the maximum information; `information_bound` gives an
+    upper bound for any set. A greedy choice takes O(M r) operations, a swap O(N M r). Works under `jit` and `vmap`, for
+    many layouts in one call.
+
+    **Arguments:**
+
+    - `candidates`: the M candidate measurements.
+    - `number`: number N of measurements to select.
+    - `criterion`: "D", the information in nats, or "A", the decrease of the weighted posterior variance.
+    - `exchange`: whether the best swap of a chosen candidate for another one is then repeated until no swap increases
+      the information (Fedorov's exchange).
+    - `max_swaps`: maximum number of swaps, by default `number`.
 
     Raises `ValueError` if `number` is not from 1 to M, and for an unknown criterion.
+
+    **Example:**
+
+    ```python
+    selection = select_measurements(candidates, 6)
+    protocol = sheet.model.protocol.subset(selection.chosen)
+    ```
     """
     _check_number(candidates, number, criterion)
     limit = 0 if not exchange else number if max_swaps is None else max_swaps
@@ -192,12 +214,27 @@ def information_bound(
 
     If fractions of candidates may be measured, 0 ≤ w_i ≤ 1 with Σw_i = N, the information is a concave function of w,
     and each of its tangents is an upper bound. The Frank-Wolfe method maximises the information, and the lowest bound
-    of its iterations is returned; more `iterations` tighten it. The bound is tight if many candidates carry similar
-    information. It is loose if the noise is so low that every candidate adds information: fractions of all candidates
-    then carry more information than any small set.
+    of its iterations is returned. The bound is tight if many candidates carry similar information. It is loose if the
+    noise is so low that every candidate adds information: fractions of all candidates then carry more information than
+    any small set.
 
-    Boyd and Vandenberghe, Convex Optimization (2004), section 7.5. Raises `ValueError` if `number` is not from 1 to the
-    number of candidates, and for an unknown criterion.
+    Boyd and Vandenberghe, Convex Optimization (2004), section 7.5.
+
+    **Arguments:**
+
+    - `candidates`: the candidate measurements.
+    - `number`: number N of measurements in a set.
+    - `criterion`: "D" or "A", as in `select_measurements`.
+    - `iterations`: number of iterations; more of them tighten the bound.
+
+    Raises `ValueError` if `number` is not from 1 to the number of candidates, and for an unknown criterion.
+
+    **Example:**
+
+    ```python
+    bound = information_bound(candidates, 6)
+    print(select_measurements(candidates, 6).share, bound)
+    ```
     """
     _check_number(candidates, number, criterion)
     return _relaxed_bound(candidates, number, criterion, iterations)

@@ -43,6 +43,13 @@ class TouchPrior(Module):
     """Gaussian prior of the amplitudes of touches, with covariance SSᵀ.
 
     **Fields**: `factor`: S (n, r). Amplitudes are relative to the touches for which the voltages are computed.
+
+    **Example:**
+
+    ```python
+    prior = TouchPrior.create(touches.places, correlation=0.02)
+    covariance = prior.factor @ prior.factor.T
+    ```
     """
 
     factor: Float[Array, "n r"]
@@ -139,10 +146,23 @@ def layout_scores(
     measurement. A protocol of adjacent electrodes depends on their numbering, which becomes meaningless once the
     electrodes move.
 
-    **Arguments:** `conductivity`: sheet conductivity, siemens; `touches`, `prior`: touches of the sheet, and prior of
-    their amplitudes; `noise`: standard deviation of the channels (M,), or one value for all, volts; `temperature`:
-    temperature T of the smooth minimum. Raises `ValueError` if the model is not of a sheet, and for incompatible shapes
-    and invalid values.
+    **Arguments:**
+
+    - `model`: forward model of the sheet.
+    - `conductivity`: sheet conductivity, siemens.
+    - `touches`: touches of the sheet, as from `Skin.sheet_touches`.
+    - `prior`: prior of the amplitudes of the touches.
+    - `noise`: standard deviation of the channels (M,), or one value for all, volts.
+    - `temperature`: temperature T of the smooth minimum of the sensitivity.
+
+    Raises `ValueError` if the model is not of a sheet, and for incompatible shapes and invalid values.
+
+    **Example:**
+
+    ```python
+    pressed = sheet.sheet_touches(touches.places, Bell(2e-3))
+    scores = layout_scores(sheet.model, sheet.model_conductivity, pressed, prior=objective.prior, noise=1e-4)
+    ```
     """
     conductivity = check_conductivity(model.mesh, conductivity)
     if conductivity.ndim == 3 or jnp.iscomplexobj(conductivity):

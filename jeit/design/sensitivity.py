@@ -92,11 +92,26 @@ def sensitivity_map(
     contrast: float = CONTRAST,
     linear: bool = False,
 ) -> SensitivityMap:
-    """Compute the sensitivity map of a skin from the voltage changes due to touches at every position of `grid`.
+    """Compute the sensitivity map of a skin from the voltage changes due to touches at every position of a grid.
 
-    `indentation`: shape of the touch, by default the unit deformation `Bell()` of Park et al. 2022. `thickness` (for a
-    sheet) and `contrast` as in `touched_cells`, `conductivity` and `linear` as in `touch_changes`. Raises `ValueError`
-    as these functions do.
+    **Arguments:**
+
+    - `model`: forward model of the skin.
+    - `conductivity`: conductivity of the model, S/m (2-D: S).
+    - `grid`: the touched positions.
+    - `indentation`: shape of the touch, by default the unit deformation `Bell()` of Park et al. 2022.
+    - `thickness`: thickness of the layer that a sheet represents, metres.
+    - `contrast`: conductivity of the touched part divided by that of the rest.
+    - `linear`: whether to compute linearised instead of exact voltage changes.
+
+    Raises `ValueError` for a model, a grid and a thickness that do not fit together, and for invalid values.
+
+    **Example:**
+
+    ```python
+    theta = sensitivity_map(sheet.model, sheet.model_conductivity, touches, thickness=0.01)
+    print(theta.minimum, theta.mean)  # volts
+    ```
     """
     check_model(model)
     check_grid(grid)

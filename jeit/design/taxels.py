@@ -137,6 +137,8 @@ def find_taxels(
 
     **Arguments:**
 
+    - `changes`: voltage changes (n, m) due to the same touch at each of n positions, volts.
+    - `places`: the positions (n, 2), on a curved skin (n, 3), metres.
     - `cell_area`: area of the part of the skin that each position represents, m²; one value for all, or (n,).
     - `num_taxels`: number k of clusters.
     - `threshold`: minimum cosine, between 0 and 1.
@@ -148,6 +150,13 @@ def find_taxels(
 
     Raises `ValueError` for shapes that disagree, changes that are not finite or all zero, and lengths and areas whose
     units do not fit together.
+
+    **Example:**
+
+    ```python
+    taxels = find_taxels(response.sensitivity.changes, touches.places, touches.cell_area, num_taxels=4, key=key)
+    print(1e4 * taxels.mean_area)  # cm²
+    ```
     """
     check_key(key)
     _check_arguments(changes, places, cell_area, num_taxels, threshold)

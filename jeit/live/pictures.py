@@ -19,6 +19,13 @@ class LiveFrame:
     **Fields**: `number`: position in order of arrival, from 0; `second`: time since the session began, seconds;
     `arrived`: `time.monotonic()` when its last byte was read; `values`: voltages (M,), volts, NaN for a channel without
     a reading, or the text of a line that is no frame.
+
+    **Example:**
+
+    ```python
+    frame = LiveFrame(0, second=0.0, arrived=0.0, values=still[0])
+    picture = view.picture(frame)
+    ```
     """
 
     number: int
@@ -34,6 +41,13 @@ class Marker:
     **Fields**: `x`, `y`: metres; `label`: text beside it, such as "2.1 N" or "stroke 93 %"; `radius`: radius of the
     region that holds the place with a probability of 68 %, metres, NaN if unknown; `track`: number of the contact that
     it belongs to, so that its path can be drawn, or None.
+
+    **Example:**
+
+    ```python
+    marker = Marker(0.02, -0.01, label="2.1 N", radius=3e-3)
+    picture = Picture(None, markers=(marker,))
+    ```
     """
 
     x: float
@@ -50,6 +64,13 @@ class Picture:
     **Fields**: `pixels` (H, W): float32 image in the scene's unit, row 0 at the largest y, NaN outside the body; None
     for a refused frame or a view without an image; `markers`: estimated places; `status`, `reason`: as in
     `jeit.inverse.streaming.FrameImage`; `events`: sentences for the page's list of events, such as a named gesture.
+
+    **Example:**
+
+    ```python
+    refused = Picture(None, reason="The frame has 100 channels; the reference has 208.")
+    print(view.picture(frame).pixels.shape, refused.reason)
+    ```
     """
 
     pixels: Float[np.ndarray, "H W"] | None
@@ -67,6 +88,13 @@ class Scene:
     colours are centred on zero; `extent`: x of left and right edge, y of lower and upper edge of the image, metres;
     `outline`: closed curves of the body, metres, each (n, 2); `electrodes`: a curve (n, 2) of each electrode, metres;
     `names`: their names; `channels`: a name for each channel (M,), such as "1-2 → 3-4"; `notes`: remarks for the user.
+
+    **Example:**
+
+    ```python
+    scene = Scene("tank", "conductivity change", "S", True, (-0.1, 0.1, -0.1, 0.1), outline=[])
+    print(scene.title, view.scene.unit)
+    ```
     """
 
     title: str
@@ -82,7 +110,17 @@ class Scene:
 
 
 class AbstractView(abc.ABC):
-    """A kind of view: turns frames into pictures, one after another, in the order of their numbers."""
+    """Base class of views, which turn frames into pictures, one after another, in the order of their numbers.
+
+    **Attributes**: `scene`: what a page needs to know of the view before the first picture.
+
+    **Example:**
+
+    ```python
+    print(isinstance(view, AbstractView), view.scene.quantity)
+    print(view.picture(frame).status)
+    ```
+    """
 
     scene: Scene
 

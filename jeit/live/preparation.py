@@ -29,8 +29,18 @@ _LOOK = 0.3
 
 
 class Prepared(NamedTuple):
-    """**Fields**: `source`, `view`: what `jeit.live.frames` and `jeit.live.Session` take; `reference`: the measurement
-    of the undisturbed sensor, None if only its frames are known."""
+    """A source, and the view of its sensor, as from `prepare`.
+
+    **Fields**: `source`, `view`: what `jeit.live.frames` and `jeit.live.Session` take; `reference`: the measurement of
+    the undisturbed sensor, None if only its frames are known.
+
+    **Example:**
+
+    ```python
+    source, view, reference = prepare("demo", settings=settings)
+    print(reference.num_channels)
+    ```
+    """
 
     source: AbstractSource
     view: AbstractView
@@ -52,19 +62,31 @@ def prepare(
 ) -> Prepared:
     """Open a source, and prepare the view of its sensor, by what is known of it.
 
+    Without `model` and `calibration`, the view is the change of conductivity (`ConductivityView`).
+
+    **Arguments:**
+
     - `source`: as in `open_source`; with a `model`, a recording is read as by `jeit touch predict`, and with a
       `calibration` as by `jeit locate`.
-    - `reference`: measured file of the undisturbed sensor, which says protocol and electrodes. Without it, the frames
-      of the first `untouched` seconds are the reference, and `description`, a TOML file or the name of a bundled one,
-      says what they are.
+    - `reference`: measured file of the undisturbed sensor, which says protocol and electrodes.
+    - `description`: a TOML file or the name of a bundled one, which says what the frames are without a `reference`.
     - `model`: file or folder of `jeit touch fit`, `jeit touch gestures` or `jeit learn image`: places and forces
       (`LearntSkinView`), gestures (`GestureView`, which needs a description) or depth (`DepthView`).
     - `calibration`: file of `jeit calibrate-microphones`: loss maps and places of sounds (`SoundView`).
-    - neither: the change of conductivity (`ConductivityView`), or with `contacts` the contacts in it (`ContactsView`),
-      imaged with `settings`.
-    - `rate`: frames/s of a recording, and for gestures. `progress` is called with each step as it begins.
+    - `contacts`: whether to find the contacts in the change of conductivity (`ContactsView`).
+    - `settings`: how changes of conductivity are imaged.
+    - `rate`: frames/s of a recording, and for gestures.
+    - `untouched`: time from the beginning, seconds, whose frames are the reference if none is given.
+    - `progress`: called with each step as it begins.
 
     Raises `ValueError` where something is missing or does not fit, and as the views and readers.
+
+    **Example:**
+
+    ```python
+    source, view, reference = prepare("demo", contacts=True, settings=settings)
+    print(next(frames(source, view)).picture.markers)
+    ```
     """
     report = progress or (lambda step: None)
     if calibration is not None:

@@ -39,11 +39,24 @@ _BINARY = getattr(os, "O_BINARY", 0)  # of Windows, which else changes line ends
 
 
 class Recorder:
-    """Writes recordings below `folder`, each into a new folder named by date and time.
+    """Writes recordings, each into a new folder named by date and time.
 
-    `reference`: a measurement of the undisturbed sensor, which is written beside the frames, with a description that
-    reads them. Frames are written by a thread of their own. If the disk is full, frames wait in memory, 64 MB of them,
-    and are written once there is room again; the file ends with a whole frame at any time.
+    Frames are written by a thread of their own. If the disk is full, frames wait in memory, 64 MB of them, and are
+    written once there is room again; the file ends with a whole frame at any time.
+
+    **Arguments:**
+
+    - `folder`: the folder below which recordings are written.
+    - `reference`: a measurement of the undisturbed sensor, which is written beside the frames, with a description that
+      reads them.
+
+    **Example:**
+
+    ```python
+    recorder = Recorder("recordings", reference=reference)
+    for result in frames(simulated_tank(100.0, limit=20), view, recorder=recorder):
+        print(result.frame.number)
+    ```
     """
 
     def __init__(self, folder: str | Path, *, reference: Measurement | None = None):

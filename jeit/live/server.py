@@ -26,11 +26,22 @@ def serve(
 ) -> None:
     """Serve the page of a started session until the session ends, or until Ctrl-C.
 
-    `host`, `port`: where to listen; port 0 takes a free one. `token`: what the address must hold; one is made for a
-    host that other machines reach. `opened` is called with the page's address once it can be opened. `stay`: stay until
-    Ctrl-C when the session has ended, so that its last minute can be looked at.
+    **Arguments:**
+
+    - `session`: the session.
+    - `host`, `port`: where to listen; port 0 takes a free one.
+    - `token`: what the address must hold; one is made for a host that other machines reach.
+    - `opened`: called with the page's address once it can be opened.
+    - `stay`: whether to stay until Ctrl-C when the session has ended, so that its last minute can be looked at.
 
     Raises `OSError` if the address is taken or not this machine's, and `ImportError` without the extra `live`.
+
+    **Example:**
+
+    ```python
+    with Session(simulated_tank(100.0, limit=20), view) as session:
+        serve(session, opened=print)  # with uvicorn
+    ```
     """
     need_extra("live", "a page in the browser")
     import uvicorn

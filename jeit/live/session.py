@@ -36,8 +36,18 @@ _LABEL, _SKIPPED = 200, 30.0
 
 @dataclass(frozen=True)
 class Result:
-    """**Fields**: `frame`; `picture`: what the view made of it; `latency`: time from the frame's last byte until the
-    picture was made, seconds."""
+    """A frame, and what was made of it.
+
+    **Fields**: `frame`: the frame; `picture`: what the view made of it; `latency`: time from the frame's last byte
+    until the picture was made, seconds.
+
+    **Example:**
+
+    ```python
+    result = next(frames(simulated_tank(100.0, limit=20), view))
+    print(isinstance(result, Result), result.latency)
+    ```
+    """
 
     frame: LiveFrame
     picture: Picture
@@ -47,10 +57,24 @@ class Result:
 class Session:
     """A source whose frames are recorded and turned into pictures by a view, until the source ends or `stop`.
 
-    One thread reads; one images, and leaves frames out of the view, never of the recording, when it falls behind.
-    `recorder`: where to record once `record(True)` is called. `history`: seconds for which results are kept; these take
-    128 MB at most. `reference`: a measurement of the undisturbed sensor, by which the quality of frames is judged; by
-    default that of the recorder. Use it as a context manager, or call `start` and `stop`.
+    One thread reads; one images, and leaves frames out of the view, never of the recording, when it falls behind. Use
+    it as a context manager, or call `start` and `stop`.
+
+    **Arguments:**
+
+    - `source`: the source.
+    - `view`: the view of its frames.
+    - `recorder`: where to record once `record(True)` is called.
+    - `history`: seconds for which results are kept; these take 128 MB at most.
+    - `reference`: a measurement of the undisturbed sensor, by which the quality of frames is judged; by default that of
+      the recorder.
+
+    **Example:**
+
+    ```python
+    with Session(simulated_tank(100.0, limit=20), view) as session:
+        print(session.newest(after=-1, timeout=5.0))
+    ```
     """
 
     def __init__(
@@ -376,7 +400,19 @@ def frames(source: AbstractSource, view: AbstractView, *, recorder: Recorder | N
     """Yield the newest result of a view each time the program asks, until the source has ended.
 
     Frames that arrive while the program is busy are skipped; their events are added before those of the next result.
-    `recorder`: where all frames are recorded.
+
+    **Arguments:**
+
+    - `source`: the source.
+    - `view`: the view of its frames.
+    - `recorder`: where all frames are recorded.
+
+    **Example:**
+
+    ```python
+    for result in frames(simulated_tank(100.0, limit=20), view):
+        print(result.frame.second, result.picture.markers)
+    ```
     """
     session, last = Session(source, view, recorder=recorder, history=_SKIPPED), -1
     if recorder is not None:

@@ -32,8 +32,26 @@ _FINGER, _HALF, _OFF, _STRENGTH, _STROKE, _PAUSE, _SPAN, _TURNED = 0.008, 0.03, 
 class SimulatedSensor(AbstractSource):
     """Frames of a simulated sensor whose state repeats itself, with Gaussian noise.
 
-    **Attributes**: `reference`: a measurement of the undisturbed sensor; `states` (K, M): voltages of the states of a
-    period without noise, volts; `period`: seconds after which all is repeated.
+    **Arguments:**
+
+    - `name`: name of the sensor.
+    - `reference`: a measurement of the undisturbed sensor.
+    - `rest`: voltages (M,) of the undisturbed sensor, volts.
+    - `changes`: what the K states of a period add to them, (K, M), volts.
+    - `places`: where the rod or finger is in these states, (K, 2), metres, NaN for nowhere.
+    - `period`: seconds after which all is repeated.
+    - `rate`: frames/s.
+    - `limit`: number of frames after which the source ends; by default it does not.
+    - `seed`: random seed of the noise.
+
+    **Attributes**: `reference`; `states` (K, M): voltages of the states of a period without noise, volts; `period`.
+
+    **Example:**
+
+    ```python
+    changes, places = np.zeros((1, still.shape[1])), np.full((1, 2), np.nan)
+    source = SimulatedSensor("at rest", reference, still.mean(axis=0), changes, places, period=1.0, limit=10)
+    ```
     """
 
     def __init__(
@@ -49,9 +67,6 @@ class SimulatedSensor(AbstractSource):
         limit: int | None = None,
         seed: int = 0,
     ):
-        """`rest` (M,): voltages of the undisturbed sensor; `changes` (K, M): what the K states of a period add to
-        them; `places` (K, 2): where the rod or finger is in them, metres, NaN for nowhere. `rate`: frames/s; `limit`:
-        number of frames after which the source ends; `seed`: of the noise."""
         super().__init__(name)
         self.reference, self.rate, self.limit, self.period = reference, float(rate), limit, period
         self.states, self._places = rest + changes, places
@@ -80,10 +95,21 @@ class SimulatedSensor(AbstractSource):
 
 
 def simulated_tank(rate: float = 60.0, *, limit: int | None = None, seed: int = 0) -> SimulatedSensor:
-    """A round tank, a sheet 200 mm across with 16 electrodes and the adjacent protocol (208 voltages), in which an
-    insulating rod, 12 mm in radius, goes round at radius 50 mm, anticlockwise from the x axis, in 8 s.
+    """A simulated round tank, a sheet 200 mm across with 16 electrodes and the adjacent protocol (208 voltages), in
+    which an insulating rod, 12 mm in radius, goes round at radius 50 mm, anticlockwise from the x axis, in 8 s.
 
-    Arguments as for `SimulatedSensor`.
+    **Arguments:**
+
+    - `rate`: frames/s.
+    - `limit`: number of frames after which the source ends; by default it does not.
+    - `seed`: random seed of the noise.
+
+    **Example:**
+
+    ```python
+    source = simulated_tank(100.0, limit=20)
+    print(len(list(source)), source.truth(0.5))
+    ```
     """
     tank = RoundSkin(radius=0.1, electrode_width=0.02, contact_impedance=1e-3, conductivity=0.01, num_points=_NODES)
     model = tank.model()
@@ -101,8 +127,22 @@ def simulated_tank(rate: float = 60.0, *, limit: int | None = None, seed: int = 
 
 
 def simulated_skin(rate: float = 60.0, *, limit: int | None = None, seed: int = 0) -> SimulatedSensor:
-    """A round skin 100 mm across (`jeit.data.RoundSkin`), over which a finger strokes 60 mm every 1.2 s, each time in
-    another direction; arguments as for `SimulatedSensor`."""
+    """A simulated round skin 100 mm across (`jeit.data.RoundSkin`), over which a finger strokes 60 mm every 1.2 s, each
+    time in another direction.
+
+    **Arguments:**
+
+    - `rate`: frames/s.
+    - `limit`: number of frames after which the source ends; by default it does not.
+    - `seed`: random seed of the noise.
+
+    **Example:**
+
+    ```python
+    source = simulated_skin(100.0, limit=20)
+    print(len(list(source)), source.truth(0.5))
+    ```
+    """
     skin = RoundSkin(num_points=_NODES)
     model = skin.model()
     cells = centroids(model.mesh)

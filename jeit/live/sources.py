@@ -25,11 +25,22 @@ _USUAL_RATE = 10.0
 
 
 class AbstractSource(abc.ABC):
-    """A source of frames, which is iterated once, by one thread; `close` may be called by any thread.
+    """Base class of sources of frames. A source is iterated once, by one thread; `close` may be called by any thread.
 
-    **Attributes**: `name`: what the user gave; `connection`: "connected", "waiting: …" with the reason, or "ended";
-    `begun`: `time.monotonic()` of second 0; `messages`: the last 50 reports about the connection, as pairs of second
-    and sentence.
+    **Arguments:**
+
+    - `name`: what the user gave, for messages.
+
+    **Attributes**: `name`; `connection`: "connected", "waiting: …" with the reason, or "ended"; `begun`:
+    `time.monotonic()` of second 0; `messages`: the last 50 reports about the connection, as pairs of second and
+    sentence.
+
+    **Example:**
+
+    ```python
+    source = open_source("demo")
+    print(isinstance(source, AbstractSource), source.connection)
+    ```
     """
 
     def __init__(self, name: str):
@@ -99,15 +110,26 @@ def open_source(
     """The source that a text names.
 
     - "-": lines on standard input. "serial:PORT@BAUD": lines of a serial device. "tcp:HOST:PORT": lines of a server.
-    - a folder: files that an instrument writes into it, a frame or more in each; those that are there already are
-      left out, unless a `rate` is given. A file: a recording, played at its own rate.
+    - a folder: files that an instrument writes into it, a frame or more in each; those that are there already are left
+      out, unless a `rate` is given. A file: a recording, played at its own rate.
     - "demo": a simulated tank in which a rod goes round; "demo:skin": a simulated skin that is stroked.
 
-    `rate`: frames/s of a recording or of lines that have all arrived already. `description`, `reference`: what numbers
-    mean, as `description` and `like` of `jeit.data.read`.
+    **Arguments:**
+
+    - `text`: the text.
+    - `rate`: frames/s of a recording or of lines that have all arrived already.
+    - `description`: what numbers mean, as `description` of `jeit.data.read`.
+    - `reference`: a measurement of the undisturbed sensor, as `like` of `jeit.data.read`.
 
     Raises `ValueError` for a text that names no source and for a rate that is not positive, and as `jeit.data.read` for
     a recording.
+
+    **Example:**
+
+    ```python
+    source = open_source("demo:skin", rate=100.0)
+    print(next(iter(source)).values.shape)
+    ```
     """
     if rate is not None and not (is_number(rate) and 0 < rate < float("inf")):
         raise ValueError(f"rate must be positive, frames in a second; it is {describe(rate)}.")

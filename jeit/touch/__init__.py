@@ -1,9 +1,10 @@
 """Estimate from frames where, how hard and how a skin is touched.
 
-Packages: `contacts` (detection of contacts in images, tracking, and their loads in newtons), `learnt` (skins that learn
-from recorded presses, without a model), `kohonen` (self-organising maps of frames), `gestures` (touches of a stream,
-and their gestures), `health` (cuts, failing electrodes, repair), `attributes` (resolution of a skin), `training`
-(training of networks, and files of trained networks), `networks` (networks that estimate maps of indentation depth).
+There are functions and classes for contacts (detection in images, tracking, loads in newtons), learnt skins (from
+recorded presses, without a model), self-organising maps, gestures, the health of a skin (cuts, failing electrodes,
+repair), its attributes (resolution), sounds of touches, networks that estimate maps of indentation depth, the training
+of networks, and the simulation of presses, people and damage. Results are drawn by `plot_…`. What users need of the
+subpackages is exported here.
 
 `LogitBoostClassifier`, and scikit-learn with it, is imported when it is first used.
 """

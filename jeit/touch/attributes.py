@@ -198,6 +198,13 @@ class TouchAttributes(NamedTuple):
     distinguished in half of the trials, metres; `area`: relation of estimated to true contact areas; `rise` and `fall`:
     rise and fall time of the response to a touch that begins and ends abruptly, seconds, None if no such touch was
     recorded.
+
+    **Example:**
+
+    ```python
+    attributes = touch_attributes(key, pressed, linear, finder)
+    print(isinstance(attributes, TouchAttributes), attributes.localisation.mean)
+    ```
     """
 
     load: Float[np.ndarray, " k"]
@@ -222,15 +229,33 @@ def touch_attributes(
     recording: tuple[ArrayLike, ArrayLike] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> TouchAttributes:
-    """Measure a real or simulated skin, by `linear` images of its changes and the contacts that `finder` finds.
+    """Measure the attributes of touch of a real or simulated skin.
 
-    `press`: a function of n touches, each a list of simultaneous discs, empty for an untouched skin, that returns their
-    frames (n, M), volts; it commands a robot with discs, or simulates a skin. Discs have a `diameter`, metres, and
-    press with a `load`, newtons; some touches have other diameters, or a quarter to four times the load. Touches are
-    near the `middle` (x, y), for localisation anywhere within the radius `within` of it, metres. `recording`: times
-    (T,), seconds, and frames (T, M), volts, of a touch that begins and ends abruptly. `key`: draws places and
-    directions; `progress`: is called with what is being measured. Raises `ValueError` for an invalid key, images or
-    finder, sizes and loads that are not positive, frames of another shape, and a skin on which no touch is found.
+    Discs press on the skin, some of them with other diameters, or with a quarter to four times the load.
+
+    **Arguments:**
+
+    - `key`: random key that draws places and directions.
+    - `press`: function of n touches, each a list of simultaneous discs, empty for an untouched skin, that returns their
+      frames (n, M), volts; it commands a robot with discs, or simulates a skin.
+    - `linear`: computes images of the changes.
+    - `finder`: finds the contacts in them.
+    - `middle`: middle (x, y) of the region in which touches are, metres.
+    - `within`: radius of this region, metres.
+    - `load`: usual load, newtons.
+    - `diameter`: usual diameter of a disc, metres.
+    - `recording`: times (T,), seconds, and frames (T, M), volts, of a touch that begins and ends abruptly.
+    - `progress`: called with what is being measured.
+
+    Raises `ValueError` for an invalid key, images or finder, sizes and loads that are not positive, frames of another
+    shape, and a skin on which no touch is found.
+
+    **Example:**
+
+    ```python
+    attributes = touch_attributes(key, pressed, linear, finder)
+    print(attributes.localisation.mean, attributes.two_points)  # metres
+    ```
     """
     check_key(key)
     if not callable(press):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jeit.acoustic.localisation.pixels import brightness, overlay
+from jeit.acoustic.localisation.pixels import map_brightness, overlay_images
 
 
 def maps():
@@ -14,7 +14,7 @@ def maps():
 
 def test_brightness_of_a_likelihood_is_relative_to_the_best_pixel():
     values = maps()
-    shown = brightness(values)
+    shown = map_brightness(values)
     best = np.nanmin(values, axis=(1, 2))
     expected = np.nan_to_num(np.exp(-(values - best[:, None, None])))
     np.testing.assert_allclose(shown, expected, rtol=1e-13)
@@ -26,7 +26,7 @@ def test_brightness_of_the_papers_loss_falls_to_1_in_e_at_its_share():
     """Whatever the unit of the loss: twenty pixels of a hundred are brighter than 1/e."""
     values = np.random.default_rng(1).permutation(100.0 + np.arange(100)).reshape(1, 10, 10)
     for scale in (1e-20, 1.0, 1e20):
-        shown = brightness(scale * values, method="consistency", share=0.2)
+        shown = map_brightness(scale * values, method="consistency", share=0.2)
         assert (shown > np.exp(-1) * (1 + 1e-9)).sum() == 20
         np.testing.assert_allclose(shown[0], np.exp(-(values[0] - 100) / 20), rtol=1e-9)
 
@@ -35,7 +35,7 @@ def test_brightness_of_nothing():
     """A frame that has no map is dark; one that is flat is bright all over."""
     values = np.stack([np.full((4, 4), np.nan), np.full((4, 4), 3.0)])
     for method in ("likelihood", "consistency"):
-        shown = brightness(values, method=method)
+        shown = map_brightness(values, method=method)
         assert (shown[0] == 0).all()
         assert (shown[1] == 1).all()
 
@@ -51,7 +51,7 @@ def test_brightness_of_nothing():
 )
 def test_bad_maps(values, options, message):
     with pytest.raises(ValueError, match=message):
-        brightness(values, **options)
+        map_brightness(values, **options)
 
 
 def test_overlay_fades_with_age():
@@ -60,7 +60,7 @@ def test_overlay_fades_with_age():
     images = np.zeros((4, 2, 2))
     for number in range(4):
         images[number, number // 2, number % 2] = 1.0 - 0.1 * number
-    seen = overlay(images, times, time_constant=0.2)
+    seen = overlay_images(images, times, time_constant=0.2)
     for number in range(4):
         for other in range(4):
             age = times[number] - times[other]
@@ -70,24 +70,26 @@ def test_overlay_fades_with_age():
 
 def test_a_source_at_rest_does_not_burn_in():
     images = np.full((5, 2, 3), 0.6)
-    np.testing.assert_allclose(overlay(images, np.arange(5.0)), images)
+    np.testing.assert_allclose(overlay_images(images, np.arange(5.0)), images)
     brighter = images * np.array([1, 0.1, 0.1, 1.2, 0.1])[:, None, None]
     expected = [0.6, 0.6 * np.exp(-1), 0.6 * np.exp(-2), 0.72, 0.72 * np.exp(-1)]
-    np.testing.assert_allclose(overlay(brighter, np.arange(5.0), time_constant=1.0)[:, 1, 1], expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        overlay_images(brighter, np.arange(5.0), time_constant=1.0)[:, 1, 1], expected, rtol=1e-12
+    )
 
 
 def test_frames_without_a_map_are_dark_and_let_the_old_fade():
     images = np.stack([np.full((2, 2), 0.8), np.full((2, 2), np.nan)])
     kept = images.copy()
-    np.testing.assert_allclose(overlay(images, [1.0, 2.0], time_constant=0.5)[1], 0.8 * np.exp(-2), rtol=1e-12)
+    np.testing.assert_allclose(overlay_images(images, [1.0, 2.0], time_constant=0.5)[1], 0.8 * np.exp(-2), rtol=1e-12)
     np.testing.assert_array_equal(images, kept)
 
 
 def test_irregular_times_do_not_matter():
     """A frame in between that is dark changes nothing later."""
     image = np.random.default_rng(2).random((1, 3, 3))
-    direct = overlay(np.concatenate([image, 0 * image]), [0.0, 0.7])[-1]
-    through = overlay(np.concatenate([image, 0 * image, 0 * image]), [0.0, 0.11, 0.7])[-1]
+    direct = overlay_images(np.concatenate([image, 0 * image]), [0.0, 0.7])[-1]
+    through = overlay_images(np.concatenate([image, 0 * image, 0 * image]), [0.0, 0.11, 0.7])[-1]
     np.testing.assert_allclose(direct, through, rtol=1e-12)
 
 
@@ -106,4 +108,4 @@ def test_irregular_times_do_not_matter():
 )
 def test_bad_overlays(images, times, constant, message):
     with pytest.raises(ValueError, match=message):
-        overlay(images, times, time_constant=constant)
+        overlay_images(images, times, time_constant=constant)

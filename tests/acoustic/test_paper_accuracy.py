@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jeit.acoustic import Intensities, Taps, calibrate_microphones, locate, tap_intensities
-from jeit.acoustic.simulate import SoundingSkin, calibration_taps
+from jeit.acoustic.simulate import SoundingSkin, simulate_calibration_taps
 from jeit.layout import grid
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
@@ -19,11 +19,11 @@ def trial():
     """Calibrated on 13 × 13 places every 15 mm, three taps each; tried on 13 × 13 every 12.5 mm, ten bursts each."""
     skin = SoundingSkin(jax.random.key(0))
     place = np.asarray(skin.microphones)
-    known = calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 13, 13), repeats=3)
+    known = simulate_calibration_taps(skin, jax.random.key(1), grid(0.18, 0.18, 13, 13), repeats=3)
     calibration = calibrate_microphones(
         Taps(place, OUTLINE, known.positions, samples=known.samples, rate=known.rate)
     ).calibration
-    tried = calibration_taps(skin, jax.random.key(2), grid(0.15, 0.15, 13, 13), repeats=BURSTS)
+    tried = simulate_calibration_taps(skin, jax.random.key(2), grid(0.15, 0.15, 13, 13), repeats=BURSTS)
     each = tap_intensities(Taps(place, OUTLINE, tried.positions, samples=tried.samples, rate=tried.rate))
     heard = Intensities(
         np.arange(169.0),

@@ -13,7 +13,14 @@ from jeit.acoustic.calibration.calibrate import CalibrationFit
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.localisation.locations import Locations
 from jeit.acoustic.noise import IntensityNoise
-from jeit.acoustic.plots import Marks, plot_error_curve, plot_loss_map, plot_pairs, plot_receptive_fields, plot_track
+from jeit.acoustic.plots import (
+    MapMarks,
+    plot_error_curve,
+    plot_loss_map,
+    plot_position_errors,
+    plot_receptive_fields,
+    plot_track,
+)
 from jeit.acoustic.plots.surface_view import FOUND
 from jeit.acoustic.surface import make_surface
 from jeit.acoustic.tracking import Touch, Track
@@ -172,7 +179,7 @@ def test_a_loss_map_lies_bottom_row_first_and_is_least_at_the_source(ax):
     values = np.full((20, 40), 50.0)
     values[0, 0], values[5, 30] = np.nan, 2.0
     place, spread = np.array([0.05, -0.04]), np.diag([4e-6, 1e-6])
-    marks = Marks([0.052, -0.041], estimate=place, covariance=spread)
+    marks = MapMarks([0.052, -0.041], estimate=place, covariance=spread)
     assert plot_loss_map(values, known.microphone_array, received=np.linspace(0, 1, 9), marks=marks, ax=ax) is ax
     (drawn,) = ax.images
     assert list(drawn.get_extent()) == pytest.approx([-0.1, 0.1, -0.1, 0.1])
@@ -214,10 +221,10 @@ def test_the_papers_loss_is_in_decibels(ax):
         ("method must be", {"method": "loudest"}),
         ("received has shape", {"received": np.ones(8)}),
         ("microphones has shape", {"microphones": np.ones((9, 3))}),
-        ("truth has shape", {"marks": Marks(truth=[0.0, 0.0, 0.0])}),
-        ("estimate has shape", {"marks": Marks(estimate=0.0)}),
-        ("give estimate too", {"marks": Marks(covariance=np.eye(2))}),
-        ("covariance has shape", {"marks": Marks(estimate=[0.0, 0.0], covariance=np.eye(3))}),
+        ("truth has shape", {"marks": MapMarks(truth=[0.0, 0.0, 0.0])}),
+        ("estimate has shape", {"marks": MapMarks(estimate=0.0)}),
+        ("give estimate too", {"marks": MapMarks(covariance=np.eye(2))}),
+        ("covariance has shape", {"marks": MapMarks(estimate=[0.0, 0.0], covariance=np.eye(3))}),
     ],
 )
 def test_loss_maps_refuse_what_makes_no_sense(match, change, ax):
@@ -231,7 +238,7 @@ def test_pairs_are_joined_and_their_error_is_the_title(ax):
     found[0] += [3e-3, 4e-3]
     found[1] += [0.0, 1e-3]
     found[3] = np.nan
-    assert plot_pairs(true, found, [[0.0, 0.0]], OUTLINE, ax=ax) is ax
+    assert plot_position_errors(true, found, [[0.0, 0.0]], OUTLINE, ax=ax) is ax
     assert ax.get_title() == "2.0 ± 2.2 mm"  # of 5, 1 and 0 mm: √(14 / 3)
     (lines,) = [c for c in ax.collections if isinstance(c, LineCollection)]
     np.testing.assert_allclose(lines.get_segments(), np.stack([true, found], axis=1)[:3])
@@ -244,9 +251,9 @@ def test_pairs_are_joined_and_their_error_is_the_title(ax):
 def test_pairs_refuse_what_does_not_match(ax):
     place = np.zeros((4, 2))
     with pytest.raises(ValueError, match="found 3"):
-        plot_pairs(place, place[:3], place, OUTLINE, ax=ax)
+        plot_position_errors(place, place[:3], place, OUTLINE, ax=ax)
     with pytest.raises(ValueError, match="true has shape"):
-        plot_pairs(place.T[:, :3], place, place, OUTLINE, ax=ax)
+        plot_position_errors(place.T[:, :3], place, place, OUTLINE, ax=ax)
 
 
 def test_a_path_is_coloured_by_time_from_onset_to_offset(ax):
@@ -418,7 +425,7 @@ def test_figures_are_made_where_no_axes_are_given():
     drawn = [
         plot_receptive_fields(fitted()),
         plot_loss_map(np.eye(3), calibration()),
-        plot_pairs(stroke(4), stroke(4), [[0.0, 0.0]], OUTLINE),
+        plot_position_errors(stroke(4), stroke(4), [[0.0, 0.0]], OUTLINE),
         plot_track(*recorded(stroke()), calibration()),
         plot_error_curve([0.0, 1.0], {"likelihood": [1e-3, 2e-3]}),
     ]

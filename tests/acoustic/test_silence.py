@@ -11,7 +11,7 @@ from jeit.acoustic import Calibration, IntensitySettings, MicrophoneArray, Recor
 from jeit.acoustic.decay import InverseSquare
 from jeit.acoustic.localisation.calibrated_intensities import calibrated_intensities
 from jeit.acoustic.noise import IntensityNoise
-from jeit.acoustic.simulate import SoundingSkin, quiet
+from jeit.acoustic.simulate import SoundingSkin, simulate_silence
 from jeit.acoustic.simulate.propagation import expected_power, transfer
 from jeit.acoustic.surface import make_surface
 from jeit.layout import grid
@@ -39,7 +39,7 @@ def heard_before(skin):
         slope, constant = np.linalg.lstsq(np.stack([r2 * f, f], axis=1), np.ones(len(f)), rcond=None)[0]
         models.append((1 / slope, constant / slope))
     a, b = np.transpose(models)
-    silent = intensities(recorded(skin, quiet(skin, jax.random.key(1)).samples))
+    silent = intensities(recorded(skin, simulate_silence(skin, jax.random.key(1)).samples))
     noise = IntensityNoise.create(9, floor=silent.floor, freedom=silent.freedom, relative=0.3)
     microphone_array = MicrophoneArray(
         jnp.asarray(MICROPHONES[9]), make_surface(OUTLINE), InverseSquare(jnp.asarray(a), jnp.asarray(b)), noise
@@ -59,12 +59,12 @@ def vibration(skin):
     phases = np.exp(2j * np.pi * np.random.default_rng(1).random(len(tones)))
     waves = np.exp(2j * np.pi * tones[:, None] * times)
     heard = np.real(np.asarray(transfer(skin, jnp.asarray(tones), jnp.asarray(PLACE))) * phases @ waves)
-    return recorded(skin, heard + quiet(skin, jax.random.key(2)).samples)
+    return recorded(skin, heard + simulate_silence(skin, jax.random.key(2)).samples)
 
 
 @pytest.fixture(scope="module")
 def silent(skin):
-    return recorded(skin, quiet(skin, jax.random.key(3)).samples, "hush")
+    return recorded(skin, simulate_silence(skin, jax.random.key(3)).samples, "hush")
 
 
 def test_a_touch_without_pauses(vibration, silent, heard_before):

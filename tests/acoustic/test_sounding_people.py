@@ -8,10 +8,10 @@ from jeit.acoustic.simulate import (
     SoundingPerson,
     SoundingSkin,
     microphone_grid,
-    room_sound,
-    sound_clips,
-    stroke,
-    wind,
+    simulate_room_sound,
+    simulate_sound_clips,
+    simulate_stroke,
+    simulate_wind,
 )
 from jeit.acoustic.simulate.people import MODALITIES, SOUND_MANNERS
 from jeit.acoustic.simulate.propagation import expected_power, noise_power
@@ -36,15 +36,15 @@ def coherence(samples: np.ndarray) -> float:
 
 def test_wind_has_the_power_of_its_places(skin):
     """All at one place, with the skin's own colour: what a steady source of that strength is received with."""
-    blown = wind(skin, KEY, WHERE, strength=2.0, radius=1e-9, gusts=0.0, slope=1.0, duration=8.0, noise=False)
+    blown = simulate_wind(skin, KEY, WHERE, strength=2.0, radius=1e-9, gusts=0.0, slope=1.0, duration=8.0, noise=False)
     expected = 4 * expected_power(skin, [WHERE])[0]
     # 8 s of noise of 800 Hz: 1 % each, and edge echoes between frequencies that are worked out.
     np.testing.assert_allclose((blown.samples**2).mean(axis=1), expected, rtol=0.06)
 
 
 def test_wind_is_incoherent_and_a_stroke_is_not(skin):
-    blown = wind(skin, KEY, (0.0, 0.0), duration=8.0, noise=False)
-    rubbed = stroke(skin, KEY, [(-0.01, 0.0), (0.01, 0.0)], duration=4.0, noise=False)
+    blown = simulate_wind(skin, KEY, (0.0, 0.0), duration=8.0, noise=False)
+    rubbed = simulate_stroke(skin, KEY, [(-0.01, 0.0), (0.01, 0.0)], duration=4.0, noise=False)
     assert coherence(blown.samples) < 0.05
     assert coherence(rubbed.samples) > 0.5
     assert blown.position.shape == (len(blown.position_times), 2)
@@ -54,20 +54,22 @@ def test_wind_falls_with_frequency_as_it_is_told(skin):
     """Twice the slope: the ratio of a low to a high band grows by that power of their distance."""
     ratios = []
     for slope in (0.0, 2.0):
-        spectrum = np.abs(np.fft.rfft(wind(skin, KEY, WHERE, slope=slope, duration=8.0, noise=False).samples)) ** 2
+        spectrum = (
+            np.abs(np.fft.rfft(simulate_wind(skin, KEY, WHERE, slope=slope, duration=8.0, noise=False).samples)) ** 2
+        )
         low, high = (spectrum[:, 8 * f - 160 : 8 * f + 160].sum(axis=1) for f in (150, 600))
         ratios.append(low / high)
     np.testing.assert_allclose(np.log(ratios[1] / ratios[0]), 2 * np.log(4), rtol=0.1)
 
 
 def test_gusts_waver_and_keep_the_power(skin):
-    still, gusty = (wind(skin, KEY, WHERE, gusts=gusts, duration=60.0, noise=False) for gusts in (0.0, 0.3))
+    still, gusty = (simulate_wind(skin, KEY, WHERE, gusts=gusts, duration=60.0, noise=False) for gusts in (0.0, 0.3))
     assert np.std(np.log(gusty.active)) == pytest.approx(0.3, rel=0.15)
     assert (gusty.active**2).mean() == pytest.approx((still.active**2).mean(), rel=0.15)
 
 
 def test_a_room_is_heard_alike_by_all(skin):
-    heard = room_sound(skin, KEY, level_db=-3.0, duration=8.0).samples / np.asarray(skin.gain)[:, None]
+    heard = simulate_room_sound(skin, KEY, level_db=-3.0, duration=8.0).samples / np.asarray(skin.gain)[:, None]
     np.testing.assert_allclose(heard, heard[:1].repeat(4, axis=0), atol=1e-12)
     nominal = np.median(noise_power(skin) / np.asarray(skin.noise_factor))
     assert (heard[0] ** 2).mean() == pytest.approx(nominal * 10**-0.3, rel=0.1)
@@ -86,9 +88,9 @@ def test_people_differ_as_they_are_said_to():
 
 def test_clips_are_told_by_their_key_alone(skin):
     people = [SoundingPerson.draw(key) for key in jax.random.split(KEY, 2)]
-    clips = list(sound_clips(KEY, skin, people, 1, duration=0.6))
+    clips = list(simulate_sound_clips(KEY, skin, people, 1, duration=0.6))
     assert [(one.person, one.modality) for one in clips] == [(who, what) for who in range(2) for what in MODALITIES]
-    again = list(sound_clips(KEY, skin, people, 1, duration=0.6))
+    again = list(simulate_sound_clips(KEY, skin, people, 1, duration=0.6))
     for one, other in zip(clips, again, strict=True):
         np.testing.assert_array_equal(one.samples, other.samples)
         assert one.samples.shape == (4, 6000)
@@ -110,13 +112,13 @@ def test_a_stroke_stays_on_the_skin_and_turns(skin):
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda skin: wind(skin, KEY, (0.5, 0.0)), "off the skin"),
-        (lambda skin: wind(skin, KEY, WHERE, strength=0.0), "strength must be a positive"),
-        (lambda skin: wind(skin, KEY, WHERE, gusts=-1.0), "gusts must be zero or positive"),
-        (lambda skin: room_sound(skin, KEY, level_db=np.inf), "level_db must be finite"),
-        (lambda skin: sound_clips(KEY, skin, [], 1), "people: give one"),
-        (lambda skin: sound_clips(KEY, skin, [SoundingPerson.draw(KEY)], 0), "each must be"),
-        (lambda skin: sound_clips(KEY, skin, [SoundingPerson.draw(KEY)], 1, modalities=["slap"]), "slap"),
+        (lambda skin: simulate_wind(skin, KEY, (0.5, 0.0)), "off the skin"),
+        (lambda skin: simulate_wind(skin, KEY, WHERE, strength=0.0), "strength must be a positive"),
+        (lambda skin: simulate_wind(skin, KEY, WHERE, gusts=-1.0), "gusts must be zero or positive"),
+        (lambda skin: simulate_room_sound(skin, KEY, level_db=np.inf), "level_db must be finite"),
+        (lambda skin: simulate_sound_clips(KEY, skin, [], 1), "people: give one"),
+        (lambda skin: simulate_sound_clips(KEY, skin, [SoundingPerson.draw(KEY)], 0), "each must be"),
+        (lambda skin: simulate_sound_clips(KEY, skin, [SoundingPerson.draw(KEY)], 1, modalities=["slap"]), "slap"),
         (lambda skin: SoundingPerson.draw(KEY).touch(KEY, "hit", skin), "modality"),
         (lambda skin: SoundingPerson({"pat": {}}), r"medians\['pat'\] must have strength"),
     ],

@@ -8,13 +8,13 @@ from scipy.optimize import least_squares
 from jeit.acoustic.simulate import (
     Burst,
     SoundingSkin,
-    calibration_taps,
     microphone_grid,
-    pat,
-    quiet,
-    stroke,
-    tap,
-    tickle,
+    simulate_calibration_taps,
+    simulate_pat,
+    simulate_silence,
+    simulate_stroke,
+    simulate_tap,
+    simulate_tickle,
 )
 from jeit.acoustic.simulate.microphones import MicrophoneModel, Readout
 from jeit.acoustic.simulate.propagation import expected_power, noise_power, nominal_power, transfer
@@ -125,7 +125,7 @@ def test_the_library_s_decay_model_does_not_fit_exactly(skin):
 @pytest.mark.slow
 def test_drawn_bursts_have_the_expected_power(small):
     places, options = np.array([[0.01, 0.02], [0.06, -0.03], [0.095, 0.09]]), {"duration": 0.14, "noise": False}
-    taps = calibration_taps(small, KEY, places, repeats=200, strength_spread=0.0, **options)
+    taps = simulate_calibration_taps(small, KEY, places, repeats=200, strength_spread=0.0, **options)
     assert taps.samples.shape == (600, 4, 1400)
     np.testing.assert_array_equal(taps.positions[[0, 199, 200]], places[[0, 0, 1]])
     # A strength of 1 over 60 ms is 600 samples' worth of energy at 10 kHz.
@@ -138,17 +138,17 @@ def test_drawn_bursts_have_the_expected_power(small):
     assert ratio.mean() == pytest.approx(1, abs=0.06)
     np.testing.assert_array_equal(taps.strengths, 1)
     # Strengths scale the taps, no more; 600 draws tell their standard deviation to 3 %.
-    spread = calibration_taps(small, KEY, places, repeats=200, strength_spread=0.5, **options)
+    spread = simulate_calibration_taps(small, KEY, places, repeats=200, strength_spread=0.5, **options)
     assert np.std(np.log(spread.strengths)) == pytest.approx(0.5, rel=0.12)
     np.testing.assert_allclose(spread.samples, taps.samples * spread.strengths[:, None, None], rtol=1e-9, atol=1e-12)
 
 
 def test_pieces_of_a_calibration_do_not_show(small, monkeypatch):
     places = [(0.0, 0.01), (0.03, 0.02), (-0.08, 0.0)]
-    whole = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
+    whole = simulate_calibration_taps(small, KEY, places, repeats=2, duration=0.1)
     monkeypatch.setattr("jeit.acoustic.simulate.calibration_recording.PIECE", 12_000)
     # Two pieces of two places, the last one twice.
-    parts = calibration_taps(small, KEY, places, repeats=2, duration=0.1)
+    parts = simulate_calibration_taps(small, KEY, places, repeats=2, duration=0.1)
     np.testing.assert_allclose(parts.samples, whole.samples, rtol=1e-9, atol=1e-12)
 
 
@@ -157,7 +157,7 @@ def test_blocks_add_up_to_the_transfer_function(multiplexed):
     # Whatever the source's spectrum was, two channels differ by the ratio of their transfer functions.
     made = SoundingSkin(KEY, microphone_grid(2), readout=Readout(multiplexed=multiplexed))
     place = (0.03, -0.06)
-    recording = tap(made, KEY, place, repeats=2, duration=1.0, noise=False)
+    recording = simulate_tap(made, KEY, place, repeats=2, duration=1.0, noise=False)
     spectrum = np.fft.rfft(recording.samples)
     frequencies = np.fft.rfftfreq(recording.samples.shape[1], 1 / recording.rate)
     inside = (frequencies > 80) & (frequencies < 900)
@@ -170,7 +170,7 @@ def test_blocks_add_up_to_the_transfer_function(multiplexed):
 
 def test_a_row_of_taps_is_as_loud_and_as_late_as_it_should_be():
     near = SoundingSkin(KEY, CENTRE)
-    recording = tap(near, KEY, (0.01, 0.0), repeats=100, frequency=10.0, noise=False)
+    recording = simulate_tap(near, KEY, (0.01, 0.0), repeats=100, frequency=10.0, noise=False)
     heard, made = (
         (row[:100_000] ** 2).reshape(100, 1000).mean(axis=0) for row in (recording.samples[0], recording.active)
     )
@@ -186,7 +186,7 @@ def test_the_multiplexer_samples_one_after_another(multiplexed, step, rate):
     # Six microphones in one place hear the same sound; later samples are earlier sound.
     readout = Readout(coupling_db=-np.inf, multiplexed=multiplexed)
     together = SoundingSkin(KEY, [(0.0, 0.02)] * 6, microphone_model=ALIKE["microphone_model"], readout=readout)
-    recording = tap(together, KEY, (0.01, 0.0), noise=False)
+    recording = simulate_tap(together, KEY, (0.01, 0.0), noise=False)
     assert recording.rate == pytest.approx(rate)
     spectrum = np.fft.rfft(recording.samples)
     frequencies = np.fft.rfftfreq(recording.samples.shape[1], 1 / recording.rate)
@@ -215,7 +215,7 @@ def test_coupling_leaks_from_the_slot_before():
 
 
 def test_noise_has_its_power_and_lies_in_the_band(small):
-    recording = quiet(small, KEY, duration=8.0)
+    recording = simulate_silence(small, KEY, duration=8.0)
     # 860 Hz for 8 s are some 14,000 independent values: 1.2 %.
     np.testing.assert_allclose((recording.samples**2).mean(axis=1), noise_power(small), rtol=0.05)
     power = np.abs(np.fft.rfft(recording.samples * np.hanning(recording.samples.shape[1]))) ** 2
@@ -230,10 +230,10 @@ def test_noise_has_its_power_and_lies_in_the_band(small):
 def test_keys_decide_everything(small):
     line = [(-0.05, 0.0), (0.05, 0.0)]
     for made in (
-        lambda key: pat(small, key, (0.01, 0.0)).samples,
-        lambda key: tickle(small, key, (0.01, 0.0)).samples,
-        lambda key: stroke(small, key, line).samples,
-        lambda key: quiet(small, key).samples,
+        lambda key: simulate_pat(small, key, (0.01, 0.0)).samples,
+        lambda key: simulate_tickle(small, key, (0.01, 0.0)).samples,
+        lambda key: simulate_stroke(small, key, line).samples,
+        lambda key: simulate_silence(small, key).samples,
         lambda key: SoundingSkin(key).gain,
     ):
         np.testing.assert_array_equal(made(KEY), made(KEY))
@@ -244,26 +244,28 @@ def test_keys_decide_everything(small):
 
 
 def test_touches_add_and_noise_is_added_once(small):
-    one, two = (pat(small, jax.random.key(k), at, noise=False) for k, at in ((1, (0.05, 0.05)), (2, (-0.06, 0.0))))
+    one, two = (
+        simulate_pat(small, jax.random.key(k), at, noise=False) for k, at in ((1, (0.05, 0.05)), (2, (-0.06, 0.0)))
+    )
     together = superpose(small, None, one, two)
     np.testing.assert_allclose(together, one.samples + two.samples, rtol=1e-12)
     noise = superpose(small, KEY, one, two) - together
     # 860 Hz for a second: 2.4 %.
     np.testing.assert_allclose((noise**2).mean(axis=1), noise_power(small), rtol=0.12)
-    louder = pat(small, jax.random.key(1), (0.05, 0.05), burst=Burst(4.0, 0.08), noise=False)
+    louder = simulate_pat(small, jax.random.key(1), (0.05, 0.05), burst=Burst(4.0, 0.08), noise=False)
     np.testing.assert_allclose(louder.samples, 2 * one.samples, rtol=1e-9, atol=1e-12)
-    noisy = pat(small, jax.random.key(1), (0.05, 0.05))
+    noisy = simulate_pat(small, jax.random.key(1), (0.05, 0.05))
     assert np.corrcoef((noisy.samples - one.samples)[0], one.samples[0])[0, 1] < 0.1
     with pytest.raises(ValueError, match="noise=False"):
         superpose(small, KEY, one, noisy)
     with pytest.raises(ValueError, match="equally long"):
-        superpose(small, KEY, one, tap(small, KEY, (0.0, 0.0), repeats=4, noise=False))
+        superpose(small, KEY, one, simulate_tap(small, KEY, (0.0, 0.0), repeats=4, noise=False))
 
 
 @pytest.mark.slow
 def test_the_loudest_microphone_follows_a_stroke():
     clear = SoundingSkin(KEY, **ALIKE | {"microphone_model": MicrophoneModel(snr_db=20.0, **SPREADS)})
-    recording = stroke(clear, KEY, [(-0.09, -0.04), (0.0, -0.04), (0.0, 0.09)])
+    recording = simulate_stroke(clear, KEY, [(-0.09, -0.04), (0.0, -0.04), (0.0, 0.09)])
     place, right = np.asarray(clear.microphones), 0
     starts = np.arange(500, 9000, 500)
     for start in starts:
@@ -277,27 +279,27 @@ def test_the_loudest_microphone_follows_a_stroke():
 
 
 def test_a_stroke_goes_where_the_path_says_and_faster_is_louder(small):
-    line = stroke(small, KEY, [(-0.05, 0.0), (0.05, 0.0)], noise=False)
+    line = simulate_stroke(small, KEY, [(-0.05, 0.0), (0.05, 0.0)], noise=False)
     np.testing.assert_allclose(line.position[:, 0], -0.05 + 0.1 * line.position_times, atol=2e-5)
     # 0.1 m in a second: the nominal speed, but for the ends.
     np.testing.assert_allclose(line.active[300:-300], 1, rtol=1e-9)
-    faster = stroke(small, KEY, lambda t: np.stack([-0.05 + 0.1 * t**2, 0 * t], axis=-1), noise=False)
+    faster = simulate_stroke(small, KEY, lambda t: np.stack([-0.05 + 0.1 * t**2, 0 * t], axis=-1), noise=False)
     np.testing.assert_allclose(faster.active[[2000, 8000]], np.sqrt([0.4, 1.6]), rtol=1e-3)
     np.testing.assert_allclose(faster.position[50], [-0.025, 0], atol=1e-9)
 
 
 def test_pats_and_tickles_are_where_and_when_they_say(small):
-    patted = pat(small, KEY, (0.02, -0.01), taps=3, interval=0.3)
+    patted = simulate_pat(small, KEY, (0.02, -0.01), taps=3, interval=0.3)
     rises = np.flatnonzero(np.diff((patted.active > 1).astype(int)) == 1) / patted.rate
     np.testing.assert_allclose(np.diff(rises), 0.3, atol=1e-9)
     assert len(rises) == 3
     np.testing.assert_array_equal(np.unique(patted.position, axis=0), [[0.02, -0.01]])
-    tickled = tickle(small, KEY, (0.095, 0.0), radius=0.01)
+    tickled = simulate_tickle(small, KEY, (0.095, 0.0), radius=0.01)
     assert 8 <= len(np.unique(tickled.position, axis=0)) <= 15
     assert (np.linalg.norm(tickled.position - [0.095, 0], axis=1) <= 0.01).all()
     assert (tickled.position[:, 0] <= 0.1).all()
     assert len(tickled.times) == tickled.samples.shape[1] == len(tickled.active) == 10_000
-    assert tap(small, KEY, (0, 0), repeats=4).samples.shape[1] == pytest.approx(4100, abs=1)
+    assert simulate_tap(small, KEY, (0, 0), repeats=4).samples.shape[1] == pytest.approx(4100, abs=1)
 
 
 @pytest.mark.parametrize(
@@ -344,34 +346,37 @@ def test_impossible_skins_are_refused(make, message):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda skin: tap(skin, KEY, (0.11, 0.0)), "position: row 0.*off the skin"),
-        (lambda skin: tap(skin, KEY, (np.nan, 0.0)), "position: row 0 is not finite"),
-        (lambda skin: tap(skin, KEY, (0.0, 0.0, 0.0)), "position: give"),
-        (lambda skin: tap(skin, KEY, (0.0, 0.0), burst=Burst(strength=0.0)), "strength must be"),
-        (lambda skin: tap(skin, KEY, (0.0, 0.0), repeats=0), "repeats"),
-        (lambda skin: tap(skin, KEY, (0.0, 0.0), burst=Burst(length=0.2)), "does not fit"),
-        (lambda skin: pat(skin, KEY, (0.0, 0.0), interval=-1.0), "interval must be"),
-        (lambda skin: tickle(skin, KEY, (0.0, 0.0), radius=0.0), "radius must be"),
-        (lambda skin: stroke(skin, KEY, [(0.0, 0.0), (0.2, 0.0)]), "path: row 1"),
-        (lambda skin: stroke(skin, KEY, [(0.0, 0.0)]), "its length is zero"),
-        (lambda skin: stroke(skin, KEY, lambda t: np.zeros((3, 2))), "one for each"),
-        (lambda skin: quiet(skin, KEY, duration=0.0), "duration must be"),
-        (lambda skin: calibration_taps(skin, KEY, [(0.0, 0.0)], repeats=0), "repeats"),
-        (lambda skin: calibration_taps(skin, KEY, [(0.0, 0.0)], strength_spread=-1.0), "strength_spread"),
-        (lambda skin: calibration_taps(skin, KEY, np.zeros((0, 2))), "positions: give"),
+        (lambda skin: simulate_tap(skin, KEY, (0.11, 0.0)), "position: row 0.*off the skin"),
+        (lambda skin: simulate_tap(skin, KEY, (np.nan, 0.0)), "position: row 0 is not finite"),
+        (lambda skin: simulate_tap(skin, KEY, (0.0, 0.0, 0.0)), "position: give"),
+        (lambda skin: simulate_tap(skin, KEY, (0.0, 0.0), burst=Burst(strength=0.0)), "strength must be"),
+        (lambda skin: simulate_tap(skin, KEY, (0.0, 0.0), repeats=0), "repeats"),
+        (lambda skin: simulate_tap(skin, KEY, (0.0, 0.0), burst=Burst(length=0.2)), "does not fit"),
+        (lambda skin: simulate_pat(skin, KEY, (0.0, 0.0), interval=-1.0), "interval must be"),
+        (lambda skin: simulate_tickle(skin, KEY, (0.0, 0.0), radius=0.0), "radius must be"),
+        (lambda skin: simulate_stroke(skin, KEY, [(0.0, 0.0), (0.2, 0.0)]), "path: row 1"),
+        (lambda skin: simulate_stroke(skin, KEY, [(0.0, 0.0)]), "its length is zero"),
+        (lambda skin: simulate_stroke(skin, KEY, lambda t: np.zeros((3, 2))), "one for each"),
+        (lambda skin: simulate_silence(skin, KEY, duration=0.0), "duration must be"),
+        (lambda skin: simulate_calibration_taps(skin, KEY, [(0.0, 0.0)], repeats=0), "repeats"),
+        (lambda skin: simulate_calibration_taps(skin, KEY, [(0.0, 0.0)], strength_spread=-1.0), "strength_spread"),
+        (lambda skin: simulate_calibration_taps(skin, KEY, np.zeros((0, 2))), "positions: give"),
         (lambda skin: expected_power(skin, [(0.0, np.inf)]), "positions: row 0 is not finite"),
         (lambda skin: microphone_grid(0), "number"),
         (lambda skin: superpose(skin, KEY), "at least one"),
-        (lambda skin: tap(skin, KEY, "middle"), r"position: give \(x, y\) in metres"),
-        (lambda skin: tap(KEY, skin, (0.0, 0.0)), "skin must be a SoundingSkin, .*; it is an array of key<fry>"),
-        (lambda skin: tap(skin, KEY, (0.0, 0.0), burst=2.0), "burst must be a Burst"),
-        (lambda skin: pat(skin, 1, (0.0, 0.0)), "key must be"),
-        (lambda skin: tickle(skin, None, (0.0, 0.0)), "key must be"),
-        (lambda skin: tickle(skin, KEY, (0.0, 0.0), burst="light"), "burst must be a Burst"),
-        (lambda skin: stroke(skin, "a", [(0.0, 0.0), (0.1, 0.0)]), "key must be"),
-        (lambda skin: quiet(skin, 3), "key must be"),
+        (lambda skin: simulate_tap(skin, KEY, "middle"), r"position: give \(x, y\) in metres"),
+        (
+            lambda skin: simulate_tap(KEY, skin, (0.0, 0.0)),
+            "skin must be a SoundingSkin, .*; it is an array of key<fry>",
+        ),
+        (lambda skin: simulate_tap(skin, KEY, (0.0, 0.0), burst=2.0), "burst must be a Burst"),
+        (lambda skin: simulate_pat(skin, 1, (0.0, 0.0)), "key must be"),
+        (lambda skin: simulate_tickle(skin, None, (0.0, 0.0)), "key must be"),
+        (lambda skin: simulate_tickle(skin, KEY, (0.0, 0.0), burst="light"), "burst must be a Burst"),
+        (lambda skin: simulate_stroke(skin, "a", [(0.0, 0.0), (0.1, 0.0)]), "key must be"),
+        (lambda skin: simulate_silence(skin, 3), "key must be"),
         (lambda skin: superpose(None, KEY), "skin must be a SoundingSkin"),
-        (lambda skin: calibration_taps(skin, 0, [(0.0, 0.0)]), "key must be"),
+        (lambda skin: simulate_calibration_taps(skin, 0, [(0.0, 0.0)]), "key must be"),
         (lambda skin: simulate_press(RoundSkin(), 0, (0.0, 0.0)), r"key must be .*jax\.random\.key\(0\)"),
         (lambda skin: simulate_press(skin, KEY, (0.0, 0.0)), "skin must be a RoundSkin, .*; it is a SoundingSkin"),
     ],

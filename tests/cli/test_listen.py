@@ -10,7 +10,13 @@ from scipy.io import wavfile
 
 from jeit.acoustic import Calibration, Recording, calibrate_microphones, read_recording, write_recording
 from jeit.acoustic.signal.recording import Taps
-from jeit.acoustic.simulate import SoundingSkin, calibration_taps, microphone_grid, pat, quiet
+from jeit.acoustic.simulate import (
+    SoundingSkin,
+    microphone_grid,
+    simulate_calibration_taps,
+    simulate_pat,
+    simulate_silence,
+)
 from jeit.cli import main
 from jeit.touch.listening import Listener, read_clips
 
@@ -142,7 +148,7 @@ def test_places_come_with_a_calibration(tmp_path):
     """Pats on a simulated skin: named, and found to a centimetre."""
     skin = SoundingSkin(jax.random.key(0), microphone_grid(3))
     outline = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
-    taps = calibration_taps(skin, jax.random.key(1), microphone_grid(7))
+    taps = simulate_calibration_taps(skin, jax.random.key(1), microphone_grid(7))
     fit = calibrate_microphones(
         Taps(np.asarray(skin.microphones), outline, taps.positions, samples=taps.samples, rate=taps.rate)
     )
@@ -150,14 +156,14 @@ def test_places_come_with_a_calibration(tmp_path):
     assert isinstance(Calibration.load(tmp_path / "skin.json"), Calibration)
     for number in range(3):
         for name, made in (
-            ("pat", pat(skin, jax.random.key(10 + number), (0.01 * number, 0.02), duration=1.5)),
-            ("none", quiet(skin, jax.random.key(20 + number), duration=1.5)),
+            ("pat", simulate_pat(skin, jax.random.key(10 + number), (0.01 * number, 0.02), duration=1.5)),
+            ("none", simulate_silence(skin, jax.random.key(20 + number), duration=1.5)),
         ):
             (tmp_path / "clips" / name).mkdir(parents=True, exist_ok=True)
             write_recording(tmp_path / "clips" / name / f"{number}.npz", Recording(made.samples, made.rate))
     model = str(tmp_path / "model")
     assert main(["listen", "fit", str(tmp_path / "clips"), "-o", model, "--method", "linear", "-q"]) == 0
-    heard = pat(skin, jax.random.key(30), (-0.03, 0.04), duration=1.5)
+    heard = simulate_pat(skin, jax.random.key(30), (-0.03, 0.04), duration=1.5)
     write_recording(tmp_path / "heard.npz", Recording(heard.samples, heard.rate))
     command = ["listen", str(tmp_path / "heard.npz"), "-m", model, "-o", str(tmp_path / "out"), "-q"]
     assert main([*command, "-c", str(tmp_path / "skin.json")]) == 0

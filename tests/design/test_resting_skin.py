@@ -9,15 +9,19 @@ from jeit.design.skin.touched_cells import TouchedCells
 from jeit.design.skin.voltage_changes import touch_changes
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
-from jeit.touch.simulate import Bar, Disc, Indent, indented_cells
+from jeit.touch.simulate import BarIndenter, DiscIndenter, Indent, indented_cells
 from jeit.touch.simulate.contact.indents import resting_skin
 from jeit_solvers.engines import as_array
 
 # One to three contacts, of few cells and many, in a group that one program works on and beyond.
 TOUCHES = [
-    [Indent(Disc(0.004), 3e-3, (0.01, 0.0))],
-    [Indent(Disc(0.03), 6e-3, (-0.01, 0.01)), Indent(Bar(0.05, 0.01), 7e-3), Indent(Disc(0.01), 2e-3, (0.02, 0.02))],
-    *([Indent(Disc(0.004), 4e-3, (0.001 * number, -0.005))] for number in range(4)),
+    [Indent(DiscIndenter(0.004), 3e-3, (0.01, 0.0))],
+    [
+        Indent(DiscIndenter(0.03), 6e-3, (-0.01, 0.01)),
+        Indent(BarIndenter(0.05, 0.01), 7e-3),
+        Indent(DiscIndenter(0.01), 2e-3, (0.02, 0.02)),
+    ],
+    *([Indent(DiscIndenter(0.004), 4e-3, (0.001 * number, -0.005))] for number in range(4)),
 ]
 
 
@@ -67,7 +71,7 @@ def test_a_layer_knows_the_nodes_that_are_reached():
     assert shallow is not None
     assert deep is not None
     assert shallow.inverse.band.size < 0.5 * deep.inverse.band.size
-    touched = indented_cells(layer, [[Indent(Disc(0.02), 1.5e-3)], []])
+    touched = indented_cells(layer, [[Indent(DiscIndenter(0.02), 1.5e-3)], []])
     found = shallow.changes(touched)
     assert np.abs(found - deep.changes(touched)).max() < 1e-12 * np.abs(found).max()
     assert not found[1].any()

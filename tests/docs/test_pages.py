@@ -18,7 +18,13 @@ from jeit.cli.app import application
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+GUIDES = [page for page in PAGES if page.relative_to(ROOT).parts[:2] in (("docs", "how-to"), ("docs", "explanation"))]
 COMMANDS = {tuple(path.split()): function for path, function in command_line.commands(application())}
+
+
+def name_of(page: Path) -> str:
+    """The path of a page in the repository."""
+    return page.relative_to(ROOT).as_posix()
 
 
 def blocks(page: Path, *languages: str) -> list[str]:
@@ -133,17 +139,17 @@ def _looking_inside(names: dict, folder: Path, printed: list[str]) -> None:
 
 
 HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
-    "looking-inside.md": _looking_inside,
+    "docs/looking-inside.md": _looking_inside,
     "README.md": _readme,
-    "contacts.md": _contacts,
-    "design.md": _design,
-    "gestures.md": _gestures,
-    "health.md": _health,
-    "hearing.md": _hearing,
-    "instruments.md": _instruments,
-    "pressing.md": _pressing,
-    "reconstruction.md": _reconstruction,
-    "surfaces.md": _surfaces,
+    "docs/contacts.md": _contacts,
+    "docs/design.md": _design,
+    "docs/gestures.md": _gestures,
+    "docs/health.md": _health,
+    "docs/hearing.md": _hearing,
+    "docs/instruments.md": _instruments,
+    "docs/pressing.md": _pressing,
+    "docs/reconstruction.md": _reconstruction,
+    "docs/surfaces.md": _surfaces,
 }
 
 
@@ -165,11 +171,11 @@ LONG = (
 )
 # Options that leave less to do of what takes long as it is written.
 LESS = {"jeit choose data1.mat": "--num-points 800", "jeit layout compare": "--cell-mm 8 --places 16"}
-READ = [page for page in PAGES if blocks(page, "python") and page.relative_to(ROOT).as_posix() not in TYPED]
+READ = [page for page in PAGES if blocks(page, "python") and name_of(page) not in TYPED]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", READ, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", READ, ids=name_of)
 def test_a_page_runs(page, tmp_path, monkeypatch, capsys, request):
     """Every block of Python of a page, one after the other, in an empty folder; then what its text promises."""
     measured = re.findall(r"[\w/.-]+\.mat\b", "".join(blocks(page, "python")))
@@ -182,7 +188,7 @@ def test_a_page_runs(page, tmp_path, monkeypatch, capsys, request):
     names: dict = {}
     for block in blocks(page, "python"):
         exec(compile(block, page.name, "exec"), names)
-    HOLDS.get(page.name, lambda *_: None)(names, tmp_path, capsys.readouterr().out.splitlines())
+    HOLDS.get(name_of(page), lambda *_: None)(names, tmp_path, capsys.readouterr().out.splitlines())
     pyplot.close("all")
 
 
@@ -219,13 +225,13 @@ def test_commands_run_as_they_are_written(data_folder, tmp_path, monkeypatch, ca
                         status = main(shlex.split(line, comments=True)[1:] + less.split())
                     assert (status, error := capsys.readouterr().err) == (0, ""), f"{page.name}: {line}: {error}"
                     typed.add(_form(line))
-        HOLDS.get(page.name, lambda *_: None)(names, tmp_path, printed)
+        HOLDS.get(name_of(page), lambda *_: None)(names, tmp_path, printed)
         pyplot.close("all")
     assert len(typed) >= 13
     assert all(Path(line.split()[3]).is_file() for line in commands(ROOT / "README.md") if line.startswith(LONG[1]))
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=name_of)
 def test_commands_are_there(page):
     assert [(line, fault(line)) for line in commands(page) if fault(line)] == []
 
@@ -254,16 +260,34 @@ def test_every_command_is_told_of():
         assert inspect.getdoc(function)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_links_lead_somewhere(page):
     """Links to files lead to files of the repository."""
     links = re.findall(r"\]\((?!\w+:|#)([^)#\s]+)", page.read_text("utf-8"))
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+@pytest.mark.parametrize("page", GUIDES, ids=name_of)
+def test_a_guide_is_short_and_says_for_whom_it_is(page):
+    """One purpose to a page: 900 words at most besides its code, and first of all who needs it."""
+    text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.DOTALL | re.MULTILINE)
+    title, first = [line for line in text.splitlines() if line.strip()][:2]
+    assert title.startswith("# ")
+    assert first.startswith("For ")
+    assert len(text.split()) <= 900
+
+
+@pytest.mark.parametrize("page", [page for page in GUIDES if blocks(page, "python")], ids=name_of)
+def test_a_guide_imports_from_rooms(page):
+    """What a reader imports comes from `jeit` or a room of it, two levels at most."""
+    code = "\n".join(blocks(page, "python"))
+    imported = re.findall(r"^\s*(?:from|import) ((?:jeit|jeit_solvers)\b[\w.]*)", code, re.MULTILINE)
+    assert [module for module in imported if module.count(".") > 1] == []
+
+
 def test_readme_is_short():
     text = (ROOT / "README.md").read_bytes()
-    assert len(text) <= 7000
+    assert len(text) <= 6000
     assert text.count(b"<!-- main-command -->") == text.count(b"<!-- test-command -->") == 1
     rows = text.partition(b"<!-- benchmark:begin -->")[2].partition(b"<!-- benchmark:end -->")[0]
     assert rows.count(b"\n|") <= 2 + 8

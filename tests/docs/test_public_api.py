@@ -14,119 +14,7 @@ from matplotlib import pyplot
 ROOMS = [one for one in public_api.rooms() if one != "jeit"]  # which repeats names of its rooms
 FENCE = re.compile(r"^```python\n(.*?)^```", re.DOTALL | re.MULTILINE)
 # Names whose docstrings are still to be written, by room.
-KNOWN: dict[str, set[str]] = {
-    "jeit.acoustic": {
-        "Calibration",
-        "Intensities",
-        "IntensitySettings",
-        "Localiser",
-        "LocatedTouches",
-        "MicrophoneArray",
-        "Recording",
-        "Taps",
-        "calibrate_microphones",
-        "cramer_rao",
-        "intensities",
-        "locate",
-        "locate_touches",
-        "read_recording",
-        "read_taps",
-        "tap_intensities",
-        "track",
-        "write_recording",
-        "write_taps",
-    },
-    "jeit.design": {
-        "Bell",
-        "Candidates",
-        "DesignSpace",
-        "Hemisphere",
-        "Objective",
-        "Skin",
-        "TouchPrior",
-        "compare_layouts",
-        "describes_skin",
-        "find_taxels",
-        "improve_layout",
-        "information_bound",
-        "layout_scores",
-        "open_results",
-        "optimise_layout",
-        "optimise_surface_layout",
-        "read_described_skin",
-        "read_study",
-        "run_study",
-        "select_measurements",
-        "sensitivity_map",
-        "skin_response",
-        "touch_grid",
-        "touches_away_from_the_edge",
-    },
-    "jeit.live": {
-        "AbstractSource",
-        "ConductivityView",
-        "ContactsView",
-        "DepthView",
-        "GestureView",
-        "LearntSkinView",
-        "LiveFrame",
-        "Marker",
-        "Picture",
-        "Prepared",
-        "Recorder",
-        "Result",
-        "Scene",
-        "Session",
-        "SimulatedSensor",
-        "SoundView",
-        "frames",
-        "open_source",
-        "prepare",
-        "serve",
-        "simulated_skin",
-        "simulated_tank",
-    },
-    "jeit.touch": {
-        "CellFinder",
-        "Contact",
-        "ContactTracker",
-        "GestureModel",
-        "HealthEvent",
-        "ImageNoise",
-        "LearntGestures",
-        "LearntSkin",
-        "LoadCalibration",
-        "LogitBoostClassifier",
-        "NamedTouch",
-        "PlacedMap",
-        "Presses",
-        "RasterFinder",
-        "SelfOrganisingMap",
-        "SkinHealth",
-        "Standing",
-        "TouchAttributes",
-        "TouchImages",
-        "TouchLevel",
-        "TouchStream",
-        "TouchWatch",
-        "Touches",
-        "WatchedFrame",
-        "doubts_of",
-        "find_contacts",
-        "find_touches",
-        "learn_gestures",
-        "learn_health",
-        "read_frames",
-        "read_presses",
-        "read_skin",
-        "touch_attributes",
-        "touch_features",
-        "track_contacts",
-        "untouched_frames",
-        "watch",
-        "write_skin",
-    },
-}
+KNOWN: dict[str, set[str]] = {}
 
 
 def example(docstring: str) -> str:
@@ -139,9 +27,10 @@ def parameters(thing: object) -> list[str]:
     if inspect.isclass(thing) and issubclass(thing, enum.Enum):
         return []
     try:
-        return [one for one in inspect.signature(thing).parameters if one not in ("self", "cls")]  # type: ignore[arg-type]
+        names = inspect.signature(thing).parameters  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return []
+    return [one for one in names if not one.startswith("_") and one not in ("self", "cls")]
 
 
 def faults(name: str, thing: object) -> list[str]:

@@ -43,7 +43,7 @@ from jeit.report import read_image
 from jeit.report.saved_image import saved_extras
 from jeit.touch import LearntSkin, PlacedMap, Presses, SelfOrganisingMap, read_presses, read_skin, write_skin
 from jeit.touch.gestures import GestureModel
-from jeit.touch.kohonen import Schedule, read_map, write_map
+from jeit.touch.kohonen import MapSchedule, read_map, write_map
 from jeit.touch.learnt.presses import read_frames
 from jeit.touch.listening import LabelledClips, Listener
 from jeit.touch.networks import ImageNetwork, read_network, write_network
@@ -416,7 +416,7 @@ def _asked():
 @_reader("map", "a.npz", read_map)
 def _map(folder):
     frames, places = _recorded()["frames"], _recorded()["positions"]
-    learnt = SelfOrganisingMap.fit(frames, jax.random.key(0), shape=(4, 4), schedule=Schedule(100, 100))
+    learnt = SelfOrganisingMap.fit(frames, jax.random.key(0), shape=(4, 4), schedule=MapSchedule(100, 100))
     write_map(PlacedMap.learn(learnt, frames, places), folder / "a.npz")
 
 

@@ -112,19 +112,29 @@ def calibrate_microphones(
     intensity: IntensitySettings | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationFit:
-    """Fit the decay model of each microphone to `taps`.
+    """Fit the decay model of each microphone to taps at known positions, like the command `jeit calibrate-microphones`.
 
-    `decay`: "inverse-square", a / (r² + b) as in Park 2022; "exponential", a exp(−r / l); "attenuated", a exp(−r / l) /
-    (r² + b); a subclass of `AbstractDecay`; or "auto", which selects among the three the model with the smallest median
-    localisation error of left-out taps (four-fold cross-validation over the positions). `place_error`: standard
-    deviation in metres of each coordinate of the given positions of the microphones, whose displacements are estimated
-    too; 0 if the positions are exact. `intensity`: band and windows, for taps given as samples. `progress` is called
-    with the name of each step when it begins.
+    **Arguments:**
 
-    The command `jeit calibrate-microphones` calls this function; `jeit.acoustic.reports.write_calibration` writes its
-    output files. Raises `ValueError` if fewer than three microphones can be calibrated, if most microphones disagree
-    with the given positions, for an unknown `decay`, a `place_error` that is negative or not finite, for `intensity`
-    given with taps that are intensities, and for arguments of the wrong type.
+    - `taps`: the taps, their positions and those of the microphones.
+    - `decay`: "inverse-square", a / (r² + b) as in Park 2022; "exponential", a exp(−r / l); "attenuated", a exp(−r / l)
+      / (r² + b); a subclass of `AbstractDecay`; or "auto", which selects among the three the model with the smallest
+      median localisation error of left-out taps (four-fold cross-validation over the positions).
+    - `place_error`: standard deviation of each coordinate of the given positions of the microphones, metres, whose
+      displacements are estimated too; 0 if the positions are exact.
+    - `intensity`: band and windows, for taps given as samples.
+    - `progress`: called with the name of each step when it begins.
+
+    Raises `ValueError` if fewer than three microphones can be calibrated, if most microphones disagree with the given
+    positions, for an unknown `decay`, a `place_error` that is negative or not finite, for `intensity` given with taps
+    that are intensities, and for arguments of the wrong type.
+
+    **Example:**
+
+    ```python
+    fit = calibrate_microphones(taps, decay="inverse-square")
+    calibration = fit.calibration
+    ```
     """
     every = isinstance(decay, str) and decay == AUTO
     kinds = () if every else (find_decay(decay),)

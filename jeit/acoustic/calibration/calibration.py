@@ -36,12 +36,14 @@ _LARGEST = 2**24
 
 
 class Calibration(Module):
-    """A calibrated array of microphones.
+    """A calibrated array of microphones, as from `calibrate_microphones`.
 
-    - `microphone_array`: positions of the microphones, surface, decay models and noise.
-    - `usable`: (M,) mask of the usable microphones.
+    **Fields**
+
+    - `microphone_array`: positions of the M microphones, surface, decay models and noise.
+    - `usable`: mask (M,) of the usable microphones.
     - `reasons`: M reasons why a microphone is not usable; "" for usable microphones.
-    - `standard_errors`: (K, M) relative standard errors of the K parameters of the decay model.
+    - `standard_errors`: relative standard errors (K, M) of the K parameters of the decay model.
     - `intensity`: band and windows with which the samples of the taps were analysed; None if the taps were given as
       intensities.
     - `name`: name of the taps.
@@ -52,6 +54,13 @@ class Calibration(Module):
     The taps determine the gains of the decay models and the strengths of the taps only up to a common factor. The
     factor is chosen so that the geometric mean of f_i(0) over the usable microphones is 1. The strength of a source is
     therefore the intensity at a typical microphone directly below it.
+
+    **Example:**
+
+    ```python
+    calibration.save("skin.json")
+    locations = locate(recording, Calibration.load("skin.json"))
+    ```
     """
 
     microphone_array: MicrophoneArray

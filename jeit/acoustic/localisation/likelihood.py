@@ -132,9 +132,23 @@ def cramer_rao(
     """Cramér-Rao bound (N, d, d) in m²: the minimum covariance of unbiased estimates of the positions of sources.
 
     It is the position block of the inverse Fisher matrix of position and logarithm of strength, for the noise model of
-    `microphone_array`; the strength is treated as unknown. `position` (N, d): true positions in metres. `strength`:
-    true strengths, (N,) or a number. `use` (M,): mask of the microphones used; by default all. Raises `ValueError` if
-    `microphone_array` is not a `MicrophoneArray`.
+    the array; the strength is treated as unknown.
+
+    **Arguments:**
+
+    - `microphone_array`: model of the array, such as that of a `Calibration`.
+    - `position`: true positions (N, d), metres.
+    - `strength`: true strengths, (N,) or a number, in the unit of intensity.
+    - `use`: mask (M,) of the microphones used; by default all.
+
+    Raises `ValueError` if `microphone_array` is not a `MicrophoneArray`.
+
+    **Example:**
+
+    ```python
+    covariance = cramer_rao(calibration.microphone_array, [[0.03, 0.02]], strength=10.0)
+    print(np.sqrt(np.trace(covariance[0])))  # metres
+    ```
     """
     check_array(microphone_array)
     present = np.ones(len(microphone_array.microphones), bool) if use is None else use

@@ -73,6 +73,13 @@ class Localiser(Module):
     **Fields**: `microphone_array`: model of the array; `coarse`: coarse grid; `pixels`: raster of the maps, if any;
     `features`: precomputed features of its pixels; `method`: "likelihood" or "consistency"; `compiled`: whether calls
     are compiled.
+
+    **Example:**
+
+    ```python
+    localiser = Localiser.create(calibration.microphone_array, map_shape=(50, 50))
+    estimate, maps = localiser.with_maps(power)
+    ```
     """
 
     microphone_array: MicrophoneArray

@@ -64,16 +64,30 @@ def locate(
 ) -> Locations:
     """Locate the touch in each frame of a recording.
 
-    `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022. `map_shape`: (rows,
-    columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid. The best position is
-    refined in either case. `intensity`: band and windows, for recordings of samples; by default those of the
-    calibration. `silence`: recording of the untouched array; see `calibrated_intensities`. `gain_drift`: standard
-    deviation of the changes of the microphones' gains since the calibration, as a fraction of the intensities. The
-    changes are estimated from all touches of the recording, and the covariances include their remaining errors; 0 if
-    the gains have not changed. `compiled`: whether to compile the computation, which takes seconds but makes it several
-    times faster; by default True for more than 1,024 frames with a touch. Use True for many successive recordings.
+    **Arguments:**
+
+    - `recording`: samples or intensities of the calibrated microphones.
+    - `calibration`: the calibrated array.
+    - `method`: "likelihood" (maximum likelihood), or "consistency" for the loss of Park 2022.
+    - `map_shape`: (rows, columns) of the raster that is searched, (200, 200) in Park 2022; by default a coarse grid.
+      The best position is refined in either case.
+    - `intensity`: band and windows, for recordings of samples; by default those of the calibration.
+    - `silence`: recording of the untouched array, from which the noise floor is estimated if touches never pause.
+    - `gain_drift`: standard deviation of the changes of the microphones' gains since the calibration, as a fraction of
+      the intensities. The changes are estimated from all touches of the recording, and the covariances include their
+      remaining errors; 0 if the gains have not changed.
+    - `compiled`: whether to compile the computation, which takes seconds but makes it several times faster; by default
+      True for more than 1,024 frames with a touch. Use True for many successive recordings.
+
     Raises `ValueError` for a recording with another number of microphones, a `gain_drift` that is negative or not
     finite, and if fewer than three microphones can be used.
+
+    **Example:**
+
+    ```python
+    locations = locate(recording, calibration)
+    print(locations.counts())
+    ```
     """
     if not (is_number(gain_drift) and gain_drift >= 0):
         raise ValueError(f"gain_drift must be zero or positive, as a fraction; it is {describe(gain_drift)}.")

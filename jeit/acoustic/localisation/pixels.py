@@ -73,16 +73,30 @@ def valleys(maps: Float[Array, "F P"], pixels: Pixels) -> tuple[Array, Array, Ar
     return first, pixels.chart[:, other], second < _WORTH_FACTOR * least + _WORTH_OFFSET
 
 
-def brightness(
+def map_brightness(
     maps: ArrayLike, *, method: str = "likelihood", share: float = 0.02
 ) -> Float[np.ndarray, "F rows columns"]:
-    """Convert maps to brightness: 1 at the best pixel of each map, decreasing to 0 with the value of the map, and 0
-    outside the outline.
+    """Convert maps to brightness (F, rows, columns): 1 at the best pixel of each map, decreasing to 0 with the value of
+    the map, and 0 outside the outline.
 
-    `maps` (F, rows, columns): as returned by `Localiser.maps`. For the method "likelihood", brightness is the
-    likelihood divided by that of the best pixel, exp(−(map − minimum)). For "consistency", brightness is exp(−(map −
-    minimum) / scale); it is 1/e where the loss equals the quantile `share` over the pixels. Raises `ValueError` for
-    other methods or shapes.
+    For the method "likelihood", brightness is the likelihood divided by that of the best pixel, exp(−(map − minimum)).
+    For "consistency", it is exp(−(map − minimum) / scale), with the scale that makes it 1/e where the loss equals a
+    quantile over the pixels.
+
+    **Arguments:**
+
+    - `maps`: maps (F, rows, columns), as from `Localiser.maps`.
+    - `method`: "likelihood" or "consistency", the method of the localiser.
+    - `share`: the quantile, between 0 and 1, for "consistency".
+
+    Raises `ValueError` for other methods or shapes.
+
+    **Example:**
+
+    ```python
+    bright = map_brightness(loss_map[None])
+    print(bright.max())  # 1
+    ```
     """
     values = np.asarray(maps, float)
     if values.ndim != 3:
@@ -103,13 +117,28 @@ def brightness(
     return np.where(known, np.exp(-(flat - least) / scale), 0.0).reshape(values.shape)
 
 
-def overlay(images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3) -> Float[np.ndarray, "F rows columns"]:
+def overlay_images(
+    images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3
+) -> Float[np.ndarray, "F rows columns"]:
     """Overlay each frame with the frames before it, which fade as exp(−age / `time_constant`).
 
-    `images` (F, rows, columns): brightness, zero where there is no touch; NaN counts as zero. `times` (F,): increasing
-    times in seconds. `time_constant`: in seconds. Each pixel of the result (F, rows, columns) is the maximum over the
-    faded frames, so that a source at rest does not saturate it. The last image shows the whole recording. Raises
-    `ValueError` for shapes that disagree, times that do not increase, and a time constant that is not positive.
+    Each pixel of the result (F, rows, columns) is the maximum over the faded frames, so that a source at rest does not
+    saturate it. The last image shows the whole recording.
+
+    **Arguments:**
+
+    - `images`: brightness (F, rows, columns), zero where there is no touch; NaN counts as zero.
+    - `times`: increasing times (F,), seconds.
+    - `time_constant`: time in which a frame fades to 1/e, seconds.
+
+    Raises `ValueError` for shapes that disagree, times that do not increase, and a time constant that is not positive.
+
+    **Example:**
+
+    ```python
+    bright = map_brightness(np.stack([loss_map, loss_map]))
+    faded = overlay_images(bright, times=[0.0, 0.1])
+    ```
     """
     frames, when = np.nan_to_num(np.asarray(images, float)), np.asarray(times, float)
     if frames.ndim != 3 or when.shape != (len(frames),) or not len(frames):
@@ -127,7 +156,7 @@ def overlay(images: ArrayLike, times: ArrayLike, *, time_constant: float = 0.3) 
 
 
 def fade(images: ArrayLike, times: ArrayLike, *, at: float, time_constant: float) -> Float[np.ndarray, "rows columns"]:
-    """Compute the last image (rows, columns) of an `overlay` only, as seen at the time `at` in seconds.
+    """Compute the last image (rows, columns) of `overlay_images` only, as seen at the time `at` in seconds.
 
     A long recording can be processed in parts: the image of the whole is the maximum of the images of its parts.
     """

@@ -42,10 +42,23 @@ def locate_two(
     """Locate the most probable pair of sources of each frame. All pairs of positions on a coarse grid are screened, and
     the best three pairs are refined.
 
-    `power` (F, M): intensities minus the floor. `use` (F, M): mask of the intensities to use; by default all finite
-    ones. Since there are six unknowns, frames with fewer than six usable microphones give NaN. Both sources are
-    searched for within the bounding box of the outline. `compiled`: whether to compile the computation, for repeated
-    calls; calls within a JAX transformation are always compiled.
+    Since there are six unknowns, frames with fewer than six usable microphones give NaN. Both sources are searched for
+    within the bounding box of the outline.
+
+    **Arguments:**
+
+    - `microphone_array`: model of the array, such as that of a `Calibration`.
+    - `power`: intensities (F, M) minus the floor.
+    - `use`: mask (F, M) of the intensities to use; by default all finite ones.
+    - `compiled`: whether to compile the computation, for repeated calls; calls within a JAX transformation are always
+      compiled.
+
+    **Example:**
+
+    ```python
+    pair = locate_two(calibration.microphone_array, power)
+    print(pair.position.shape)
+    ```
     """
     at_hand = not compiled and np.size(power) > 0 and has_values(microphone_array, power, use)
     xp = np if at_hand else jnp

@@ -21,7 +21,7 @@ _STATISTICS = {
 }
 
 
-def plot_pairs(
+def plot_position_errors(
     true: ArrayLike,
     found: ArrayLike,
     microphones: ArrayLike,
@@ -30,12 +30,27 @@ def plot_pairs(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot true positions (P, d) and the corresponding estimates `found` (P, d), on a drawing of the surface with its
-    `microphones` (M, d). All positions are in metres.
+    """Plot true positions and the corresponding estimates, on a drawing of the surface with its microphones.
 
-    `surface`: an outline, a surface, a `MicrophoneArray` or a `Calibration`. The true positions of sources without an
-    estimate (NaN) are drawn as hollow markers. The default title is the mean ± standard deviation of the error. Raises
-    `ValueError` for shapes that disagree.
+    True positions of sources without an estimate (NaN) are drawn as hollow markers.
+
+    **Arguments:**
+
+    - `true`: true positions (P, d), metres.
+    - `found`: estimated positions (P, d), metres.
+    - `microphones`: positions (M, d), metres.
+    - `surface`: an outline, a surface, a `MicrophoneArray` or a `Calibration`.
+    - `title`: title of the plot; by default the mean ± standard deviation of the error.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for shapes that disagree.
+
+    **Example:**
+
+    ```python
+    true = np.array([[0.03, 0.02], [-0.05, 0.01]])
+    ax = plot_position_errors(true, true + 2e-3, skin.microphones, calibration)
+    ```
     """
     view = view_of(surface, microphones)
     place, guess = view.chart(true, "true"), view.chart(found, "found")
@@ -71,14 +86,30 @@ def plot_error_curve(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot localisation errors of one or several methods against `values` (K,) of a `quantity`.
+    """Plot localisation errors of one or several methods against another quantity, such as the noise.
 
-    `errors`: dictionary from the name of each method to its errors in metres. For errors (K, N) of N positions per
-    value, the `statistic` ("median", "mean" or "rms") is drawn as a line, and the interquartile range as a band; errors
-    (K,) are drawn as a line only. NaN is ignored. `bound`: the Cramér-Rao bound in metres, (K,) or (K, N); for (K, N)
-    the same statistic is drawn. `logarithmic`: whether the axis of `values` is logarithmic, for example for numbers of
-    microphones; the axis of errors is always logarithmic. Raises `ValueError` for shapes that disagree, for no errors,
-    and for more than six methods.
+    For errors of several positions per value a line shows their `statistic`, and a band their interquartile range. NaN
+    is ignored. The axis of errors is logarithmic.
+
+    **Arguments:**
+
+    - `values`: values (K,) of the quantity.
+    - `errors`: dictionary from the name of each method to its errors (K,) or (K, N), metres, for N positions per value.
+    - `bound`: the Cramér-Rao bound (K,) or (K, N), metres; for (K, N) its `statistic` is drawn.
+    - `quantity`: label of the axis of `values`.
+    - `statistic`: "median", "mean" or "rms".
+    - `logarithmic`: whether the axis of `values` is logarithmic, for example for numbers of microphones.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for shapes that disagree, for no errors, and for more than six methods.
+
+    **Example:**
+
+    ```python
+    errors = {"likelihood": [8e-3, 4e-3, 2e-3], "consistency": [12e-3, 7e-3, 5e-3]}
+    ax = plot_error_curve([0, 10, 20], errors)
+    ```
     """
     x = np.asarray(values, float)
     if x.ndim != 1 or not x.size or not np.isfinite(x).all() or (logarithmic and not (x > 0).all()):

@@ -42,11 +42,18 @@ _MAP_LABELS = {
 }
 
 
-class Marks(NamedTuple):
+class MapMarks(NamedTuple):
     """Positions to mark on a map.
 
     **Fields**: `truth`: true position (d,) in metres; `estimate`: estimated position (d,) in metres; `covariance`:
     covariance of the estimate (d, d) in m², drawn as a 95 % ellipse.
+
+    **Example:**
+
+    ```python
+    marks = MapMarks(truth=(0.03, 0.02), estimate=(0.031, 0.021))
+    ax = plot_loss_map(loss_map, calibration, marks=marks)
+    ```
     """
 
     truth: ArrayLike | None = None
@@ -60,7 +67,7 @@ def plot_loss_map(
     *,
     microphones: ArrayLike | None = None,
     received: ArrayLike | None = None,
-    marks: Marks | None = None,
+    marks: MapMarks | None = None,
     method: str = "likelihood",
     title: str | None = None,
     colour_bar: bool = True,
@@ -68,16 +75,32 @@ def plot_loss_map(
 ) -> Axes:
     """Plot the map of one frame from `Localiser.with_maps`. The most probable positions have the brightest colours.
 
-    `values` (rows, columns): the map over the bounding box of the outline, bottom row first, NaN outside the outline.
-    `surface`: a `Calibration`, a `MicrophoneArray`, a surface or an outline. `microphones`: positions (M, d) in metres;
-    by default those of the array. `received` (M,): intensities shown by the size of the microphones' circles. `marks`:
-    true and estimated position to mark. `method`: "likelihood" or "consistency". A likelihood map is drawn as
-    √(2 (map − minimum)), the number of standard deviations by which a position is worse than the best; a map of the
-    consistency loss (Park 2022) is drawn in decibels above its minimum. Raises `ValueError` for other methods, shapes
-    that disagree, and `marks` that are not `Marks`.
+    A likelihood map is drawn as √(2 (map − minimum)), the number of standard deviations by which a position is worse
+    than the best; a map of the consistency loss (Park 2022) is drawn in decibels above its minimum.
+
+    **Arguments:**
+
+    - `values`: map (rows, columns) over the bounding box of the outline, bottom row first, NaN outside the outline.
+    - `surface`: a `Calibration`, a `MicrophoneArray`, a surface or an outline.
+    - `microphones`: positions (M, d), metres; by default those of the array.
+    - `received`: intensities (M,), shown by the size of the microphones' circles.
+    - `marks`: true and estimated position to mark.
+    - `method`: "likelihood" or "consistency", the method of the localiser.
+    - `title`: title of the plot.
+    - `colour_bar`: whether to draw a colour bar.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for other methods, shapes that disagree, and `marks` that are not `MapMarks`.
+
+    **Example:**
+
+    ```python
+    ax = plot_loss_map(loss_map, calibration, received=power[0], marks=MapMarks(truth=(0.03, 0.02)))
+    ax.figure.savefig("map.png")
+    ```
     """
     if marks is not None:
-        check_kind("marks", marks, Marks, "Marks, such as Marks(truth=(0.02, 0.01))")
+        check_kind("marks", marks, MapMarks, "MapMarks, such as MapMarks(truth=(0.02, 0.01))")
     pixels = np.asarray(values, float)
     if pixels.ndim != 2 or not np.isfinite(pixels).any():
         raise ValueError(f"values has shape {pixels.shape}; give (rows, columns) with at least one finite value.")
@@ -106,7 +129,7 @@ def plot_loss_map(
     return ax
 
 
-def _draw_marks(ax: Axes, view: View, marks: Marks) -> list[Line2D]:
+def _draw_marks(ax: Axes, view: View, marks: MapMarks) -> list[Line2D]:
     """Draw the marked positions and return their legend entries. Raises `ValueError` for shapes that do not match the
     surface, and for a covariance without an estimate."""
     if marks.covariance is not None and marks.estimate is None:
@@ -163,11 +186,26 @@ def plot_receptive_fields(
     """Plot the receptive field of each microphone: the intensity of each tap, divided by the strength of the tap,
     against distance, with the fitted decay model.
 
-    `microphones`: indices of the microphones to draw, from 0 as in the messages of the calibration; by default all. Red
-    circles are taps excluded from the fit. The panel of an unusable microphone states the reason. The dashed line is
-    the standard deviation of the noise divided by the median strength of the taps. The number beside the index is the
-    distance at which the response is half that to a tap directly above the microphone. The panels are insets of the
-    returned axes. Raises `ValueError` for microphones that do not exist, and if `fit` is not a `CalibrationFit`.
+    Red circles are taps excluded from the fit. The panel of an unusable microphone states the reason. The dashed line
+    is the standard deviation of the noise divided by the median strength of the taps. The number beside the index is
+    the distance at which the response is half that to a tap directly above the microphone. The panels are insets of the
+    returned axes.
+
+    **Arguments:**
+
+    - `fit`: result of `calibrate_microphones`.
+    - `microphones`: indices of the microphones to draw, from 0 as in the messages of the calibration; by default all.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for microphones that do not exist, and if `fit` is not a `CalibrationFit`.
+
+    **Example:**
+
+    ```python
+    ax = plot_receptive_fields(fit, microphones=[0, 1, 2])
+    ax.figure.savefig("fields.png")
+    ```
     """
     check_kind("fit", fit, CalibrationFit, "a CalibrationFit, as of calibrate_microphones")
     number = fit.power.shape[1]

@@ -47,12 +47,30 @@ def plot_track(
     """Plot the path of every touch, coloured by time, with its onset and offset. Dots are the positions of individual
     frames.
 
-    `array`: a `Calibration` or `MicrophoneArray`; microphones that are unusable, or not used in any frame of
-    `locations`, are drawn as crosses. `overlay` (rows, columns): brightness from 0 to 1 over the bounding box of the
-    outline, bottom row first, as in the last image of `jeit.acoustic.localisation.pixels.overlay`. `truth` (N, d): true
-    path in metres, if known. A touch at rest is drawn as a dot with its 95 % ellipse. Frames whose status is not
-    "touch" have their own markers, explained in the legend. A curved surface is drawn in the coordinates of its chart.
+    A touch at rest is drawn as a dot with its 95 % ellipse. Frames whose status is not "touch" have their own markers,
+    explained in the legend. A curved surface is drawn in the coordinates of its chart.
+
+    **Arguments:**
+
+    - `track`: smoothed positions, as from the function `track`.
+    - `locations`: positions of the frames, as from `locate`.
+    - `array`: a `Calibration` or `MicrophoneArray`; microphones that are unusable, or not used in any frame of
+      `locations`, are drawn as crosses.
+    - `overlay`: brightness (rows, columns) from 0 to 1 over the bounding box of the outline, bottom row first, as in
+      the last image of `overlay_images`.
+    - `truth`: true path (N, d), metres, if known.
+    - `title`: title of the plot.
+    - `colour_bar`: whether to draw a colour bar.
+    - `ax`: axes to draw into; by default new ones.
+
     Raises `ValueError` for shapes that disagree, and for arguments of the wrong type.
+
+    **Example:**
+
+    ```python
+    ax = plot_track(track(locations), locations, calibration, truth=[(0.03, 0.02)])
+    ax.figure.savefig("track.png")
+    ```
     """
     check_kind("track", track, Track, "a Track, as of jeit.acoustic.track(locations)")
     check_kind("locations", locations, Locations, "Locations, as of jeit.acoustic.locate")

@@ -156,6 +156,13 @@ class IntensitySettings(Module):
 
     The sound of touches on a soft skin is below 1 kHz. Below 50 Hz, motion of the skin and of the arm that wears it
     dominates. Raises `ValueError` for an invalid band, and for times that are invalid or probably not in seconds.
+
+    **Example:**
+
+    ```python
+    settings = IntensitySettings(low=100, high=800, window=0.04, hop=0.01)
+    measured = intensities(recording, settings)
+    ```
     """
 
     low: float = 50.0
@@ -213,9 +220,22 @@ def intensities(
 ) -> Intensities:
     """Compute the intensities of a recording in sliding windows. Windows with faults are marked as not usable.
 
-    `floor` (M,): noise floor in the squared unit of the samples. By default it is estimated from the quietest windows,
-    which requires that at least a fifth of all windows contain no touch. If touches never pause, give the floor
-    measured in silence. Raises `ValueError` if band, window and recording are not compatible.
+    **Arguments:**
+
+    - `recording`: samples of the microphones.
+    - `settings`: band and windows, by default `IntensitySettings()`.
+    - `floor`: noise floor (M,) in the squared unit of the samples. By default it is estimated from the quietest
+      windows, which requires that at least a fifth of all windows contain no touch. If touches never pause, give the
+      floor measured in silence.
+
+    Raises `ValueError` if band, window and recording are not compatible.
+
+    **Example:**
+
+    ```python
+    measured = intensities(recording)
+    print(measured.power.max(axis=0))
+    ```
     """
     check_kind("recording", recording, Recording, "a Recording of samples, as of read_recording(path)")
     check_settings("settings", settings)
@@ -249,12 +269,24 @@ def tap_intensities(taps: Taps, settings: IntensitySettings | None = None) -> Ta
     loudness of a window is the sum over microphones of (power − floor) / floor; the tap is audible where the loudness
     is at least half its maximum. A microphone with a fault in one of these windows is not usable for the tap, since
     other windows have another loudness. The noise floor is estimated from the quietest windows of all taps, so the
-    recordings should include some silence before or after the taps. `freedom` accounts for the overlap of windows,
-    exactly for white noise, but not for the selection of windows: if a tap is not audible at all, the loudest windows
-    of noise are selected, and its power is somewhat too high.
+    recordings should include some silence before or after the taps. `freedom` of the result accounts for the overlap of
+    windows, exactly for white noise, but not for the selection of windows: if a tap is not audible at all, the loudest
+    windows of noise are selected, and its power is somewhat too high.
 
-    If `taps` contains intensities instead of samples, these are returned unchanged, with a floor of zero and infinite
-    `freedom`. Raises `ValueError` if `taps` is not a `Taps`, and if band, window and samples are not compatible.
+    **Arguments:**
+
+    - `taps`: the taps. If they contain intensities instead of samples, these are returned unchanged, with a floor of
+      zero and infinite `freedom`.
+    - `settings`: band and windows, by default `IntensitySettings()`.
+
+    Raises `ValueError` if `taps` is not a `Taps`, and if band, window and samples are not compatible.
+
+    **Example:**
+
+    ```python
+    measured = tap_intensities(taps)
+    print(measured.power.shape)  # (T, M)
+    ```
     """
     check_kind("taps", taps, Taps, "Taps, as of read_taps(path)")
     check_settings("settings", settings)

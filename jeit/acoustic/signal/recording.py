@@ -128,11 +128,20 @@ _LOUDEST = 1e15
 class Recording(Module):
     """Simultaneous samples of M microphones.
 
-    - `samples`: (M, S), in any unit (volts, counts, fractions of full scale). NaN and infinite samples are kept;
+    **Arguments:**
+
+    - `samples`: samples (M, S) in any unit (volts, counts, fractions of full scale). NaN and infinite samples are kept;
       magnitudes above 1e15 are replaced by infinity.
-    - `rate`: sampling rate of each microphone in Hz.
+    - `rate`: sampling rate of each microphone, Hz.
     - `full_scale`: largest magnitude of a sample that the device can return, or None if unknown.
     - `name`: name of the recording, used in messages.
+
+    **Example:**
+
+    ```python
+    recorded = Recording(np.random.default_rng(0).normal(size=(16, 8000)), rate=4000)
+    measured = intensities(recorded)
+    ```
     """
 
     samples: Float[np.ndarray, "M S"]
@@ -160,17 +169,26 @@ class Recording(Module):
 class Intensities(Module):
     """Band power of M microphones in F time windows.
 
-    - `times`: (F,) middle of each window in seconds.
-    - `power`: (F, M) band power minus the noise floor, in the squared unit of the samples. Values may be negative, and
+    **Arguments:**
+
+    - `times`: middle (F,) of each window, seconds.
+    - `power`: band power (F, M) minus the noise floor, in the squared unit of the samples. Values may be negative, and
       are NaN only where they are not usable.
-    - `floor`: (M,) noise power that was subtracted; zero if unknown.
+    - `floor`: noise power (M,) that was subtracted; zero if unknown.
     - `freedom`: degrees of freedom ν of the power of white noise in a window: its variance is 2 floor² / ν. Infinite if
       unknown.
     - `overlap`: length of a window divided by the hop between windows; 1 if windows do not overlap.
-    - `usable`: (F, M) mask of the windows without a fault.
+    - `usable`: mask (F, M) of the windows without a fault; by default where `power` is finite.
     - `faults`: M descriptions of the fault of each channel; "" for none.
     - `name`: name of the recording, used in messages.
     - `notes`: remarks on the measurement.
+
+    **Example:**
+
+    ```python
+    measured = Intensities(times=[0.0, 0.1], power=np.ones((2, 16)))
+    locations = locate(measured, calibration)
+    ```
     """
 
     times: Float[np.ndarray, " F"]
@@ -238,15 +256,24 @@ class Intensities(Module):
 
 
 class Taps(Module):
-    """T touches at known positions, for calibration; d = 2 or 3.
+    """T touches at known positions, for calibration; d = 2 or 3. Give either `power`, or `samples` and `rate`.
 
-    - `microphones`: (M, d) positions of the microphones in metres.
-    - `positions`: (T, d) positions of the taps in metres.
-    - `outline`: (K, d) vertices of the skin's outline in order, in metres. A plane outline is ordered
-      counter-clockwise.
-    - `power`: (T, M) intensity of each tap above the noise floor, or None.
-    - `samples`: (T, M, S) recording of each tap, or None; `rate`: sampling rate in Hz, or None.
+    **Arguments:**
+
+    - `microphones`: positions (M, d) of the microphones, metres.
+    - `outline`: vertices (K, d) of the skin's outline in order, metres. A plane outline is ordered counter-clockwise.
+    - `positions`: positions (T, d) of the taps, metres.
+    - `power`: intensity (T, M) of each tap above the noise floor.
+    - `samples`: recording (T, M, S) of each tap.
+    - `rate`: sampling rate of the samples, Hz.
     - `full_scale`, `name`: as in `Recording`.
+
+    **Example:**
+
+    ```python
+    taps = Taps(skin.microphones, outline, tapped.positions, samples=tapped.samples, rate=tapped.rate)
+    fit = calibrate_microphones(taps, decay="inverse-square")
+    ```
     """
 
     microphones: Float[np.ndarray, "M d"]
@@ -320,8 +347,20 @@ def read_recording(path: str | Path) -> Recording | Intensities:
 
     An NPZ file contains either `samples` (M, S), `rate` in Hz and optionally `full_scale`; or `intensity` (F, M),
     `times` (F,) in seconds and optionally `floor` (M,), `freedom` and `overlap`, as in `Intensities`. Integer samples
-    of a sound file are converted to fractions of full scale, from -1 to 1. Raises `ValueError` for any other content,
-    and `OSError` if the file cannot be opened.
+    of a sound file are converted to fractions of full scale, from -1 to 1.
+
+    **Arguments:**
+
+    - `path`: path of the file.
+
+    Raises `ValueError` for any other content, and `OSError` if the file cannot be opened.
+
+    **Example:**
+
+    ```python
+    write_recording("recording.npz", recording)
+    same = read_recording("recording.npz")
+    ```
     """
     path = Path(path)
     try:
@@ -350,8 +389,20 @@ def read_taps(path: str | Path) -> Taps:
     """Read calibration taps from an NPZ file.
 
     The file contains `microphones` (M, d), `outline` (K, d) and `positions` (T, d) in metres; either `intensity` (T, M)
-    or `samples` (T, M, S) and `rate` in Hz; and optionally `full_scale`. Raises `ValueError` for other content, and
-    `OSError` if the file cannot be opened.
+    or `samples` (T, M, S) and `rate` in Hz; and optionally `full_scale`.
+
+    **Arguments:**
+
+    - `path`: path of the file.
+
+    Raises `ValueError` for other content, and `OSError` if the file cannot be opened.
+
+    **Example:**
+
+    ```python
+    write_taps("taps.npz", taps)
+    same = read_taps("taps.npz")
+    ```
     """
     path = Path(path)
     geometry = ("microphones", "outline", "positions")
@@ -371,7 +422,20 @@ def read_taps(path: str | Path) -> Taps:
 
 
 def write_recording(path: str | Path, recording: Recording | Intensities) -> None:
-    """Write a recording to an NPZ file for `read_recording`. Intensities that are not usable are written as NaN."""
+    """Write a recording to an NPZ file for `read_recording`. Intensities that are not usable are written as NaN.
+
+    **Arguments:**
+
+    - `path`: path of the file.
+    - `recording`: samples or intensities.
+
+    **Example:**
+
+    ```python
+    write_recording("recording.npz", recording)
+    same = read_recording("recording.npz")
+    ```
+    """
     if isinstance(recording, Recording):
         _write_npz(path, samples=recording.samples, rate=recording.rate, full_scale=recording.full_scale)
     else:
@@ -380,7 +444,20 @@ def write_recording(path: str | Path, recording: Recording | Intensities) -> Non
 
 
 def write_taps(path: str | Path, taps: Taps) -> None:
-    """Write taps to an NPZ file for `read_taps`."""
+    """Write taps to an NPZ file for `read_taps`.
+
+    **Arguments:**
+
+    - `path`: path of the file.
+    - `taps`: the taps.
+
+    **Example:**
+
+    ```python
+    write_taps("taps.npz", taps)
+    same = read_taps("taps.npz")
+    ```
+    """
     geometry = {"microphones": taps.microphones, "outline": taps.outline, "positions": taps.positions}
     _write_npz(path, **geometry, intensity=taps.power, samples=taps.samples, rate=taps.rate, full_scale=taps.full_scale)
 

@@ -1,25 +1,25 @@
-from .calibration_recording import calibration_taps
+from .calibration_recording import simulate_calibration_taps
 from .microphones import microphone_grid
-from .people import SoundClip, SoundingPerson, sound_clips
-from .sound import quiet
+from .people import SoundClip, SoundingPerson, simulate_sound_clips
+from .sound import simulate_silence
 from .sounding_skin import SoundingSkin
 from .synthesis import Burst
-from .touches import pat, stroke, tap, tickle
-from .wind_sound import room_sound, wind
+from .touches import simulate_pat, simulate_stroke, simulate_tap, simulate_tickle
+from .wind_sound import simulate_room_sound, simulate_wind
 
 __all__ = [
     "Burst",
     "SoundClip",
     "SoundingPerson",
     "SoundingSkin",
-    "calibration_taps",
     "microphone_grid",
-    "pat",
-    "quiet",
-    "room_sound",
-    "sound_clips",
-    "stroke",
-    "tap",
-    "tickle",
-    "wind",
+    "simulate_calibration_taps",
+    "simulate_pat",
+    "simulate_room_sound",
+    "simulate_silence",
+    "simulate_sound_clips",
+    "simulate_stroke",
+    "simulate_tap",
+    "simulate_tickle",
+    "simulate_wind",
 ]

@@ -46,7 +46,7 @@ class CalibrationTaps(Module):
     strengths: Float[np.ndarray, " T"]
 
 
-def calibration_taps(
+def simulate_calibration_taps(
     skin: SoundingSkin,
     key: Array,
     positions: ArrayLike,
@@ -58,11 +58,30 @@ def calibration_taps(
     noise: bool = True,
     progress: Callable[[str], None] | None = None,
 ) -> CalibrationTaps:
-    """Simulate `repeats` taps at each of `positions` (P, 2) in metres: T = P · repeats recordings, ordered by position.
+    """Simulate repeated taps at each of P positions: T = P · repeats recordings, ordered by position.
 
-    The strengths are log-normal with the median `burst.strength` and the standard deviation `strength_spread` of the
-    logarithm; they are unknown to a calibration. `progress` is called with a text after each part of the computation.
-    The other arguments are those of `tap`. Raises `ValueError` as `tap` does.
+    The strengths are log-normal; they are unknown to a calibration.
+
+    **Arguments:**
+
+    - `skin`: the simulated skin.
+    - `key`: random key.
+    - `positions`: tapped positions (P, 2), metres.
+    - `repeats`: number of taps at each position.
+    - `burst`: envelope of a tap; its strength is the median of the strengths.
+    - `strength_spread`: standard deviation of the logarithm of the strength.
+    - `duration`: duration of each recording, seconds.
+    - `noise`: whether to add the microphones' noise.
+    - `progress`: called with a text after each part of the computation.
+
+    Raises `ValueError` as `simulate_tap` does.
+
+    **Example:**
+
+    ```python
+    tapped = simulate_calibration_taps(skin, key, grid(0.1, 0.1, 2, 2), repeats=1)
+    print(tapped.samples.shape)  # (4, 16, …)
+    ```
     """
     check_skin_and_key(skin, key)
     places = skin.layer.check_inside("positions", positions)

@@ -94,7 +94,19 @@ class Readout(Module):
 def microphone_grid(number: int, *, width: float = 0.2, height: float = 0.2) -> np.ndarray:
     """Centres (number², 2) in metres of number × number equal cells of the skin, row by row from the lower left.
 
+    **Arguments:**
+
+    - `number`: number of microphones in a row and in a column.
+    - `width`, `height`: sides of the skin, metres.
+
     Raises `ValueError` if `number` is less than 1.
+
+    **Example:**
+
+    ```python
+    skin = SoundingSkin(key, microphone_grid(3, width=0.2, height=0.2))
+    print(skin.microphones.shape)  # (9, 2)
+    ```
     """
     if number < 1:
         raise ValueError(f"number: give the number of points in a row, at least 1; it is {number}.")

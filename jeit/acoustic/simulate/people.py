@@ -10,11 +10,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, quiet, record
+from jeit.acoustic.simulate.sound import HOP, SimulatedSound, block_times, record, simulate_silence
 from jeit.acoustic.simulate.sounding_skin import SoundingSkin, check_skin_and_key
 from jeit.acoustic.simulate.synthesis import ONSET, Burst, microphone_noise, sample_times
 from jeit.acoustic.simulate.touches import NOMINAL_SPEED
-from jeit.acoustic.simulate.wind_sound import TURBULENCE, room_sound, wind
+from jeit.acoustic.simulate.wind_sound import TURBULENCE, simulate_room_sound, simulate_wind
 from jeit.arguments import check_key, check_kind, check_name, describe
 from jeit.arguments.checks import check_positive
 from jeit_solvers.module import Module
@@ -84,6 +84,13 @@ class SoundingPerson(Module):
     """Traits of one person.
 
     **Fields**: `medians`: for each modality, dictionary of the person's traits by name, in SI units.
+
+    **Example:**
+
+    ```python
+    person = SoundingPerson.draw(key)
+    touch = person.touch(key, "stroke", skin, duration=2.0)
+    ```
     """
 
     medians: Mapping[str, Mapping[str, float]] = eqx.field(static=True)
@@ -184,7 +191,7 @@ def _simulate_wind(
     rng: np.random.Generator, skin: SoundingSkin, key: Array, traits: dict, duration: float
 ) -> SimulatedSound:
     """Simulate an air jet at a random position."""
-    return wind(
+    return simulate_wind(
         skin, key, _random_position(rng, skin), slope=skin.spectral_slope, duration=duration, noise=False, **traits
     )
 
@@ -199,7 +206,7 @@ _SIMULATIONS: dict[str, Callable[..., SimulatedSound]] = {
 
 def _silence(skin: SoundingSkin, duration: float) -> SimulatedSound:
     """Simulate a recording without a touch and without noise."""
-    silence = quiet(skin, jax.random.key(0), duration=duration)
+    silence = simulate_silence(skin, jax.random.key(0), duration=duration)
     return SimulatedSound(
         np.zeros_like(silence.samples), skin.rate, np.zeros((0, 2)), np.zeros(0), silence.active, False
     )
@@ -248,7 +255,7 @@ class SoundClip:
         return self.touch.samples + 10 ** (decibels / 20) * self.noise
 
 
-def sound_clips(
+def simulate_sound_clips(
     key: Array,
     skin: SoundingSkin,
     people: Sequence[SoundingPerson],
@@ -257,12 +264,29 @@ def sound_clips(
     modalities: Sequence[str] = MODALITIES,
     duration: float = 2.9,
 ) -> Iterator[SoundClip]:
-    """Yield `each` clips of each modality by each person, ordered by person and modality. Clips are generated one at a
-    time, so that a large set need not fit into memory.
+    """Yield recordings of touches by several people, ordered by person and modality. Clips are generated one at a time,
+    so that a large set need not fit into memory.
 
     The noise consists of the microphones' noise and the room's sound, whose level in decibels relative to that noise is
-    normal with a mean of -6 dB. Every clip has its own random key. Raises `ValueError` for invalid arguments, and for
-    an empty list of people.
+    normal with a mean of -6 dB. Every clip has its own random key.
+
+    **Arguments:**
+
+    - `key`: random key.
+    - `skin`: the simulated skin.
+    - `people`: the people, as from `SoundingPerson.draw`.
+    - `each`: number of clips of each modality by each person.
+    - `modalities`: kinds of touch: "pat", "tickle", "stroke", "wind" and "none".
+    - `duration`: duration of a clip, seconds.
+
+    Raises `ValueError` for invalid arguments, and for an empty list of people.
+
+    **Example:**
+
+    ```python
+    people = [SoundingPerson.draw(key)]
+    clips = list(simulate_sound_clips(key, skin, people, 1, modalities=("pat", "stroke")))
+    ```
     """
     check_skin_and_key(skin, key)
     check_kind("people", people, (list, tuple), "a list of them, such as [SoundingPerson.draw(key)]")
@@ -286,5 +310,5 @@ def _clips(key, skin, people, each, modalities, duration) -> Iterator[SoundClip]
         touched, own, room, loud = jax.random.split(jax.random.fold_in(key, number), 4)
         touch = people[person].touch(touched, modality, skin, duration=duration)
         level = _ROOM + _ROOM_SPREAD * float(jax.random.normal(loud))
-        around = room_sound(skin, room, level_db=level, duration=duration).samples
+        around = simulate_room_sound(skin, room, level_db=level, duration=duration).samples
         yield SoundClip(touch, microphone_noise(skin, own, count) + around, modality, person)

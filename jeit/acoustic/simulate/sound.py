@@ -38,9 +38,9 @@ class SimulatedSound(Module):
     """Samples of all channels during a touch, and the true source.
 
     **Fields**: `samples`: (M, S), in the unit of source strength; `rate`: sampling rate in Hz; `position`: positions
-    (N, 2) of the source in metres at `position_times` (N,) in seconds, where N = 0 for `quiet`, and a silent source has
-    the position of its last or first sound; `active`: root mean square (S,) of the source at `times`, without the delay
-    of propagation; `noisy`: whether the samples include noise.
+    (N, 2) of the source in metres at `position_times` (N,) in seconds, where N = 0 for `simulate_silence`, and a silent
+    source has the position of its last or first sound; `active`: root mean square (S,) of the source at `times`,
+    without the delay of propagation; `noisy`: whether the samples include noise.
     """
 
     samples: Float[np.ndarray, "M S"]
@@ -56,8 +56,24 @@ class SimulatedSound(Module):
         return np.arange(self.samples.shape[1]) / self.rate
 
 
-def quiet(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -> SimulatedSound:
-    """Simulate `duration` seconds of microphone noise without a source. Raises `ValueError` for an invalid duration."""
+def simulate_silence(skin: SoundingSkin, key: Array, *, duration: float = 1.0) -> SimulatedSound:
+    """Simulate the noise of the microphones without a source.
+
+    **Arguments:**
+
+    - `skin`: the simulated skin.
+    - `key`: random key.
+    - `duration`: duration of the recording, seconds.
+
+    Raises `ValueError` for an invalid duration.
+
+    **Example:**
+
+    ```python
+    sound = simulate_silence(skin, key, duration=2.0)
+    silence = Recording(sound.samples, sound.rate)
+    ```
+    """
     check_skin_and_key(skin, key)
     check_positive("duration", duration)
     times = sample_times(skin, duration)

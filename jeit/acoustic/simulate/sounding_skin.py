@@ -137,20 +137,31 @@ class ElastomerLayer(Module):
 
 
 class SoundingSkin(Module):
-    """An elastomer layer with microphones under its surface.
+    """An elastomer layer with microphones under its surface, for simulations.
 
     The unit of samples is arbitrary: a source of strength 1 has a mean square of 1 at a nominal microphone directly
     below it, without loss and echoes.
 
-    **Fields**
+    **Arguments:**
 
-    - `microphones`: positions (M, 2) in metres. `microphone_depth`: depth (M,) under the surface in metres.
-    - `gain`: amplitude gain (M,) of each microphone. `noise_factor`: noise power (M,) of each microphone divided by
-      that of the nominal microphone.
-    - `layer`: shape and material of the layer. `microphone_model`: properties of the nominal microphone. `readout`:
-      filters and sampling.
+    - `key`: random key from which depths, gains and noise of the microphones are drawn.
+    - `microphones`: positions (M, 2), metres; by default those of `microphone_grid(5)`.
+    - `layer`: shape and material of the layer.
+    - `microphone_model`: properties of the nominal microphone.
+    - `readout`: filters and sampling.
     - `spectral_slope`: the power spectral density of a touch is proportional to frequency to the power
       −`spectral_slope` (1 is 3 dB per octave).
+
+    **Fields**: the arguments except `key`, and of each microphone the depth under the surface `microphone_depth` (M,)
+    in metres, the amplitude `gain` (M,), and `noise_factor` (M,), its noise power divided by that of the nominal
+    microphone.
+
+    **Example:**
+
+    ```python
+    skin = SoundingSkin(key, microphone_grid(3))
+    touch = simulate_tap(skin, key, (0.03, 0.02))
+    ```
     """
 
     microphones: Float[Array, "M 2"]

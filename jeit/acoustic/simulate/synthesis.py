@@ -91,6 +91,13 @@ class Burst(Module):
 
     **Fields**: `strength`: root mean square over `length`; `length`: duration in seconds. Raises `ValueError` for
     values that are not positive.
+
+    **Example:**
+
+    ```python
+    light = Burst(strength=0.5, length=0.04)
+    touch = simulate_tap(skin, key, (0.02, 0.01), burst=light)
+    ```
     """
 
     strength: float = 1.0

@@ -22,7 +22,7 @@ from jeit.arguments.checks import check_positive
 NOMINAL_SPEED = 0.1
 
 
-def tap(
+def simulate_tap(
     skin: SoundingSkin,
     key: Array,
     position: ArrayLike,
@@ -33,12 +33,28 @@ def tap(
     duration: float = 0.15,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate taps at one `position` (2,) in metres, as by a vibrator with a rubber tip.
+    """Simulate taps at one position, as by a vibrator with a rubber tip.
 
-    `burst`: envelope of a tap. `repeats`: number of taps; `frequency`: taps per second. `duration`: duration of the
-    recording in seconds, extended if the taps take longer. `noise`: whether to add the microphones' noise. Raises
-    `ValueError` for a position outside the skin, for values that are not positive, and if `duration` is too short for
-    one tap.
+    **Arguments:**
+
+    - `skin`: the simulated skin.
+    - `key`: random key.
+    - `position`: position (2,), metres.
+    - `burst`: envelope of a tap.
+    - `repeats`: number of taps.
+    - `frequency`: taps per second.
+    - `duration`: duration of the recording, seconds, extended if the taps take longer.
+    - `noise`: whether to add the microphones' noise.
+
+    Raises `ValueError` for a position outside the skin, for values that are not positive, and if `duration` is too
+    short for one tap.
+
+    **Example:**
+
+    ```python
+    touch = simulate_tap(skin, key, (0.03, 0.02), repeats=2)
+    recording = Recording(touch.samples, touch.rate)
+    ```
     """
     check_skin_and_key(skin, key)
     check_positive("frequency", frequency)
@@ -51,7 +67,7 @@ def tap(
     return record(skin, key, _check_place(skin, position), envelope, noise)
 
 
-def pat(
+def simulate_pat(
     skin: SoundingSkin,
     key: Array,
     position: ArrayLike,
@@ -62,13 +78,34 @@ def pat(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate firm taps of a hand at one `position` (2,) in metres, `interval` seconds apart; see `tap`."""
+    """Simulate firm taps of a hand at one position, at regular intervals.
+
+    **Arguments:**
+
+    - `skin`: the simulated skin.
+    - `key`: random key.
+    - `position`: position (2,), metres.
+    - `burst`: envelope of a tap.
+    - `taps`: number of taps.
+    - `interval`: time between taps, seconds.
+    - `duration`: duration of the recording, seconds, extended if the taps take longer.
+    - `noise`: whether to add the microphones' noise.
+
+    Raises `ValueError` as `simulate_tap` does.
+
+    **Example:**
+
+    ```python
+    touch = simulate_pat(skin, key, (0.03, 0.02), taps=4)
+    recording = Recording(touch.samples, touch.rate)
+    ```
+    """
     check_positive("interval", interval)
     repeated = {"repeats": taps, "frequency": 1 / interval}
-    return tap(skin, key, position, burst=burst, **repeated, duration=duration, noise=noise)
+    return simulate_tap(skin, key, position, burst=burst, **repeated, duration=duration, noise=noise)
 
 
-def tickle(
+def simulate_tickle(
     skin: SoundingSkin,
     key: Array,
     position: ArrayLike,
@@ -79,12 +116,31 @@ def tickle(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate many light taps of random strength and rhythm near `position` (2,) in metres.
+    """Simulate many light taps of random strength and rhythm near a position.
 
-    Each tap is half way between the previous tap and a random position within `radius` metres of `position`; positions
-    outside the skin are moved to its edge. The strengths are log-normal with the median `burst.strength` and the
-    standard deviation 0.3 of the logarithm. Each tap is delayed by a random part of up to a quarter of the interval.
-    Raises `ValueError` as `tap` does.
+    Each tap is half way between the previous tap and a random position near the given one; positions outside the skin
+    are moved to its edge. The strengths are log-normal with the standard deviation 0.3 of the logarithm. Each tap is
+    delayed by a random part of up to a quarter of the interval.
+
+    **Arguments:**
+
+    - `skin`: the simulated skin.
+    - `key`: random key.
+    - `position`: mean position (2,), metres.
+    - `burst`: envelope of a tap; its strength is the median of the strengths.
+    - `radius`: largest distance of the random positions from `position`, metres.
+    - `taps_per_second`: mean number of taps per second.
+    - `duration`: duration of the recording, seconds.
+    - `noise`: whether to add the microphones' noise.
+
+    Raises `ValueError` as `simulate_tap` does.
+
+    **Example:**
+
+    ```python
+    touch = simulate_tickle(skin, key, (0.03, 0.02), radius=0.015)
+    recording = Recording(touch.samples, touch.rate)
+    ```
     """
     check_skin_and_key(skin, key)
     middle = _check_place(skin, position)[0]
@@ -108,7 +164,7 @@ def tickle(
     return record(skin, rest, places[blocks], burst.envelope(times, onsets, strengths), noise)
 
 
-def stroke(
+def simulate_stroke(
     skin: SoundingSkin,
     key: Array,
     path: ArrayLike,
@@ -117,11 +173,26 @@ def stroke(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate a finger that rubs along `path` for `duration` seconds.
+    """Simulate a finger that rubs along a path.
 
-    `path`: vertices (K, 2) of a polyline in metres, traversed at constant speed; or a function that returns positions
-    (N, 2) in metres at times (N,) in seconds. `strength`: root mean square of the source at 0.1 m/s; it is proportional
-    to the square root of speed. Raises `ValueError` for paths that leave the skin or have no length.
+    **Arguments:**
+
+    - `skin`: the simulated skin.
+    - `key`: random key.
+    - `path`: vertices (K, 2) of a polyline, metres, traversed at constant speed; or a function that returns positions
+      (N, 2) in metres at times (N,) in seconds.
+    - `strength`: root mean square of the source at 0.1 m/s; it is proportional to the square root of speed.
+    - `duration`: duration of the stroke, seconds.
+    - `noise`: whether to add the microphones' noise.
+
+    Raises `ValueError` for paths that leave the skin or have no length.
+
+    **Example:**
+
+    ```python
+    touch = simulate_stroke(skin, key, [(-0.05, 0.0), (0.05, 0.02)], duration=0.5)
+    recording = Recording(touch.samples, touch.rate)
+    ```
     """
     check_skin_and_key(skin, key)
     check_positive("strength", strength)

@@ -28,7 +28,7 @@ _PLACES, _FREQUENCIES = 64, 160
 TURBULENCE = 5 / 3
 
 
-def wind(
+def simulate_wind(
     skin: SoundingSkin,
     key: Array,
     position: ArrayLike,
@@ -41,15 +41,33 @@ def wind(
     duration: float = 1.0,
     noise: bool = True,
 ) -> SimulatedSound:
-    """Simulate a steady jet of air, such as from an air brush, at `position` (2,) in metres.
+    """Simulate a steady jet of air on the skin, such as from an air brush.
 
-    Eddies act as independent sources at 64 random positions, normally distributed about `position` with the standard
-    deviation `radius` in metres. Their power spectral density is proportional to frequency to the power −`slope`, and
-    the root mean square of their sum is `strength`. Since eddies are much smaller than the spacing of the microphones,
-    the microphones receive independent noise, each with the total power that it receives from these positions. The
-    logarithm of the amplitude varies with the standard deviation `gusts` and the correlation time `gust_time` in
-    seconds. `noise`: whether to add the microphones' noise. Raises `ValueError` for a position outside the skin, and
-    for values out of range.
+    Eddies act as independent sources at 64 random positions. Since eddies are much smaller than the spacing of the
+    microphones, the microphones receive independent noise, each with the total power that it receives from these
+    positions.
+
+    **Arguments:**
+
+    - `skin`: the simulated skin.
+    - `key`: random key.
+    - `position`: mean position (2,) of the eddies, metres.
+    - `strength`: root mean square of the sum of all sources.
+    - `radius`: standard deviation of the normally distributed positions of the eddies, metres.
+    - `gusts`: standard deviation of the logarithm of the amplitude, which varies with time.
+    - `gust_time`: correlation time of the amplitude, seconds.
+    - `slope`: the power spectral density is proportional to frequency to the power −`slope`.
+    - `duration`: duration of the recording, seconds.
+    - `noise`: whether to add the microphones' noise.
+
+    Raises `ValueError` for a position outside the skin, and for values out of range.
+
+    **Example:**
+
+    ```python
+    sound = simulate_wind(skin, key, (0.03, 0.02), strength=2.0)
+    recording = Recording(sound.samples, sound.rate)
+    ```
     """
     check_skin_and_key(skin, key)
     middle = skin.layer.check_inside("position", [position])[0]
@@ -71,14 +89,27 @@ def wind(
     return SimulatedSound(samples, skin.rate, np.tile(middle, (len(kept), 1)), kept, strength * loud, noise)
 
 
-def room_sound(
+def simulate_room_sound(
     skin: SoundingSkin, key: Array, *, level_db: float = 0.0, slope: float = 1.0, duration: float = 1.0
 ) -> SimulatedSound:
     """Simulate the sound of a room: the same signal for all microphones, multiplied by their gains.
 
-    `level_db`: its power relative to the noise of the nominal microphone, in decibels. `slope`: its power spectral
-    density is proportional to frequency to the power −`slope`. Raises `ValueError` for a level that is not finite, a
-    negative slope, and a duration that is not positive.
+    **Arguments:**
+
+    - `skin`: the simulated skin.
+    - `key`: random key.
+    - `level_db`: power of the sound relative to the noise of the nominal microphone, decibels.
+    - `slope`: the power spectral density is proportional to frequency to the power −`slope`.
+    - `duration`: duration of the recording, seconds.
+
+    Raises `ValueError` for a level that is not finite, a negative slope, and a duration that is not positive.
+
+    **Example:**
+
+    ```python
+    sound = simulate_room_sound(skin, key, level_db=-6)
+    recording = Recording(sound.samples, sound.rate)
+    ```
     """
     check_skin_and_key(skin, key)
     check_positive("duration", duration)

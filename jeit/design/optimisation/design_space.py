@@ -79,6 +79,13 @@ class DesignSpace(Module):
     - `contact_impedance`: two limits, ohm·m², between which the contact impedances are varied; None to keep them.
     - `thickness`: two limits, metres, between which the thickness of the sheet is varied, starting from that of the
       skin; its sheet conductivity is proportional to it. None to keep it.
+
+    **Example:**
+
+    ```python
+    space = DesignSpace(minimum_spacing=0.012, symmetry="rotate-2")
+    optimised = optimise_layout(sheet, objective, space, steps=1)
+    ```
     """
 
     outline: Domain | None

@@ -97,6 +97,13 @@ def optimise_layout(
 
     Raises `ValueError` for a layer, for arguments that `layout_scores` rejects, if the touches are for another
     thickness, and for constraints that cannot be satisfied.
+
+    **Example:**
+
+    ```python
+    optimised = optimise_layout(sheet, objective, DesignSpace(minimum_spacing=0.012), steps=1)
+    print(optimised.status, optimised.start_value, optimised.value)
+    ```
     """
     space = DesignSpace() if space is None else space
     _check_arguments(skin, objective, space, steps, starts, key)

@@ -63,6 +63,13 @@ def optimise_surface_layout(
     - `callback`: called after each step with its number and the score.
 
     Raises `ValueError` for flat skins and layers, if `steps` is not a positive whole number, and for negative lengths.
+
+    **Example:**
+
+    ```python
+    optimised = optimise_surface_layout(curved, curved_objective, steps=1, minimum_spacing=0.012)
+    print(optimised.start_value, optimised.value)
+    ```
     """
     check_skin("skin", skin)
     check_kind("objective", objective, Objective, "an Objective, as of Objective.create(skin, places)")

@@ -211,6 +211,13 @@ class Objective(Module):
     `temperature`: as in `layout_scores`; `score`: function of `Scores` whose values differ by the order of 1 between
     layouts, such as a logarithm. Raises `ValueError` if `score` is not a function, and for touches or a prior of
     another type.
+
+    **Example:**
+
+    ```python
+    objective = Objective.create(sheet, touches.places, Bell(2e-3), noise=1e-4, correlation=0.02)
+    print(objective.scores(sheet).worst)  # volts
+    ```
     """
 
     touches: SheetTouches

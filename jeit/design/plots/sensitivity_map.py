@@ -35,8 +35,22 @@ def plot_sensitivity_map(
 ) -> Axes:
     """Plot the sensitivity Θ over the skin, in millivolts.
 
-    `electrodes`: positions (L, 2) to be marked, metres; `limit`: upper end of the colour bar, volts, by default the
-    maximum of Θ. Raises `ValueError` if `theta` is not a `SensitivityMap`.
+    **Arguments:**
+
+    - `theta`: the sensitivity map.
+    - `electrodes`: positions (L, 2) to be marked, metres.
+    - `limit`: upper end of the colour bar, volts, by default the maximum of Θ.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` if `theta` is not a `SensitivityMap`.
+
+    **Example:**
+
+    ```python
+    ax = plot_sensitivity_map(response.sensitivity, electrodes=layout.centres)
+    ax.figure.savefig("sensitivity.png")
+    ```
     """
     _check_is_sensitivity_map("theta", theta)
     ax = axes_or_new(ax)
@@ -63,10 +77,24 @@ def plot_sensitivity_map(
 def plot_sensitivity_histograms(
     maps: Mapping[str, SensitivityMap], *, bins: int = 40, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Plot histograms of the sensitivity, as shares of the area, of several maps {name: map}. A dashed line marks the
-    minimum of the first map.
+    """Plot histograms of the sensitivity, as shares of the area, of several maps. A dashed line marks the minimum of
+    the first map.
+
+    **Arguments:**
+
+    - `maps`: sensitivity maps by name, for the legend.
+    - `bins`: number of bins of equal width.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
 
     Raises `ValueError` if `maps` is not a mapping to sensitivity maps.
+
+    **Example:**
+
+    ```python
+    ax = plot_sensitivity_histograms({"grid": response.sensitivity}, bins=10)
+    ax.figure.savefig("histogram.png")
+    ```
     """
     check_kind("maps", maps, Mapping, "{name: map}")
     for name, sensitivity in maps.items():

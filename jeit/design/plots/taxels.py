@@ -42,13 +42,25 @@ def plot_taxels(
 ) -> Axes:
     """Plot the map of the taxels of one layout.
 
+    **Arguments:**
+
+    - `taxels`: the taxels, as from `find_taxels`.
     - `colour`: quantity shown by colours: "area", the area of the taxel whose cluster contains the position;
       "coverage", the number of taxels that cover the position; "label", a colour for each cluster.
     - `outlines`: whether to draw the outline of each taxel, where the similarity falls below the threshold.
     - `electrodes`: positions (L, 2) or (L, 3) to be marked, metres.
     - `limit`: value at the upper end of the colour bar, in m² for "area".
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
 
     Raises `ValueError` for other values of `colour`, and for batches of layouts.
+
+    **Example:**
+
+    ```python
+    ax = plot_taxels(response.taxels, colour="label", electrodes=layout.centres)
+    ax.figure.savefig("taxels.png")
+    ```
     """
     check_name("colour", colour, _QUANTITIES)
     _check_single(taxels)
@@ -72,10 +84,24 @@ def plot_taxels(
 def plot_taxel_areas(
     taxels: Taxels | Mapping[str, Taxels], *, bins: int = 20, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Plot the histogram of the taxel areas of one layout, or of several layouts {name: taxels}.
+    """Plot the histogram of the taxel areas of one or several layouts. The legend gives the mean ± standard deviation
+    of each layout.
 
-    `bins`: number of bins of equal width from 0 to the largest area, the same for all layouts. The legend gives the
-    mean ± standard deviation of each layout. Raises `ValueError` for batches, and unless there are one to six layouts.
+    **Arguments:**
+
+    - `taxels`: taxels of one layout, or of one to six layouts by name.
+    - `bins`: number of bins of equal width from 0 to the largest area, the same for all layouts.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for batches, and unless there are one to six layouts.
+
+    **Example:**
+
+    ```python
+    ax = plot_taxel_areas({"grid": response.taxels}, bins=5)
+    ax.figure.savefig("areas.png")
+    ```
     """
     layouts = dict(taxels) if isinstance(taxels, Mapping) else {"taxels": taxels}
     if not 1 <= len(layouts) <= len(_COLOURS):

@@ -31,9 +31,22 @@ def plot_travel(
     """Plot the path of every electrode for one start of an optimisation. Hollow discs mark the initial positions,
     filled discs the final ones.
 
-    `start`: index of the start, from 0; `keep_out`: regions to be hatched. The default title gives the mean distance
-    between initial and final positions in millimetres. Raises `ValueError` for a start that does not exist, and if
-    `optimisation` is not an `Optimisation`.
+    **Arguments:**
+
+    - `optimisation`: result of `optimise_layout`.
+    - `start`: index of the start, from 0.
+    - `keep_out`: regions to be hatched.
+    - `title`: title of the plot; by default the mean distance between initial and final positions in millimetres.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for a start that does not exist, and if `optimisation` is not an `Optimisation`.
+
+    **Example:**
+
+    ```python
+    optimised = optimise_layout(sheet, objective, steps=1)
+    plot_travel(optimised).figure.savefig("travel.png")
+    ```
     """
     check_kind("optimisation", optimisation, Optimisation, "an Optimisation, as of optimise_layout")
     number = len(optimisation.centres)

@@ -43,15 +43,28 @@ def plot_unrolled(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot an unrolled surface, as from `jeit.mesh.geodesic.unroll(skin.model.mesh)`, with dashed lines along the cut.
+    """Plot an unrolled surface, with dashed lines along the cut.
 
+    If unrolling changes lengths by more than half a per cent on average, the plot states the distortion.
+
+    **Arguments:**
+
+    - `unrolled`: the surface, as from `jeit.mesh.unroll`.
     - `values`: one value for each triangle of the surface, drawn in uniform colours, or for each node, interpolated.
     - `electrodes`: disc electrodes, drawn as circles with their numbers or labels.
     - `marks`: positions (p, 3) on the surface to be marked, metres, by their names in the legend.
     - `scale`: mapping from values to colours; by default for changes of sheet conductivity in S.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
 
-    If unrolling changes lengths by more than half a per cent on average, the plot states the distortion. Raises
-    `ValueError` for values of another shape, complex or not finite, and for arguments of the wrong type.
+    Raises `ValueError` for values of another shape, complex or not finite, and for arguments of the wrong type.
+
+    **Example:**
+
+    ```python
+    ax = plot_unrolled(unroll(curved.model.mesh), electrodes=curved.layout)
+    ax.figure.savefig("unrolled.png")
+    ```
     """
     check_kind("unrolled", unrolled, Unrolled, "a surface laid flat, as of unroll(skin.model.mesh)")
     check_scale(scale)

@@ -17,9 +17,21 @@ _MAX_NAME_LENGTH = 32
 
 
 def write_layout_comparison(result: LayoutComparison, folder: str | Path) -> None:
-    """Write `comparison.png` and `report.json` into `folder`, which is created if needed.
+    """Write `comparison.png` and `report.json` into a folder.
+
+    **Arguments:**
+
+    - `result`: result of `compare_layouts`.
+    - `folder`: the folder, which is created if needed.
 
     Raises `ValueError` if the folder cannot be created or written.
+
+    **Example:**
+
+    ```python
+    comparison = compare_layouts(sheet, other, places=8, num_taxels=4)
+    write_layout_comparison(comparison, "out")
+    ```
     """
     with results(folder, ("comparison.png", "report.json")) as made:
         write_json(report_layout_comparison(result), made / "report.json")
@@ -100,9 +112,21 @@ def _shorten_name(name: str) -> str:
 
 
 def write_improved_layout(result: ImprovedLayout, folder: str | Path) -> None:
-    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into `folder`, which is created if needed.
+    """Write `layout.csv`, `layout.svg`, `travel.png` and `report.json` into a folder.
+
+    **Arguments:**
+
+    - `result`: result of `improve_layout`.
+    - `folder`: the folder, which is created if needed.
 
     Raises `ValueError` if the folder cannot be created or written.
+
+    **Example:**
+
+    ```python
+    improved = improve_layout(layout, DesignSpace(minimum_spacing=0.012), steps=1, num_points=400)
+    write_improved_layout(improved, "out")
+    ```
     """
     with results(folder, ("layout.csv", "layout.svg", "travel.png", "report.json")) as made:
         write_layout(result.layout, made / "layout.csv")

@@ -237,12 +237,25 @@ img { max-width: 100% } pre { background: #f4f4f4; padding: 1em; overflow-x: aut
 
 
 def write_study_report(study: Study, store: str | Path, path: str | Path) -> None:
-    """Write the finished results of the study in `store` as one HTML file at `path`. An existing file is replaced as a
-    whole.
+    """Write the finished results of a study as one HTML file. An existing file is replaced as a whole.
 
     The page shows the maps of up to 24 finished points with the same colour scale, mean against minimum sensitivity,
-    parameters and scores of every point, and the study file, its fingerprint and the versions of packages. Raises
-    `ValueError` if no chunk is finished, `OSError` if the page cannot be written, and as `open_results` does.
+    parameters and scores of every point, and the study file, its fingerprint and the versions of packages.
+
+    **Arguments:**
+
+    - `study`: the study.
+    - `store`: path of the Zarr store with its results.
+    - `path`: path of the HTML file.
+
+    Raises `ValueError` if no chunk is finished, `OSError` if the page cannot be written, and as `open_results` does.
+
+    **Example:**
+
+    ```python
+    run_study(study, "study.zarr")  # with zarr
+    write_study_report(study, "study.zarr", "study.html")
+    ```
     """
     data = open_results(study, store)
     if not data.finished.values.any():

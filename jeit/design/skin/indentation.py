@@ -31,6 +31,15 @@ class Bell(AbstractIndentation):
     deformation of Park et al. 2022, text S4.
 
     It is set to 0 beyond r = 3 deviation, where it has dropped to about a hundredth of `depth`.
+
+    **Fields**: `depth`: largest depth, metres; `deviation`: deviation of the Gaussian, metres.
+
+    **Example:**
+
+    ```python
+    touched = skin.touched_cells([(0.0, 0.0)], Bell(depth=2e-3, deviation=6e-3))
+    changes = skin.voltage_changes(touched)
+    ```
     """
 
     depth: float
@@ -56,7 +65,19 @@ class Bell(AbstractIndentation):
 
 class Hemisphere(AbstractIndentation):
     """Indentation by a rigid ball of radius R: depth − (R − √(R² − r²)) at distance r where this is positive, otherwise
-    0. The default diameter of 15 mm is that of the experiments of Park et al. 2022."""
+    0.
+
+    The default diameter is that of the experiments of Park et al. 2022.
+
+    **Fields**: `depth`: depth of the lowest point, metres; `diameter`: diameter 2R of the ball, metres.
+
+    **Example:**
+
+    ```python
+    touched = skin.touched_cells([(0.0, 0.0)], Hemisphere(depth=2e-3, diameter=0.01))
+    changes = skin.voltage_changes(touched)
+    ```
+    """
 
     depth: float
     diameter: float

@@ -58,6 +58,13 @@ class Skin(Module):
 
     Create it with `Skin.create`, which checks the arguments and makes the mesh, or from a custom `model` with
     electrodes of class `SheetDiscs` (`SurfaceDiscs` on a curved sheet) or `FaceDiscs`.
+
+    **Example:**
+
+    ```python
+    skin = Skin.create(layout, thickness=0.01, num_layers=2, cell_size=0.008)
+    changes = skin.voltage_changes(skin.touched_cells([(0.0, 0.0)], Bell(2e-3)))
+    ```
     """
 
     layout: Layout | SurfaceLayout

@@ -83,7 +83,19 @@ class SkinTable(Table):
 
 
 def describes_skin(path: str | Path) -> bool:
-    """Whether a file is a TOML file with a table "skin", even if it is invalid otherwise."""
+    """Whether a file is a TOML file with a table "skin", even if it is invalid otherwise.
+
+    **Arguments:**
+
+    - `path`: path of the file.
+
+    **Example:**
+
+    ```python
+    if describes_skin("skin.toml"):
+        skin = read_described_skin("skin.toml")
+    ```
+    """
     try:
         return isinstance(read_toml(path).get("skin"), dict)
     except (OSError, ValueError):
@@ -97,8 +109,19 @@ def read_described_skin(path: str | Path) -> Skin:
     surface. Every key has a single value. Only `layout` in the table electrodes is required, a name or a file in the
     same folder; all other keys have defaults.
 
+    **Arguments:**
+
+    - `path`: path of the file.
+
     Raises `FileNotFoundError` if there is no such file, and `ValueError` for files that are not TOML, for unknown keys
     and invalid values, and as `Skin.create` does.
+
+    **Example:**
+
+    ```python
+    skin = read_described_skin("skin.toml")
+    print(skin.layout.name, skin.model.protocol.num_measurements)
+    ```
     """
     path = Path(path)
     if not path.is_file():

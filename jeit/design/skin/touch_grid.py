@@ -80,11 +80,25 @@ class SurfaceGrid(TouchGrid):
 
 
 def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = PLACES) -> TouchGrid:
-    """Create a grid of touched positions: divide the bounding box of `outline` into rows × columns equal rectangles,
-    and take the centres that lie inside. The default is 48 × 48, as in Park et al. 2022.
+    """Create a grid of touched positions: divide the bounding box of an outline into equal rectangles, and take the
+    centres that lie inside.
 
-    On a curved skin, whose outline is its surface, rows × columns positions are spread evenly over the surface. Raises
-    `ValueError` for fewer than one row or column, and if `outline` is not an outline.
+    The default is 48 × 48, as in Park et al. 2022. On a curved skin, whose outline is its surface, rows × columns
+    positions are spread evenly over the surface.
+
+    **Arguments:**
+
+    - `outline`: outline of the skin, or the surface of a curved skin.
+    - `columns`, `rows`: numbers of columns and rows.
+
+    Raises `ValueError` for fewer than one row or column, and if `outline` is not an outline.
+
+    **Example:**
+
+    ```python
+    touches = touch_grid(skin.outline, 6, 5)
+    print(touches.places.shape)  # (30, 2)
+    ```
     """
     check_kind("outline", outline, (Domain, Triangles), "an outline, such as skin.outline or Rectangle(0.2, 0.2)")
     if columns < 1 or rows < 1:
@@ -105,10 +119,23 @@ def touch_grid(outline: Domain | Triangles, columns: int = PLACES, rows: int = P
 def touches_away_from_the_edge(
     outline: Domain | Triangles, margin: float, columns: int = PLACES, rows: int = PLACES
 ) -> TouchGrid:
-    """The positions of `touch_grid` that are farther than `margin` (metres) from the outline, so that touches do not
-    reach beyond the edge.
+    """The positions of `touch_grid` that are farther than a margin from the outline, so that touches do not reach
+    beyond the edge.
+
+    **Arguments:**
+
+    - `outline`: outline of the skin, or the surface of a curved skin.
+    - `margin`: minimum distance from the edge, metres.
+    - `columns`, `rows`: numbers of columns and rows of the grid.
 
     Raises `ValueError` if no position is that far from the edge.
+
+    **Example:**
+
+    ```python
+    touches = touches_away_from_the_edge(skin.outline, 0.01, 6, 5)
+    print(touches.places)
+    ```
     """
     if isinstance(outline, Triangles):
         return SurfaceGrid.spread(outline, columns * rows, margin)

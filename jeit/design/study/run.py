@@ -98,6 +98,9 @@ def run_study(
     If a run is killed at any moment, the next run continues after the last finished chunk and gives the same store bit
     for bit.
 
+    **Arguments:**
+
+    - `study`: the study.
     - `path`: path of the Zarr store, which is created if it does not exist.
     - `client`: a `dask.distributed.Client` whose workers have jeit installed. Chunks of a lost worker are solved again,
       and only this process writes. By default, the chunks are computed in this process.
@@ -108,6 +111,13 @@ def run_study(
     runs, `ValueError` for meshes too coarse for their electrodes or touches, for the store of another study, and for a
     store that another process writes. Raises `ImportError` without the extra `cluster`, and `OSError` if the store
     cannot be written, such as on a full disk; finished chunks are kept.
+
+    **Example:**
+
+    ```python
+    results = run_study(study, "study.zarr", progress=print)  # with zarr
+    print(results["mean"].values)
+    ```
     """
     need_extra("cluster", "a study")
     check_points(study)
@@ -122,8 +132,23 @@ def run_study(
 
 
 def study_progress(study: Study, path: str | Path) -> Progress:
-    """Progress of the study in a store. Chunks that do not match their checksums count as unfinished. Raises errors as
-    `Store` does."""
+    """Progress of the study in a store: the numbers of finished points and chunks. Chunks that do not match their
+    checksums count as unfinished.
+
+    **Arguments:**
+
+    - `study`: the study.
+    - `path`: path of the Zarr store.
+
+    Raises errors as `Store` does.
+
+    **Example:**
+
+    ```python
+    run_study(study, "study.zarr")  # with zarr
+    print(study_progress(study, "study.zarr"))
+    ```
+    """
     finished = Store(study, path, create=False).sound()
     points = sum(len(study.chunks[number]) for number in finished)
     return Progress(points, len(study.points), len(finished), len(study.chunks), None)

@@ -211,10 +211,21 @@ def read_study(path: str | Path) -> Study:
     Only `electrodes.layouts` is required; the defaults of other keys are those of `jeit.design.defaults`. Paths of
     files are relative to the study file.
 
+    **Arguments:**
+
+    - `path`: path of the file.
+
     Raises `FileNotFoundError` if there is no such file. Raises `ValueError`, naming the keys and a remedy, for keys
     that are unknown or have no effect in combination with the others, values of the wrong type or out of range (such as
     metres for millimetres), electrodes that overlap, impossible spacings, layouts without the electrodes that a
     protocol needs, and studies that would take too much memory or disk space.
+
+    **Example:**
+
+    ```python
+    study = read_study("study.toml")
+    print(study.name, len(study.points))
+    ```
     """
     path = Path(path)
     if not path.is_file():

@@ -367,7 +367,21 @@ def open_results(study: Study, path: str | Path):
     points are NaN.
 
     `xarray.open_zarr(path)` opens the same store, but detects neither half-written chunks of an interrupted run nor
-    code that a store from another source may execute. Raises errors as `Store` does.
+    code that a store from another source may execute.
+
+    **Arguments:**
+
+    - `study`: the study.
+    - `path`: path of the Zarr store.
+
+    Raises errors as `Store` does.
+
+    **Example:**
+
+    ```python
+    run_study(study, "study.zarr")  # with zarr
+    results = open_results(study, "study.zarr")
+    ```
     """
     xarray = optional("xarray", _TASK)
     store = Store(study, path, create=False)

@@ -21,16 +21,28 @@ class ConductivityView(AbstractView):
     """View of the change of conductivity from that of the undisturbed body: the images of `jeit.inverse.stream`.
 
     Images are in S/m (2-D: S). A marker stands at the largest change, unless the frame differs from an undisturbed one
-    by noise only.
+    by noise only. `ConductivityView.prepare` makes the view from a measurement of the undisturbed body.
+
+    **Arguments:**
+
+    - `imager`: reconstructs images from frames, as from `jeit.imaging.prepare_imager`.
+    - `calibration`: calibrated model of the body, from the same function.
+    - `title`: title of the page.
+    - `notes`: remarks for the page.
+
+    Raises `ValueError` for objects of another kind, and for a surface in space, which has no flat image.
+
+    **Example:**
+
+    ```python
+    view = ConductivityView.prepare(reference, settings)
+    print(view.picture(frame).markers)
+    ```
     """
 
     def __init__(
         self, imager: Imager, calibration: Calibration, *, title: str = "Conductivity change", notes: Sequence[str] = ()
     ):
-        """`imager`, `calibration`: as of `jeit.imaging.prepare_imager`; `title`, `notes`: for the page.
-
-        Raises `ValueError` for objects of another kind, and for a surface in space, which has no flat image.
-        """
         check_kind("imager", imager, Imager, "an Imager, as of prepare_imager(reference)[0]")
         check_kind("calibration", calibration, Calibration, "a Calibration, as of prepare_imager(reference)[1]")
         model = calibration.model

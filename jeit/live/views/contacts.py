@@ -56,16 +56,26 @@ class ContactsView(AbstractView):
 
     Contacts are those of `jeit.touch.find_contacts`, followed by a `jeit.touch.ContactTracker`. The noise of images is
     that of the frames of the reference, ten or more, otherwise it is estimated from each image.
+
+    **Arguments:**
+
+    - `images`: view of the images, of a sheet.
+    - `still`: frames (N, M) of the untouched sheet, volts.
+    - `sign`: 1 if touched skin conducts better, -1 if worse; None: as the strongest change of each image.
+
+    Raises `ValueError` for a solid, and for another sign.
+
+    **Example:**
+
+    ```python
+    contacts = ContactsView(view, still, sign=-1)
+    print(contacts.picture(frame).markers)
+    ```
     """
 
     def __init__(
         self, images: ConductivityView, still: Float[np.ndarray, "N M"] | None = None, *, sign: int | None = None
     ):
-        """`images`: view of the images, of a sheet. `still` (N, M): frames of the untouched sheet, volts. `sign`: 1 if
-        touched skin conducts better, -1 if worse; None: as the strongest change of each image.
-
-        Raises `ValueError` for a solid, and for another sign.
-        """
         mesh = images.imager.inversion.model.mesh
         self.images, self.scene = images, replace(images.scene, title=f"Contacts, {images.scene.title}")
         signs = (1, -1) if sign is None else (sign,)
@@ -125,7 +135,26 @@ def _noise_of(images: ConductivityView, still: Float[np.ndarray, "N M"]) -> Imag
 
 
 class GestureView(AbstractView):
-    """Touches of a skin as they come, and their gestures as they end, as `jeit.touch.TouchWatch` names them."""
+    """Touches of a skin as they come, and their gestures as they end, as `jeit.touch.TouchWatch` classifies them.
+
+    **Arguments:**
+
+    - `description`: description of the skin.
+    - `model`: the learnt gestures.
+    - `still`: frames (N, M) of the untouched skin, volts.
+    - `rate`: frames/s, by default that of the frames learnt from.
+    - `patience`: time after which a touch becomes part of the reference, seconds.
+    - `progress`: called with each step as it begins.
+
+    Raises `ValueError` as `jeit.touch.TouchImages.prepare` and `jeit.touch.TouchWatch.create` do.
+
+    **Example:**
+
+    ```python
+    named = GestureView(description, gestures, untouched, rate=30.0)
+    print(named.picture(LiveFrame(0, 0.0, 0.0, untouched[0])).events)
+    ```
+    """
 
     def __init__(
         self,
@@ -137,10 +166,6 @@ class GestureView(AbstractView):
         patience: float = 30.0,
         progress: Callable[[str], None] | None = None,
     ):
-        """`description`: of the skin; `model`: learnt gestures; `still` (N, M): frames of the untouched skin, volts;
-        `rate`: frames/s, by default that of the frames learnt from; `patience`: as in `TouchWatch`; `progress` is
-        called with each step as it begins. Raises `ValueError` as `TouchImages.prepare` and `TouchWatch.create`.
-        """
         self._model, self._patience = model, patience
         usual = 60.0 if model.reading is None else model.reading.rate
         self._rate = usual if rate is None else rate

@@ -26,9 +26,26 @@ _RADIUS, _NODES, _STEADY, _HALF = float(np.sqrt(-2 * np.log(1 - 0.68))), 400, 2,
 
 
 class LearntSkinView(AbstractView):
-    """Place and force of a touch, with their uncertainty, its label and keys, as `LearntSkin.predict` estimates them.
+    """Place and force of a touch, with their uncertainty, its label and keys, as `jeit.touch.LearntSkin.predict`
+    estimates them.
 
     Places are markers; labels and keys that change are events. There is no image.
+
+    **Arguments:**
+
+    - `skin`: the learnt skin.
+    - `still`: frames (N, M) of the untouched skin, in the unit of those learnt from; needed if these had a reference.
+    - `description`: description of the skin, for its outline and electrodes.
+
+    Raises `ValueError` for a skin whose frames are standardised by session, for which all frames of a session are
+    needed, and as `jeit.touch.LearntSkin.predict` for the reference.
+
+    **Example:**
+
+    ```python
+    places = LearntSkinView(learnt)
+    print(places.picture(LiveFrame(0, 0.0, 0.0, presses.frames[0])).markers)
+    ```
     """
 
     def __init__(
@@ -38,12 +55,6 @@ class LearntSkinView(AbstractView):
         *,
         description: Description | None = None,
     ):
-        """`still` (N, M): frames of the untouched skin, in the unit of those learnt from; needed if these had a
-        reference. `description`: of the skin, for its outline and electrodes.
-
-        Raises `ValueError` for a skin whose frames are standardised by session, for which all frames of a session are
-        needed, and as `LearntSkin.predict` for the reference.
-        """
         if skin.per_session:
             raise ValueError(
                 "model: this skin was learnt per session, whose changes are standardised by all frames of it; learn "
@@ -84,13 +95,27 @@ class LearntSkinView(AbstractView):
 
 
 class DepthView(AbstractView):
-    """Depth of indentation, in millimetres, as a network estimates it: the maps of `stream_depths`.
+    """Depth of indentation, in millimetres, as a network estimates it: the maps of `jeit.touch.stream_depths`.
 
     A marker stands at the centroid of the map, where it is deeper than noise makes it.
+
+    **Arguments:**
+
+    - `network`: the network of the skin, as from `jeit.touch.read_network`.
+    - `still`: frames (N, M) of the untouched skin, volts.
+    - `title`: title of the page.
+
+    Raises `ValueError` for another number of channels.
+
+    **Example:**
+
+    ```python
+    depths = DepthView(network, rest[None])
+    print(depths.picture(LiveFrame(0, 0.0, 0.0, rest)).status)
+    ```
     """
 
     def __init__(self, network: ImageNetwork, still: Float[np.ndarray, "N M"], *, title: str = "Depth of indentation"):
-        """`still` (N, M): frames of the untouched skin, volts. Raises `ValueError` for another number of channels."""
         self.network = network
         self._places = pixel_places(network.extent, network.shape)
         self.set_reference(still)

@@ -22,8 +22,24 @@ class SoundView(AbstractView):
     """Loss map and place of a touch, from the intensities of microphones: a frame is an intensity for each.
 
     Places are those of `jeit.acoustic.locate` without changes of gains, which it estimates from all touches of a
-    recording. With the method "likelihood" pixels are distances from the most likely place, in standard deviations:
-    √(2 (loss − least loss)); with "consistency", the loss of Park et al. (2022).
+    recording. With the method "likelihood" pixels are distances from the most likely place, in standard deviations: √(2
+    (loss − least loss)); with "consistency", the loss of Park et al. (2022).
+
+    **Arguments:**
+
+    - `calibration`: calibration of the array.
+    - `method`: "likelihood" or "consistency".
+    - `floor`: noise power (M,) that was subtracted from the intensities.
+    - `freedom`: degrees of freedom of the noise power, as in `jeit.acoustic.Intensities`.
+
+    Raises `ValueError` for another method, another number of microphones, or fewer than three that can be used.
+
+    **Example:**
+
+    ```python
+    sounds = SoundView(microphones)
+    print(sounds.picture(LiveFrame(0, 0.0, 0.0, np.ones(9))).markers)
+    ```
     """
 
     def __init__(
@@ -34,11 +50,6 @@ class SoundView(AbstractView):
         floor: Float[np.ndarray, " M"] | None = None,
         freedom: float = np.inf,
     ):
-        """`calibration`: of the array; `method`: "likelihood" or "consistency"; `floor` (M,): noise power that was
-        subtracted from the intensities, and `freedom`: as in `jeit.acoustic.Intensities`.
-
-        Raises `ValueError` for another method, another number of microphones, or fewer than three that can be used.
-        """
         self.calibration, self.method = calibration, method
         self.floor, self.freedom = floor, freedom
         self._silence = np.zeros(calibration.num_microphones)

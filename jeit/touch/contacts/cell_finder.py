@@ -69,21 +69,35 @@ def outline_of_cells(points: Float[np.ndarray, "n d"], cells: Int[np.ndarray, "c
 
 
 class CellFinder(AbstractFinder):
-    """Find every peak of an image, with the cells around it that exceed `level` times the peak.
+    """Find every peak of an image, with the cells around it that exceed a share of the peak.
 
     The centroid is weighted by the excess above this threshold, which is zero at the region's edge, so that the
-    centroid does not jump when a cell joins or leaves the region. A peak counts if it is at least `least_peak` times
-    the strongest peak, and rises at least `least_prominence` times its own height above the saddle to a higher peak;
-    weaker peaks are artefacts or shoulders.
+    centroid does not jump when a cell joins or leaves the region. Peaks that are weak, or rise little above the saddle
+    to a higher peak, are artefacts or shoulders, and are left out.
 
     The defaults give the smallest error on simulated skins (`python -m benchmarks contacts`).
 
-    The mesh is a flat sheet or a surface in space; on a surface, centroids are points (3,) on it.
+    **Arguments:**
 
-    **Fields**: `smoothing` (m, m): matrix that smooths images first; `cells` (m, 3), `points` (n, d): the mesh;
-    `centres` (m, d), `areas` (m,): centroids and areas of the cells; `shared` (m, 3): numbers of the facets that each
-    cell shares with another; `surface`: the surface of a mesh in space, otherwise None; `level`, `least_peak`,
-    `least_prominence`: thresholds for peaks; `floor`, `sign`: see `AbstractFinder`.
+    - `mesh`: mesh of the images: a flat sheet, or a surface in space; on a surface, centroids are points (3,) on it.
+    - `smoothing`: standard deviation of the Gaussian that smooths images first, metres; by default 3 % of the square
+      root of the mesh's area.
+    - `level`: share of the peak that cells of a contact exceed.
+    - `least_peak`: minimum height of a peak, as a share of the strongest peak.
+    - `least_prominence`: minimum rise of a peak above the saddle to a higher peak, as a share of its own height.
+    - `floor`: number of standard deviations of the noise that a cell must exceed to belong to a contact.
+    - `sign`: 1 if touched skin conducts better, -1 if it conducts worse.
+
+    **Fields**: the thresholds; `smoothing` (m, m): matrix that smooths images; `cells` (m, 3), `points` (n, d): the
+    mesh; `centres` (m, d), `areas` (m,): centroids and areas of the cells; `shared` (m, 3): numbers of the facets that
+    each cell shares with another; `surface`: the surface of a mesh in space, otherwise None.
+
+    **Example:**
+
+    ```python
+    finder = CellFinder(model.mesh, least_peak=0.3)
+    print(len(find_contacts(finder, image, noise)))
+    ```
     """
 
     smoothing: sparse.csr_array

@@ -21,6 +21,13 @@ class Contact(Module):
     region, in that unit times m²; `contour` (k, d): outline of the region, metres, in which the first point is not
     repeated; `deviation`: root mean square displacement of the centroid by noise of the image (see `ImageNoise`), to
     first order, metres. It includes neither the blur of the image nor systematic errors.
+
+    **Example:**
+
+    ```python
+    contact = find_contacts(finder, image, noise)[0]
+    print(isinstance(contact, Contact), contact.centroid, contact.area)
+    ```
     """
 
     centroid: Float[np.ndarray, " d"]
@@ -63,12 +70,22 @@ class AbstractFinder(Module):
 def find_contacts(
     finder: AbstractFinder, image: Float[np.ndarray, " m"], noise: ImageNoise | None = None
 ) -> list[Contact]:
-    """Find the contacts in an image, strongest first.
+    """Find the contacts in an image, strongest first. Changes of the sign opposite to the finder's are ignored.
 
-    `finder`: `CellFinder(mesh)` or `RasterFinder(mesh)` for the mesh of the image. `image` (m,): change of conductivity
-    in every cell, S (3-D: S/m), as `LinearReconstruction.image` computes it. `noise`: noise of these images, by default
-    estimated from the image itself (see `ImageNoise.of_image`). Changes of the sign opposite to the finder's are
-    ignored. Raises `ValueError` for an image of another mesh, NaN, and noise of another mesh.
+    **Arguments:**
+
+    - `finder`: `CellFinder(mesh)` or `RasterFinder(mesh)` for the mesh of the image.
+    - `image`: change of conductivity (m,) in every cell, S (3-D: S/m), as `LinearReconstruction.image` computes it.
+    - `noise`: noise of these images, by default estimated from the image itself (see `ImageNoise.of_image`).
+
+    Raises `ValueError` for an image of another mesh, NaN, and noise of another mesh.
+
+    **Example:**
+
+    ```python
+    for contact in find_contacts(finder, image, noise):
+        print(contact.centroid, contact.deviation, contact.area)
+    ```
     """
     check_kind("finder", finder, AbstractFinder, "a finder, such as CellFinder(mesh)")
     change = signed_image(finder, image)

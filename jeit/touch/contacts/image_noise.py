@@ -26,6 +26,13 @@ class ImageNoise(Module):
 
     **Fields**: `deviation` (m,): standard deviation of every cell, in the unit of the image; `factor` (r, m): matrix
     whose product factorᵀ factor is the covariance of the cells, None if the covariance is unknown.
+
+    **Example:**
+
+    ```python
+    noise = ImageNoise.of_frames(linear, empty)
+    contacts = find_contacts(finder, image, noise)
+    ```
     """
 
     deviation: Float[np.ndarray, " m"]

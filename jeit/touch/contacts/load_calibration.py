@@ -47,6 +47,13 @@ class LoadCalibration(Module):
     F½; `covariance` (4, 4): covariance of the parameters; `sign`: sign of the peaks, 1 or -1; `scatter`: standard
     deviation of the logarithm of a peak about the curve; `loads`: minimum and maximum load of the calibrated contacts,
     newtons; `farthest`: their maximum ρ; `highest`: their maximum ratio of a peak to the saturated peak.
+
+    **Example:**
+
+    ```python
+    calibration = LoadCalibration.fit(known, loads, radius=0.05)
+    print(calibration.load(known[0]).force)  # newtons
+    ```
     """
 
     centre: Float[np.ndarray, "2"]

@@ -57,12 +57,29 @@ class RasterFinder(AbstractFinder):
     """Finds contacts by an adaptive threshold on a raster.
 
     Grey levels are proportional to the change, up to 255 for the image's maximum; pixels below the noise floor are
-    black. Pixels are kept if they are `constant` levels above the Gaussian mean of the `block` around them. They are
-    then opened with an ellipse. Each external contour is a contact, whose centroid is that of the enclosed pixels.
+    black. Pixels are kept if they are some levels above the Gaussian mean of the block around them. They are then
+    opened with an ellipse. Each external contour is a contact, whose centroid is that of the enclosed pixels.
 
-    **Fields**: `raster`: raster of the mesh; `smoothing` (m, m): matrix that smooths images first; `block`, `opening`:
-    widths of the block and the ellipse, odd numbers of pixels; `constant`: number of grey levels; `floor`, `sign`: see
-    `AbstractFinder`; without a floor, contacts would be found in images without any.
+    **Arguments:**
+
+    - `mesh`: mesh of the images.
+    - `pixels`: number of pixels along a side of the raster.
+    - `smoothing`: standard deviation of the Gaussian that smooths images first, metres; see `CellFinder`.
+    - `block`: width of the block, an odd number of pixels.
+    - `constant`: number of grey levels.
+    - `opening`: width of the ellipse, an odd number of pixels.
+    - `floor`: number of standard deviations of the noise that a cell must exceed to belong to a contact; without a
+      floor, contacts would be found in images without any.
+    - `sign`: 1 if touched skin conducts better, -1 if it conducts worse.
+
+    **Fields**: the settings; `raster`: raster of the mesh; `smoothing` (m, m): matrix that smooths images.
+
+    **Example:**
+
+    ```python
+    raster_finder = RasterFinder(model.mesh, pixels=128)
+    contacts = find_contacts(raster_finder, image, noise)
+    ```
     """
 
     raster: Raster

@@ -87,6 +87,13 @@ class ContactTracker(Module):
     **Fields**: `gap`, `reach`, `fastest`: as above; `least`: minimum number of frames of a touch, shorter ones are not
     reported; `time`: time of the last frame, -inf before the first; `open`, `closed`: current touches, and touches that
     have ended; `number`: number of touches that have begun.
+
+    **Example:**
+
+    ```python
+    tracker = ContactTracker(gap=0.2)
+    paths = track_contacts(seconds, film_contacts, tracker)
+    ```
     """
 
     gap: float = 0.15
@@ -165,10 +172,22 @@ class ContactTracker(Module):
 def track_contacts(
     times: Float[np.ndarray, " F"], contacts: Sequence[Sequence[Contact]], tracker: ContactTracker | None = None
 ) -> list[TouchPath]:
-    """Track the touches of a recording: `contacts` of every frame, at increasing `times` (F,), seconds.
+    """Track the touches of a recording.
 
-    `tracker`: initial state, by default `ContactTracker()`. Raises `ValueError` for a different number of times, and as
-    `ContactTracker.follow` does.
+    **Arguments:**
+
+    - `times`: increasing times (F,), seconds.
+    - `contacts`: contacts of every frame, as from `find_contacts`.
+    - `tracker`: initial state, by default `ContactTracker()`.
+
+    Raises `ValueError` for a different number of times, and as `ContactTracker.follow` does.
+
+    **Example:**
+
+    ```python
+    paths = track_contacts(seconds, film_contacts)
+    print([path.position for path in paths])
+    ```
     """
     wanted = "a list with those of every frame, each a list"
     check_kind("contacts", contacts, (list, tuple, np.ndarray), wanted)

@@ -64,8 +64,20 @@ def touch_features(touches: list[StreamTouch] | tuple[StreamTouch, ...]) -> Touc
     largest. The features, in the order of `FEATURES`, are: P at t*; minimum of x_e over all elements and frames of the
     touch; fraction of the elements with x_e ≥ P / 2 at t*; mean of x_e at t* over the elements above the touch level;
     duration from the first to the last frame above the level, s; mean of |dP/dt|, 0 for a single frame; distance
-    between the first and the last centroid, m. Silvera Tawil et al. (2011), table II and section IV-A. Raises
-    `ValueError` if `touches` is not a list of touches.
+    between the first and the last centroid, m. Silvera Tawil et al. (2011), table II and section IV-A.
+
+    **Arguments:**
+
+    - `touches`: the touches, as from `find_touches`.
+
+    Raises `ValueError` if `touches` is not a list of touches.
+
+    **Example:**
+
+    ```python
+    features = touch_features(touches)
+    print(features)
+    ```
     """
     courses = _time_courses(touches)
     values = np.array([_seven_features(one) for one in courses]).reshape(len(courses), len(FEATURES))

@@ -26,6 +26,13 @@ class LearntGestures:
 
     **Fields**: `model`: the classifier; `images`: the imager of the skin; `without_touch`: numbers of the recordings in
     which no touch was found.
+
+    **Example:**
+
+    ```python
+    learnt = learn_gestures(description, made, method="linear-svm", form="seven")
+    print(isinstance(learnt, LearntGestures), learnt.model.names)
+    ```
     """
 
     model: GestureModel
@@ -43,8 +50,21 @@ def learn_gestures(
 ) -> LearntGestures:
     """Learn the gestures of a described skin from recordings; the longest touch of each recording is used.
 
-    `method` and `form`: see `GestureModel.fit`. `progress` is called with a description of the progress. Raises
-    `ValueError` as `TouchImages.prepare` and `GestureModel.fit` do, and if most recordings contain no touch.
+    **Arguments:**
+
+    - `description`: description of the skin.
+    - `recordings`: recordings of one gesture each.
+    - `method`, `form`: classifier and its features; see `GestureModel.fit`.
+    - `progress`: called with a description of the progress.
+
+    Raises `ValueError` as `TouchImages.prepare` and `GestureModel.fit` do, and if most recordings contain no touch.
+
+    **Example:**
+
+    ```python
+    learnt = learn_gestures(description, made, method="linear-svm", form="seven")
+    learnt.model.write("gestures.skops")
+    ```
     """
     check_kind("recordings", recordings, GestureSet, "a GestureSet, as of GestureSet.read(path)")
     report = progress or (lambda said: None)

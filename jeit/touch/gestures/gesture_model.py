@@ -129,6 +129,13 @@ class GestureModel:
     distance from the nearest touch of the training set beyond which a touch is unlike all of them; `reading`: how the
     frames were acquired, None if unknown; `standing`: predictions for held-out touches, and error rates of all
     classifiers tried, best first, None if the model was read from a file; `notes`: remarks on the training.
+
+    **Example:**
+
+    ```python
+    gestures = GestureModel.fit(touches, made.gesture, method="linear-svm", form="seven")
+    print(gestures.predict(touches).gesture)
+    ```
     """
 
     names: tuple[str, ...]

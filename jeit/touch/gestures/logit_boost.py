@@ -26,18 +26,30 @@ class LogitBoostClassifier(ClassifierMixin, BaseEstimator):
     Let p be the current probability of a class, and y = 1 for samples of the class, otherwise 0. In every round, a
     stump f_j is fitted for each of the J classes to the responses z = (y − p) / (p (1 − p)), clipped at ±3, with the
     weights w = (y − p) / z, at least 1e-12; without clipping, w = p (1 − p). Then the score F_j grows by (J − 1) / J
-    (f_j − mean f), multiplied by `learning_rate`, and p becomes the softmax of F. Friedman, Hastie and Tibshirani,
+    (f_j − mean f), multiplied by the learning rate, and p becomes the softmax of F. Friedman, Hastie and Tibshirani,
     Annals of Statistics 28 (2000) 337, algorithm 6; weights as in WEKA's LogitBoost.
 
     A small step increases the likelihood of the training set, but a full step may be too long, although clipping makes
     this rare. A step is therefore halved until the likelihood is at least that before it. For two classes, the method
     equals the two-class LogitBoost of that paper.
 
+    **Arguments:**
+
+    - `n_estimators`: number of rounds.
+    - `learning_rate`: factor of every step.
+
     **Fields** after `fit`: `classes_` (J,): the classes; `feature_` (rounds, J): feature that each stump compares;
     `threshold_`: threshold of each stump; `below_`, `above_` (rounds, J): values at or below the threshold and above
     it, multiplied by the step and by (J − 1) / J, before their mean over the classes is subtracted; `step_` (rounds,):
     step of each round; `log_likelihood_` (rounds + 1,): mean log-likelihood of a sample before the first round and
     after each round.
+
+    **Example:**
+
+    ```python
+    features, classes = np.random.default_rng(0).normal(size=(40, 3)), np.arange(40) % 2
+    classifier = LogitBoostClassifier(20, learning_rate=0.5).fit(features, classes)
+    ```
     """
 
     def __init__(self, n_estimators: int = 10, *, learning_rate: float = 1.0):

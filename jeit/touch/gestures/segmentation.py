@@ -61,8 +61,20 @@ _COLUMNS = ("seconds", "peak", "least", "half_share", "mean", "area", "centroid"
 class TouchLevel(Module):
     """Level of the maximum change in an image above which the skin is touched.
 
-    **Fields**: `level`: in the unit of the images; `centres` (m, 2): centroids of the mesh's elements, metres; `areas`
-    (m,): areas of the elements, m².
+    **Arguments:**
+
+    - `mesh`: mesh of the images.
+    - `level`: the level, in the unit of the images.
+
+    **Fields**: `level`; `centres` (m, 2): centroids of the mesh's elements, metres; `areas` (m,): areas of the
+    elements, m².
+
+    **Example:**
+
+    ```python
+    level = TouchLevel.of_untouched(images.mesh, images.changes(empty))
+    touches = find_touches(level, seconds, images.changes(film))
+    ```
     """
 
     level: float
@@ -162,6 +174,13 @@ class StreamTouch(Module):
     **Fields**: `course`: time course from the first to the last frame above the level; `lost`: number of unusable
     frames in between; `begun_before`, `cut_off`: whether the touch is present in the first, or the last, frame of an
     uninterrupted part of the stream, so that its true onset, or end, is unknown.
+
+    **Example:**
+
+    ```python
+    for touch in find_touches(level, seconds, images.changes(film)):
+        print(isinstance(touch, StreamTouch), touch.onset, touch.offset)
+    ```
     """
 
     course: ChangeCourse
@@ -202,6 +221,14 @@ class TouchStream(Module):
     current touch; `held`: number of these up to the last one above the level; `lost`: numbers of unusable frames up to
     that frame and after it; `begun_before`: whether the current touch began before it was first seen; `ended`: touches
     that have ended.
+
+    **Example:**
+
+    ```python
+    stream = TouchStream(level, gap=0.2)
+    for second, change in zip(seconds, images.changes(film), strict=True):
+        stream = stream.follow(second, change)
+    ```
     """
 
     level: TouchLevel
@@ -263,10 +290,25 @@ def find_touches(
     gap: float = _GAP,
     least: int = _LEAST,
 ) -> list[StreamTouch]:
-    """Find the touches in images (F, m) at times `seconds` (F,), as a `TouchStream` does frame by frame.
+    """Find the touches in a series of images, as a `TouchStream` does frame by frame.
+
+    **Arguments:**
+
+    - `level`: level above which the skin is touched.
+    - `seconds`: times (F,) of the images, seconds.
+    - `images`: changes (F, m), in the unit of the level.
+    - `gap`: minimum untouched time between two touches, seconds.
+    - `least`: minimum number of frames of a touch.
 
     Raises `ValueError` for times that decrease or are not finite, images of another mesh, and frames whose median
     interval is not below the `gap`.
+
+    **Example:**
+
+    ```python
+    touches = find_touches(level, seconds, images.changes(film), gap=0.2)
+    print([(touch.onset, touch.offset) for touch in touches])
+    ```
     """
     _check_settings(level, gap, least)
     images = check_images(images, len(level.areas))

@@ -35,6 +35,13 @@ class TouchImages:
 
     **Fields**: `imager`: reconstructs images from frames; `calibration`: calibrated model of the skin that it uses;
     `reference`: mean frame of the untouched skin.
+
+    **Example:**
+
+    ```python
+    images = TouchImages.prepare(description, empty, settings)
+    changes = images.changes(film)  # (F, m), S
+    ```
     """
 
     imager: Imager
@@ -96,10 +103,23 @@ class TouchImages:
 def untouched_frames(
     recording: FrameRecording, seconds: Float[np.ndarray, " F"], span: float
 ) -> Float[np.ndarray, "u M"]:
-    """Return frames (u, M) of the untouched skin: the recording's `reference`, otherwise its first `span` seconds.
+    """Return frames (u, M) of the untouched skin: the recording's `reference`, otherwise its first seconds. Frames
+    without any reading are left out.
 
-    `seconds` (F,): times of the recording's frames. Frames without any reading are left out. Raises `ValueError` if
-    fewer than three frames remain.
+    **Arguments:**
+
+    - `recording`: the recording.
+    - `seconds`: times (F,) of its frames, seconds.
+    - `span`: time from the beginning that is untouched, seconds.
+
+    Raises `ValueError` if fewer than three frames remain.
+
+    **Example:**
+
+    ```python
+    still = untouched_frames(healthy_recording, np.arange(len(healthy)) / 5, span=1.0)
+    print(still.shape)  # (u, M)
+    ```
     """
     if recording.reference is not None:
         return recording.reference

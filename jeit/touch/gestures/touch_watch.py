@@ -39,6 +39,13 @@ class NamedTouch:
     unlike all touches of the training set, so that the prediction is not valid; `named`: time in the stream at which it
     was classified, seconds; `latency`: computing time from that frame to the prediction, seconds; `held`: whether it
     was cut off because it lasted longer than the patience.
+
+    **Example:**
+
+    ```python
+    for touch in named_touches:
+        print(isinstance(touch, NamedTouch), touch.gesture, touch.probability)
+    ```
     """
 
     number: int
@@ -60,6 +67,14 @@ class WatchedFrame:
     `peak`: maximum change, S, NaN if the frame was refused; `touched`: whether the skin is touched; `named`: touch that
     was classified at this frame, which may still continue, or None; `ended`: touches that have ended for good;
     `latency`: time from the frame to the result, seconds; `note`: remark on the frame, or an empty string.
+
+    **Example:**
+
+    ```python
+    watched = TouchWatch.create(images, gestures, empty, rate=30.0)
+    for frame in watched.follow(zip(seconds.tolist(), film, strict=True)):
+        print(isinstance(frame, WatchedFrame), frame.touched, frame.peak)
+    ```
     """
 
     second: float
@@ -79,6 +94,13 @@ class TouchWatch:
     **Fields**: `images`: imager of the skin; `level`: change that a touch exceeds; `model`: gesture classifier; `gap`:
     minimum untouched time between two touches, seconds; `patience`: time after which a touch becomes part of the
     reference, seconds; `notes`: remarks on the untouched skin and the frame rate.
+
+    **Example:**
+
+    ```python
+    watched = TouchWatch.create(images, gestures, empty, rate=30.0)
+    frames = list(watched.follow(zip(seconds.tolist(), film, strict=True)))
+    ```
     """
 
     images: TouchImages

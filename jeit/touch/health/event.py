@@ -63,6 +63,13 @@ class HealthEvent(Module):
     `path` (k, 2): path of a cut, metres, or None; `deviation`: standard deviation of the path's `length`, metres,
     estimated from the voltages; `through`: whether the whole depth of the skin is cut, or None; `reason`: explanation,
     a sentence.
+
+    **Example:**
+
+    ```python
+    events = watch(health, damaged).events
+    print([(event.kind, event.frame) for event in events if isinstance(event, HealthEvent)])
+    ```
     """
 
     number: int

@@ -29,11 +29,24 @@ def learn_health(
 ) -> SkinHealth:
     """Learn the healthy state of a skin to be monitored, from a recording of frames while it is healthy.
 
-    Frames have the recording's times, or come at `rate`, frames/s; otherwise, times are numbers of frames. If the
-    `description` has a protocol, failing electrodes are identified. If it also has geometry and electrodes, a model is
-    calibrated on the untouched frames, with which cuts are located. `sign`: as in `SkinHealth.fit`, -1 for skins that
-    conduct worse where touched; `patience`: time, in seconds, that no touch is held for. Raises `ValueError` as
-    `SkinHealth.fit` and `TouchImages.prepare` do.
+    **Arguments:**
+
+    - `healthy`: the recording. Frames have its times, or come at `rate`; otherwise, times are numbers of frames.
+    - `description`: description of the skin. If it has a protocol, failing electrodes are identified. If it also has
+      geometry and electrodes, a model is calibrated on the untouched frames, with which cuts are located.
+    - `sign`: as in `SkinHealth.fit`, -1 for skins that conduct worse where touched.
+    - `rate`: frames/s of a recording without times.
+    - `patience`: time that no touch is held for, seconds.
+    - `progress`: called with each step as it begins.
+
+    Raises `ValueError` as `SkinHealth.fit` and `TouchImages.prepare` do.
+
+    **Example:**
+
+    ```python
+    health = learn_health(healthy_recording, rate=5.0)
+    print(watch(health, damaged).events)
+    ```
     """
     check_kind("healthy", healthy, FrameRecording, "a FrameRecording, as of read_frame_recording(path)")
     frames, seconds = healthy.frames, seconds_of(healthy, rate)
@@ -59,9 +72,22 @@ def seconds_of(recording: FrameRecording, rate: float | None) -> Float[np.ndarra
 
 
 def doubts_of(health: SkinHealth, healthy: FrameRecording, frames: Float[np.ndarray, "F M"]) -> list[str]:
-    """List reasons to doubt the events that `health`, learnt from `healthy`, detects in frames (F, M).
+    """List reasons to doubt the events that a monitored skin reports: a sentence for each reason.
 
-    Returns a sentence for each reason. Raises `ValueError` if no frame has a reading in half of the healthy channels.
+    **Arguments:**
+
+    - `health`: the monitored skin, as from `learn_health`.
+    - `healthy`: the recording from which it was learnt.
+    - `frames`: the monitored frames (F, M), volts.
+
+    Raises `ValueError` if no frame has a reading in half of the healthy channels.
+
+    **Example:**
+
+    ```python
+    health = learn_health(healthy_recording)
+    print(doubts_of(health, healthy_recording, damaged))
+    ```
     """
     known = health.healthy
     there = np.isfinite(frames)

@@ -85,6 +85,13 @@ class SkinHealth:
     whether its channels are usable; `reason`: reason for the status, a sentence.
 
     Create it with `SkinHealth.fit`.
+
+    **Example:**
+
+    ```python
+    health = SkinHealth.fit(healthy)
+    print(watch(health, damaged).events)
+    ```
     """
 
     healthy: HealthyState
@@ -477,10 +484,22 @@ class SkinHealth:
 
 
 def watch(health: SkinHealth, frames: ArrayLike, times: ArrayLike | None = None) -> SkinHealth:
-    """Process a recording (F, M), volts, frame by frame, and return the state after it.
+    """Process a recording frame by frame, and return the state of the skin after it.
 
-    `times` (F,): seconds; by default, frames are counted. Raises `ValueError` as `SkinHealth.follow` does, and for a
-    different number of times.
+    **Arguments:**
+
+    - `health`: the monitored skin.
+    - `frames`: frames (F, M), volts.
+    - `times`: times (F,), seconds; by default, frames are counted.
+
+    Raises `ValueError` as `SkinHealth.follow` does, and for a different number of times.
+
+    **Example:**
+
+    ```python
+    for event in watch(health, damaged).events:
+        print(event.kind, event.frame, event.strength)
+    ```
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(healthy)")
     read = real_array("frames", frames, "(F, M) volts")

@@ -2,13 +2,13 @@ from .placed_map import PlacedMap, drawn_map, read_map, write_map
 from .quality import MapQuality, learning_curves, map_quality, time_constant
 from .self_organising_map import SelfOrganisingMap, fit_maps
 from .several_touches import MapTouch, neuron_shares, touches_reported
-from .training import Schedule
+from .training import MapSchedule
 
 __all__ = [
     "MapQuality",
+    "MapSchedule",
     "MapTouch",
     "PlacedMap",
-    "Schedule",
     "SelfOrganisingMap",
     "drawn_map",
     "fit_maps",

@@ -38,11 +38,22 @@ _AT_ONCE = 512
 class PlacedMap:
     """A self-organising map whose neurons have places, created by `PlacedMap.learn`.
 
-    `learnt`: the map. `places` (R, C, d), metres: mean place of the presses that each neuron won, NaN if it won none.
-    `widening`: root mean square error of held-out presses, divided by the estimated spread. `missed`: root mean square
-    residual of a channel if presses are approximated by the neurons nearest to them, in the unit of frames. `fitted`
-    (R, C, d), metres: places that fit the presses best, if neighbours on the grid locate a frame; None if the neurons
-    nearest to the frame locate it, by `places`.
+    **Fields**
+
+    - `learnt`: the map.
+    - `places` (R, C, d): mean place of the presses that each neuron won, metres, NaN if it won none.
+    - `widening`: root mean square error of held-out presses, divided by the estimated spread.
+    - `missed`: root mean square residual of a channel if presses are approximated by the neurons nearest to them, in
+      the unit of frames.
+    - `fitted` (R, C, d): places that fit the presses best, metres, if neighbours on the grid locate a frame; None if
+      the neurons nearest to the frame locate it, by `places`.
+
+    **Example:**
+
+    ```python
+    placed = PlacedMap.learn(learnt_map, map_frames, map_positions)
+    place, deviation = placed.locate(map_frames[:1])
+    ```
     """
 
     learnt: SelfOrganisingMap
@@ -249,7 +260,19 @@ def neighbours(shape: tuple[int, int]) -> tuple[Int[np.ndarray, " e"], Int[np.nd
 def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
     """Write a map to an NPZ file: its `weights` and `scale`, and the places of a `PlacedMap`.
 
+    **Arguments:**
+
+    - `learnt`: the map.
+    - `path`: path of the file.
+
     Raises `ValueError` if `learnt` is no map, or `path` is a folder.
+
+    **Example:**
+
+    ```python
+    write_map(learnt_map, "map.npz")
+    learnt_map = read_map("map.npz")
+    ```
     """
     check_kind("learnt", learnt, (SelfOrganisingMap, PlacedMap), "a map, as of SelfOrganisingMap.fit, or a PlacedMap")
     if Path(path).is_dir():
@@ -263,8 +286,21 @@ def write_map(learnt: SelfOrganisingMap | PlacedMap, path: str | Path) -> None:
 
 
 def read_map(path: str | Path) -> SelfOrganisingMap | PlacedMap:
-    """Read a map from a file that `write_map` wrote. Raises `FileNotFoundError`, and `ValueError` for any other
-    file."""
+    """Read a map from a file that `write_map` wrote.
+
+    **Arguments:**
+
+    - `path`: path of the file.
+
+    Raises `FileNotFoundError`, and `ValueError` for any other file.
+
+    **Example:**
+
+    ```python
+    write_map(placed, "map.npz")
+    placed = read_map("map.npz")
+    ```
+    """
     if Path(path).is_dir():
         raise ValueError(f"'{path}' is a folder; give an NPZ file.")
     if not Path(path).is_file():

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from jeit.arguments import check_kind, real_array
 from jeit.arguments.extras import optional
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap, checked_frames, learn_weights
-from jeit.touch.kohonen.training import Schedule
+from jeit.touch.kohonen.training import MapSchedule
 
 # Maximum number of frames of which all pairs are compared; number of neighbours of each frame.
 _COMPARED, _NEIGHBOURS = 2000, 12
@@ -34,10 +34,23 @@ class MapQuality:
 
 
 def map_quality(learnt: SelfOrganisingMap, frames: ArrayLike) -> MapQuality:
-    """Compute the quality of a map for frames (n, M), which may be those it was learnt from or others.
+    """Compute the quality of a self-organising map.
 
-    Trustworthiness is computed for at most 2,000 evenly spaced frames, with 12 neighbours of each. Raises `ValueError`
-    if `learnt` is no map, and for fewer than 25 frames, another number of channels, and NaN.
+    Trustworthiness is computed for at most 2,000 evenly spaced frames, with 12 neighbours of each.
+
+    **Arguments:**
+
+    - `learnt`: the map.
+    - `frames`: frames (n, M), those it was learnt from or others, in their unit.
+
+    Raises `ValueError` if `learnt` is no map, and for fewer than 25 frames, another number of channels, and NaN.
+
+    **Example:**
+
+    ```python
+    quality = map_quality(learnt_map, map_frames)
+    print(quality)
+    ```
     """
     trustworthiness = optional("sklearn.manifold", "the trustworthiness of a map").trustworthiness
 
@@ -69,7 +82,7 @@ def learning_curves(
     side. Raises `ValueError` as `SelfOrganisingMap.fit` does.
     """
     radius = max(shape) / 2
-    schedules = [Schedule(steps, 0, (float(rate), float(rate)), (radius, radius)) for rate in rates]
+    schedules = [MapSchedule(steps, 0, (float(rate), float(rate)), (radius, radius)) for rate in rates]
     return learn_weights(checked_frames(frames), [key], shape, schedules)[1]
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jeit.arguments import check_key, check_kind, counted, describe, is_number, real_array
-from jeit.touch.kohonen.training import Schedule, train
+from jeit.touch.kohonen.training import MapSchedule, train
 
 # Minimum number of frames: fewer define no order.
 _FEWEST = 3
@@ -31,6 +31,13 @@ class SelfOrganisingMap:
 
     **Fields**: `weights` (R, C, M): the frame of every neuron on a grid of R rows and C columns, in the unit of frames;
     `scale`: distance between a frame and a neuron at which the neuron's activity is 1/2, in the same unit.
+
+    **Example:**
+
+    ```python
+    learnt_map = SelfOrganisingMap.fit(map_frames, key, shape=(6, 6), schedule=MapSchedule(500, 500))
+    print(learnt_map.winners(map_frames[:3]))
+    ```
     """
 
     weights: Float[np.ndarray, "R C M"]
@@ -52,7 +59,7 @@ class SelfOrganisingMap:
         key: Array,
         *,
         shape: tuple[int, int] = (32, 32),
-        schedule: Schedule | None = None,
+        schedule: MapSchedule | None = None,
         scale: float | None = None,
     ) -> "SelfOrganisingMap":
         """Train a map on frames (N, M): voltages or changes of voltage, all in one unit.
@@ -63,7 +70,7 @@ class SelfOrganisingMap:
         are not numbers, contain NaN, are fewer than three or all the same, and for an invalid key, shape, schedule or
         scale.
         """
-        schedule = Schedule() if schedule is None else schedule
+        schedule = MapSchedule() if schedule is None else schedule
         return fit_maps(frames, [key], shape=shape, schedules=[schedule], scale=scale)[0]
 
     @property
@@ -135,7 +142,7 @@ def fit_maps(
     keys: Sequence[Array],
     *,
     shape: tuple[int, int] = (32, 32),
-    schedules: Sequence[Schedule] = (Schedule(),),
+    schedules: Sequence[MapSchedule] = (MapSchedule(),),
     scale: float | None = None,
 ) -> list[SelfOrganisingMap]:
     """Train several maps on the same frames at once, one for each pair of a key and a schedule.
@@ -152,7 +159,7 @@ def learn_weights(
     frames: Float[np.ndarray, "N M"],
     keys: Sequence[Array],
     shape: tuple[int, int],
-    schedules: Sequence[Schedule],
+    schedules: Sequence[MapSchedule],
 ) -> tuple[Float[np.ndarray, "k R C M"], Float[np.ndarray, "k T"]]:
     """Train the weights of the maps of `fit_maps`; also returns the mean of their weights after each frame.
 
@@ -164,7 +171,7 @@ def learn_weights(
     for key in keys:
         check_key(key)
     for one in schedules:
-        check_kind("schedule", one, Schedule, "a Schedule, such as Schedule()")
+        check_kind("schedule", one, MapSchedule, "a MapSchedule, such as MapSchedule()")
     if not keys or len({one.steps for one in schedules}) != 1:
         raise ValueError("keys and schedules: give one at least of each, and schedules that show as many frames.")
     shape = _check_shape(shape)

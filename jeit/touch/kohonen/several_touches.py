@@ -54,14 +54,27 @@ def touches_reported(
     least: float = _LEAST,
     apart: float | None = None,
 ) -> list[MapTouch]:
-    """Detect the touches in a frame (M,) of a skin whose untouched frame is `reference` (M,).
+    """Detect the touches in a frame by a self-organising map: at most six, the strongest first.
 
-    Returns at most six touches, the strongest first. Neurons with a share in the frame (`neuron_shares`) are grouped
-    into possible touches: groups are separated by more than `apart` metres, by default a tenth of the extent of all
-    places. Touches are added one after another, as long as the unexplained change decreases by five standard deviations
-    of the map's own residual. Touches are omitted if they are weaker than the fraction `least` of the strongest touch,
-    or of a touch in the training set. Raises `ValueError` as `neuron_shares` does, and for an invalid `least` or
-    `apart`.
+    Neurons with a share in the frame (`neuron_shares`) are grouped into possible touches. Touches are added one after
+    another, as long as the unexplained change decreases by five standard deviations of the map's own residual.
+
+    **Arguments:**
+
+    - `placed`: the map, with places.
+    - `frame`: the frame (M,), in the unit of the frames it was learnt from.
+    - `reference`: frame (M,) of the untouched skin, in the same unit.
+    - `least`: touches weaker than this fraction of the strongest touch, or of a touch in the training set, are omitted.
+    - `apart`: distance that separates groups, metres; by default a tenth of the extent of all places.
+
+    Raises `ValueError` as `neuron_shares` does, and for an invalid `least` or `apart`.
+
+    **Example:**
+
+    ```python
+    for touch in touches_reported(placed, map_frames[0], reference):
+        print(touch.place, touch.strength)
+    ```
     """
     if not (is_number(least) and 0 <= least < 1):
         raise ValueError(f"least must be a share, from 0 to below 1; it is {describe(least)}.")

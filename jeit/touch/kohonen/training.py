@@ -33,12 +33,19 @@ _ORDERING_FRAMES, _TUNING_FRAMES = 16, 64
 _IN_BOUNDS = "promise_in_bounds"
 
 
-class Schedule(Module):
+class MapSchedule(Module):
     """Schedule of a map's training.
 
     **Fields**: `ordering` and `tuning`: number of frames shown in each phase; `rate`: the rate ε at the first and the
     last frame, with exponential decay between them; `radius`: ρ at the first and the last frame of the ordering phase,
     in grid steps, also with exponential decay; if None, from half the map's longer side to 1.
+
+    **Example:**
+
+    ```python
+    schedule = MapSchedule(ordering=500, tuning=500)
+    learnt_map = SelfOrganisingMap.fit(map_frames, key, shape=(6, 6), schedule=schedule)
+    ```
     """
 
     ordering: int = 20_000

@@ -140,9 +140,20 @@ METHODS = tuple(dict.fromkeys((*number_methods.METHODS, *label_methods.METHODS))
 class Standing:
     """Accuracy with which a quantity was learnt, in the units of the quantity.
 
-    `method`: the chosen method; `tried`: all methods that were tried, and their errors on held-out presses; `held_out`:
-    predictions of the chosen method for held-out presses; `right`: the true values; `std`: standard deviations of the
-    predictions.
+    **Fields**
+
+    - `method`: the chosen method.
+    - `tried`: all methods that were tried, and their errors on held-out presses.
+    - `held_out`: predictions of the chosen method for held-out presses.
+    - `right`: the true values.
+    - `std`: standard deviations of the predictions.
+
+    **Example:**
+
+    ```python
+    standing = learnt.standing["place"]
+    print(isinstance(standing, Standing), standing.tried)
+    ```
     """
 
     method: str

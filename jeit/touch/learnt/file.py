@@ -105,7 +105,22 @@ _STORED_NAMES = {stored: name for name, stored in _STORED_CLASSES.items()}
 
 
 def write_skin(skin: LearntSkin, path: str | Path) -> None:
-    """Write a learnt skin to one file, without its `standing`. Raises `ValueError` for a folder."""
+    """Write a learnt skin to one file, without its `standing`.
+
+    **Arguments:**
+
+    - `skin`: the learnt skin.
+    - `path`: path of the file.
+
+    Raises `ValueError` for a folder.
+
+    **Example:**
+
+    ```python
+    write_skin(learnt, "skin.skops")
+    learnt = read_skin("skin.skops")
+    ```
+    """
     fields_by_name = {one.name: getattr(skin, one.name) for one in fields(skin) if one.name != "standing"}
     write_plain(path, _KIND, _VERSION, fields_by_name, "skin.skops")
 
@@ -114,7 +129,19 @@ def read_skin(path: str | Path) -> LearntSkin:
     """Read a learnt skin from a file, or from the folder that `jeit touch fit` made.
 
     Nothing in the file is executed: it may contain only numbers and estimators of scikit-learn.
+
+    **Arguments:**
+
+    - `path`: path of the file or folder.
+
     Raises `FileNotFoundError`, and `ValueError` for files of another kind or with any other content.
+
+    **Example:**
+
+    ```python
+    write_skin(learnt, "skin.skops")
+    learnt = read_skin("skin.skops")
+    ```
     """
     path = Path(path)
     if path.is_dir():

@@ -53,11 +53,24 @@ _ALIKE, _SIZES = 0.8, 5.0
 class LearntSkin:
     """Models learnt from presses by `LearntSkin.fit`; a model is None if the presses lack its quantity.
 
-    `channels`: joint model of the channels. `place`, `force`, `label`, `keys`: model of each quantity. `quiet`: root
-    mean square of the changes, in the channels' scales, below which the skin counts as untouched. `mean_reference`
-    (M,): mean reference of the training set. `lag`: number of rows by which frames lagged behind their presses.
-    `per_session`: whether changes are standardised by session. `standing`: accuracy of each model on held-out presses;
-    `notes`: corrections that were made.
+    **Fields**
+
+    - `channels`: joint model of the channels.
+    - `mean_reference` (M,): mean reference of the training set.
+    - `place`, `force`, `label`, `keys`: model of each quantity.
+    - `quiet`: root mean square of the changes, in the channels' scales, below which the skin counts as untouched.
+    - `lag`: number of rows by which frames lagged behind their presses.
+    - `per_session`: whether changes are standardised by session.
+    - `name`: name of the presses.
+    - `notes`: corrections that were made.
+    - `standing`: accuracy of each model on held-out presses.
+
+    **Example:**
+
+    ```python
+    learnt = LearntSkin.fit(presses, method="neighbours")
+    print(learnt.predict(presses.frames, reference).position)
+    ```
     """
 
     channels: Channels

@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 
 from jeit.touch.kohonen.placed_map import PlacedMap
 from jeit.touch.kohonen.self_organising_map import SelfOrganisingMap
-from jeit.touch.kohonen.training import Schedule
+from jeit.touch.kohonen.training import MapSchedule
 from jeit.touch.learnt.array_models import Forest, NearestNeighbours, SupportVectorMachine
 from jeit.touch.learnt.extras import apply_in_parts
 from jeit.touch.learnt.network import Network
@@ -142,8 +142,8 @@ def som(features, targets) -> Any:
     """Fit a self-organising map, which interpolates between the mean targets of the presses that each neuron won."""
     import jax
 
-    shown = min(Schedule().ordering, _SHOWN * len(features))
-    learnt = SelfOrganisingMap.fit(features, jax.random.key(0), schedule=Schedule(shown, shown))
+    shown = min(MapSchedule().ordering, _SHOWN * len(features))
+    learnt = SelfOrganisingMap.fit(features, jax.random.key(0), schedule=MapSchedule(shown, shown))
     return PlacedMap.learn(learnt, features, targets)
 
 

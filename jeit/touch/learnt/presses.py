@@ -88,6 +88,13 @@ class Presses:
       "none" where nothing touched; `touched`: (N, K), which of K keys were pressed.
     - `group`: (N,), the session or person of each press, which cross-validation never splits; `time`: (N,), seconds.
     - `name`: the name in errors and reports; `notes`: corrections that were made.
+
+    **Example:**
+
+    ```python
+    presses = Presses.create(map_frames, positions=map_positions, reference=reference)
+    learnt = LearntSkin.fit(presses, method="neighbours")
+    ```
     """
 
     frames: Float[np.ndarray, "N M"]
@@ -151,7 +158,18 @@ class Presses:
 def read_presses(path: str | Path) -> Presses:
     """Read presses from an NPZ file with arrays named as the fields of `Presses`: `frames`, and optionally the others.
 
+    **Arguments:**
+
+    - `path`: path of the file.
+
     Raises `FileNotFoundError`, and `ValueError` for any other file and as `Presses.create` does.
+
+    **Example:**
+
+    ```python
+    np.savez("presses.npz", frames=map_frames, positions=map_positions, reference=reference)
+    learnt = LearntSkin.fit(read_presses("presses.npz"), method="neighbours")
+    ```
     """
     with _with_file_name(path):
         return Presses.create(**_read_arrays(path, "frames", "reference", *_ROWS), name=Path(path).name)
@@ -160,7 +178,18 @@ def read_presses(path: str | Path) -> Presses:
 def read_frames(path: str | Path) -> dict[str, np.ndarray]:
     """Read the arguments of `LearntSkin.predict` from an NPZ file: `frames`, and optionally `reference` and `group`.
 
+    **Arguments:**
+
+    - `path`: path of the file.
+
     Raises `FileNotFoundError`, and `ValueError` for any other file.
+
+    **Example:**
+
+    ```python
+    np.savez("frames.npz", frames=map_frames, reference=reference)
+    found = learnt.predict(**read_frames("frames.npz"))
+    ```
     """
     with _with_file_name(path):
         arrays = _read_arrays(path, "frames", "reference", "group")
@@ -375,6 +404,13 @@ class Touches:
       for the farthest frame in it.
     - `alive` (n, M): whether a channel was used.
     - `notes`: corrections that were made.
+
+    **Example:**
+
+    ```python
+    found = learnt.predict(presses.frames[:3], reference)
+    print(isinstance(found, Touches), found.position, found.position_std)
+    ```
     """
 
     position: Float[np.ndarray, "n d"] | None

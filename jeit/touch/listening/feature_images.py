@@ -104,9 +104,22 @@ def band_edges(highest: float) -> Float[np.ndarray, " 65"]:
 def sound_images(recording: Recording, highest: float = EVEN) -> SoundImages:
     """Compute the feature images of all windows of a recording, every 0.1 s.
 
-    Sound above the frequency `highest`, Hz, is left out; bands above half the sampling rate are empty. A recording
-    shorter than 0.5 s is padded with 0.3 s of silence before and after it. Samples that are not finite count as zero.
+    Bands above half the sampling rate are empty. A recording shorter than 0.5 s is padded with 0.3 s of silence before
+    and after it. Samples that are not finite count as zero.
+
+    **Arguments:**
+
+    - `recording`: samples of one or several microphones.
+    - `highest`: frequency above which sound is left out, Hz.
+
     Raises `ValueError` if `recording` is no recording of samples, its rate is below 1250 Hz, or `highest` is invalid.
+
+    **Example:**
+
+    ```python
+    feature_images = sound_images(recordings[0])
+    print(feature_images.times)
+    ```
     """
     return SoundImages.joined(list(image_blocks(recording, highest)))
 

@@ -36,12 +36,24 @@ class _Files(Sequence):
 
 @dataclass(frozen=True)
 class LabelledClips:
-    """n labelled clips of sound.
+    """n labelled clips of sound, created by `LabelledClips.from_recordings`.
 
-    `recordings`: a sequence of `Recording`; `labels` (n,): their classes; `groups` (n,): names of the groups, such as
-    of people or things, in which clips are held out together; `channels`: number of channels of all clips, 1 if they
-    are mixed; `highest`: frequency up to which all clips have sound, Hz; `notes`: remarks on the clips; `name`: their
-    name.
+    **Fields**
+
+    - `recordings`: sequence of n `jeit.acoustic.Recording`.
+    - `labels` (n,): their classes.
+    - `groups` (n,): names of the groups, such as of people or things, in which clips are held out together.
+    - `channels`: number of channels of all clips, 1 if they are mixed.
+    - `highest`: frequency up to which all clips have sound, Hz.
+    - `notes`: remarks on the clips.
+    - `name`: their name.
+
+    **Example:**
+
+    ```python
+    clips = LabelledClips.from_recordings(recordings, labels)
+    listener = Listener.fit(clips, method="linear")
+    ```
     """
 
     recordings: Sequence[Recording]
@@ -117,13 +129,28 @@ class LabelledClips:
 
 
 def read_clips(folder: str | Path, *, progress: Callable[[str], None] | None = None) -> LabelledClips:
-    """Read labelled clips: every sub-folder of `folder` is a class, and every file in it a clip of that class.
+    """Read labelled clips: every sub-folder of a folder is a class, and every file in it a clip of that class.
 
     Files are WAV, NPZ, or any format that `soundfile` reads if it is installed. Clips in a folder within the folder of
     a class, such as of one person or day, are one group, together with the clips of other classes in a folder of the
     same name; any other file is a group of its own. Files that cannot be read are left out and listed in `notes`;
-    hidden files are ignored. `progress` is called with a description of the progress. Raises `ValueError` if there is
-    no such folder, there are fewer than two classes, or no clip of a class can be read.
+    hidden files are ignored.
+
+    **Arguments:**
+
+    - `folder`: the folder.
+    - `progress`: called with a description of the progress.
+
+    Raises `ValueError` if there is no such folder, there are fewer than two classes, or no clip of a class can be read.
+
+    **Example:**
+
+    ```python
+    for number, (recording, label) in enumerate(zip(recordings, labels, strict=True)):
+        Path("clips", label).mkdir(parents=True, exist_ok=True)
+        write_recording(f"clips/{label}/{number}.npz", recording)
+    clips = read_clips("clips")
+    ```
     """
     folder = Path(folder)
     if not folder.is_dir():

@@ -27,7 +27,7 @@ from jeit.touch.listening.modality_network import (
     train_network,
 )
 from jeit.touch.listening.window_features import Levels, sound_features, spectrum_features
-from jeit.touch.training import Plan
+from jeit.touch.training import TrainingPlan
 
 # Number of boosting rounds; number of leaves of a tree; minimum number of windows in a leaf if the set is large.
 _ROUNDS, _LEAVES, _IN_A_LEAF = 100, 15, 10
@@ -86,7 +86,7 @@ class NetworkListener:
 class NetworkLearner:
     """Trains a network by the schedule `plan(windows, batches=)`."""
 
-    plan: Callable[..., Plan]
+    plan: Callable[..., TrainingPlan]
 
     def learn(self, lesson: TrainingSet) -> NetworkListener:
         """Train a network with early stopping, by the loss on held-out groups.

@@ -51,6 +51,13 @@ class Listener:
     these support no higher confidence. `standing`: predictions for the held-out clips, and errors of all methods that
     were tried, the best first; None for a listener that was read from a file; `notes`: remarks on the training; `name`:
     name of the clips.
+
+    **Example:**
+
+    ```python
+    listener = Listener.fit(clips, method="linear")
+    print(listener.hear(recordings[0]).whole)
+    ```
     """
 
     names: tuple[str, ...]

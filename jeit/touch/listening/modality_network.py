@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.lib.stride_tricks import sliding_window_view
 
-from jeit.touch.training import Objective, Plan, TrainingResult, fit
+from jeit.touch.training import TrainingObjective, TrainingPlan, TrainingResult, fit_network
 from jeit_solvers.module import Module
 
 # For the two layers: sizes of kernels and of pools, in pixels, and numbers of channels.
@@ -150,14 +150,14 @@ class NetworkAnswers:
         return values.reshape(len(images), -1) @ self.dense + self.bias
 
 
-def paper_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
+def paper_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan:
     """Training schedule of the paper for a training set of `windows` windows.
 
     Training has at most `batches`, but at least one pass through the windows. Noise is drawn anew in every batch, so
     that no image is repeated; `COPIES` passes through the windows correspond to one epoch of noisy copies.
     """
     least = min(batch, windows)
-    return Plan(
+    return TrainingPlan(
         rate=2e-4,
         batch=least,
         epochs=max(1, round(batches / (windows // least))),
@@ -168,7 +168,7 @@ def paper_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
     )
 
 
-def library_plan(windows: int, *, batches: int, batch: int = 64) -> Plan:
+def library_plan(windows: int, *, batches: int, batch: int = 64) -> TrainingPlan:
     """Training schedule of this library, which needs fewer batches for the same accuracy on small sets.
 
     The rate is 1e-3, and a tenth of it in the last third of the training.
@@ -184,7 +184,7 @@ def train_network(
     *,
     classes: int,
     key: Array,
-    plan: Plan,
+    plan: TrainingPlan,
     noise: float = NOISE,
     checkpoint: str | Path | None = None,
     progress: Callable[[str], None] | None = None,
@@ -192,7 +192,7 @@ def train_network(
     """Train a network on images of the classes `right`, until its loss on held-out images no longer decreases.
 
     `held`: the held-out images and their classes; `plan`: as from `library_plan`; `noise`: standard deviation of the
-    noise added to images; `checkpoint` and `progress` as in `jeit.touch.training.fit`, whose errors are raised. The
+    noise added to images; `checkpoint` and `progress` as in `jeit.touch.fit_network`, whose errors are raised. The
     same `key` gives identical results.
     """
     drawn, trained = jax.random.split(key)
@@ -211,9 +211,9 @@ def train_network(
 
     data = (np.asarray(images, np.float32), np.asarray(right, np.int32))
     validation = (np.asarray(held[0], np.float32), np.asarray(held[1], np.int32))
-    return fit(
+    return fit_network(
         network,
-        Objective(loss, held_out, moving),
+        TrainingObjective(loss, held_out, moving),
         data,
         validation,
         plan,

@@ -29,12 +29,25 @@ class Event:
 class SoundLabels:
     """The classification of W windows of a recording by a listener.
 
-    `times` (W,): middles of the windows, seconds; `probabilities` (W, C) of the classes `names` (C,); `quiet` (W,):
-    whether a window is quieter than all in the training set, so that its probabilities do not count; `known` (W,):
-    whether a window's samples are finite; `strongest` (W,): index of the loudest microphone; `loud` (W,): whether a
-    window is at most 20 dB below the loudest of the recording, for `whole`. `position` (W, d), metres, with standard
-    deviations `position_std`: estimated place, NaN if there is none; both are None without a calibration. `name`: name
-    of the recording; `notes`: remarks on it.
+    **Fields**
+
+    - `times` (W,): middles of the windows, seconds.
+    - `probabilities` (W, C): probabilities of the classes `names` (C,).
+    - `quiet` (W,): whether a window is quieter than all in the training set, so that its probabilities do not count.
+    - `known` (W,): whether a window's samples are finite.
+    - `strongest` (W,): index of the loudest microphone.
+    - `loud` (W,): whether a window is at most 20 dB below the loudest of the recording, for `whole`.
+    - `name`: name of the recording.
+    - `notes`: remarks on it.
+    - `position` (W, d), `position_std`: estimated place and its standard deviations, metres, NaN if there is none; both
+      are None without a calibration.
+
+    **Example:**
+
+    ```python
+    sounds = listener.hear(recordings[0])
+    print(isinstance(sounds, SoundLabels), sounds.whole, sounds.events)
+    ```
     """
 
     times: Float[np.ndarray, " W"]

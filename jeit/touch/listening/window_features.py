@@ -80,6 +80,17 @@ def sound_features(images: SoundImages) -> Float[np.ndarray, "W k"]:
     and decay, and modulation up to 16 Hz. Features of the spectrogram: mean spectrum in 16 bands, centroid, width,
     flatness, flux, and decay in 4 bands. Features of the microphones: share of the loudest, evenness, correlation
     between their levels, and change of their distribution over time.
+
+    **Arguments:**
+
+    - `images`: feature images of the windows, as from `sound_images`.
+
+    **Example:**
+
+    ```python
+    features = sound_features(sound_images(recordings[0]))
+    print(features.shape)  # (W, k)
+    ```
     """
     if not len(images):
         return np.zeros((0, len(_loudness_features(np.zeros((1, FRAMES)))[0]) + _COLOURS + 2 * _FEW + 8 + 8))

@@ -1,5 +1,5 @@
 from .image_network import DESIGNS, ImageNetwork, read_network, write_network
-from .learn import PRESETS, ImageStanding, LearntImages, Preset, learn_images
+from .learn import PRESETS, ImageStanding, LearntImages, NetworkPreset, learn_images
 from .measured import FrameDepth, resting_frame, stream_depths
 
 __all__ = [
@@ -9,7 +9,7 @@ __all__ = [
     "ImageNetwork",
     "ImageStanding",
     "LearntImages",
-    "Preset",
+    "NetworkPreset",
     "learn_images",
     "read_network",
     "resting_frame",

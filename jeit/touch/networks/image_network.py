@@ -56,6 +56,13 @@ class ImageNetwork:
     metres; `shape`: (rows, columns) of its maps; `extent`: (x_min, x_max, y_min, y_max) of its maps, metres, with row 0
     at y_min; `noise`: relative noise of a channel in training; `made_for`: description of the skin, electrodes and
     protocol that it can be used for, as plain values.
+
+    **Example:**
+
+    ```python
+    network = read_network("network")
+    print(isinstance(network, ImageNetwork), network.depth(rest, rest).shape)
+    ```
     """
 
     network: ThreeStages | Unrolled
@@ -217,8 +224,20 @@ def describe_skin(protocol: Protocol, centres: ArrayLike, extent: tuple[float, .
 def write_network(network: ImageNetwork, path: str | Path) -> None:
     """Write a network to one file: arrays with a JSON header.
 
+    **Arguments:**
+
+    - `network`: the network.
+    - `path`: path of the file.
+
     Raises `ValueError` for anything but an `ImageNetwork`, and if `path` is a folder; `OSError` if it cannot be
     written.
+
+    **Example:**
+
+    ```python
+    write_network(read_network("network"), "copy.jeit")
+    network = read_network("copy.jeit")
+    ```
     """
     check_kind("network", network, ImageNetwork, "an ImageNetwork, as of learn_images")
     head = {
@@ -237,8 +256,22 @@ def write_network(network: ImageNetwork, path: str | Path) -> None:
 def read_network(path: str | Path, *, skin: Skin | None = None) -> ImageNetwork:
     """Read a network from a file that `write_network` wrote, or from the folder of `learn_images`.
 
-    Nothing in the file is executed. Raises `FileNotFoundError`, and `ValueError` for a file of another kind, and, with
-    the difference, if the network was trained for a skin other than the given `skin`.
+    Nothing in the file is executed.
+
+    **Arguments:**
+
+    - `path`: path of the file or folder.
+    - `skin`: the skin that it is to be used for, which is then compared with that it was trained for.
+
+    Raises `FileNotFoundError`, and `ValueError` for a file of another kind, and, with the difference, if the network
+    was trained for another skin.
+
+    **Example:**
+
+    ```python
+    network = read_network("network", skin=sheet)
+    depth = network.depth(rest, rest)  # (rows, columns), metres
+    ```
     """
     path = Path(path)
     path = path / FILE if path.is_dir() else path

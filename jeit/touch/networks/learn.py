@@ -31,9 +31,17 @@ from jeit.touch.networks.linear_channels import (
 )
 from jeit.touch.networks.three_stages import DepthAutoencoder, ThreeStages, VoltageAutoencoder
 from jeit.touch.networks.unrolled import Unrolled
-from jeit.touch.simulate import Indent, IndentSet, ball, relative_changes, simulate_presses
+from jeit.touch.simulate import Indent, IndentSet, ball_indenter, relative_changes, simulate_presses
 from jeit.touch.simulate.contact.indent_sets import image_places
-from jeit.touch.training import ArrayRows, MappedRows, Objective, Plan, Rows, TrainingResult, fit
+from jeit.touch.training import (
+    ArrayRows,
+    MappedRows,
+    Rows,
+    TrainingObjective,
+    TrainingPlan,
+    TrainingResult,
+    fit_network,
+)
 
 # Maximum number of touches that are in memory, and shuffled, at once: 120 MB for 94 channels and 48 × 48 maps.
 _AT_ONCE = 12_000
@@ -148,18 +156,18 @@ class TrainingRuns(NamedTuple):
     `progress`: function that is called with a description of the progress, or None.
     """
 
-    plan: Plan
+    plan: TrainingPlan
     key: Array
     folder: Path | None = None
     progress: Callable[[str], None] | None = None
 
-    def run(self, name: str, network, objective: Objective, training, validation) -> TrainingResult:
+    def run(self, name: str, network, objective: TrainingObjective, training, validation) -> TrainingResult:
         """Run one training, with a random key that depends on its name."""
         key = jax.random.fold_in(self.key, int.from_bytes(name.encode()[:4], "little"))
         kept = None if self.folder is None else self.folder / f"{name}.training"
         report = self.progress
         said = None if report is None else (lambda text: report(f"{name}, {text}"))
-        return fit(network, objective, training, validation, self.plan, key=key, checkpoint=kept, progress=said)
+        return fit_network(network, objective, training, validation, self.plan, key=key, checkpoint=kept, progress=said)
 
 
 def train_three_stages(
@@ -194,14 +202,16 @@ def train_three_stages(
         "voltages": runs.run(
             "voltages",
             VoltageAutoencoder(validation.change.shape[1], key=voltages),
-            Objective(denoising_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=1)),
+            TrainingObjective(denoising_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=1)),
             changes,
             network_start.standardise(jnp.asarray(validation.change, jnp.float32)),
         ),
         "maps": runs.run(
             "maps",
             DepthAutoencoder(shape, key=depth),
-            Objective(map_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=(1, 2)) / _SCALE),
+            TrainingObjective(
+                map_loss, lambda network, batch: jnp.mean((network(batch) - batch) ** 2, axis=(1, 2)) / _SCALE
+            ),
             training.rows("depth"),
             validation.depth,
         ),
@@ -221,7 +231,7 @@ def train_three_stages(
 
     rows = training.rows("change", "depth"), _add_noise(validation, noise)
     trainings["projection"] = runs.run(
-        "projection", network_start, Objective(projection_loss, _map_errors, trained), *rows
+        "projection", network_start, TrainingObjective(projection_loss, _map_errors, trained), *rows
     )
     return TrainedNetwork(trainings["projection"].network, trainings)
 
@@ -261,7 +271,7 @@ def train_unrolled(
         return value / _SCALE + _MISFIT * jnp.mean(jnp.log1p(relative_misfit)), network
 
     rows = training.rows("change", "depth"), _add_noise(validation, noise)
-    found = runs.run("unrolled", untrained, Objective(loss, _map_errors, untrained.trained), *rows)
+    found = runs.run("unrolled", untrained, TrainingObjective(loss, _map_errors, untrained.trained), *rows)
     return TrainedNetwork(found.network, {"unrolled": found})
 
 
@@ -305,30 +315,37 @@ _BALL, _DEPTH, _PLACES = 0.015, 0.75, 15
 
 
 @dataclass(frozen=True)
-class Preset:
+class NetworkPreset:
     """Size of a training.
 
     **Fields**: `number`: number of training touches; `held_out`: number of held-out touches, and of test touches;
     `plan`: plan of every training; `three_stages`: plan for the design "three-stages" if it is another, otherwise None.
+
+    **Example:**
+
+    ```python
+    preset = NetworkPreset(20, 10, TrainingPlan(batch=10, epochs=1))
+    learnt_images = learn_images(sheet, "network", preset=preset)
+    ```
     """
 
     number: int
     held_out: int
-    plan: Plan
-    three_stages: Plan | None = None
+    plan: TrainingPlan
+    three_stages: TrainingPlan | None = None
 
-    def plan_of(self, design: str) -> Plan:
+    def plan_of(self, design: str) -> TrainingPlan:
         """Return the training plan for a design."""
         return self.three_stages if design == "three-stages" and self.three_stages is not None else self.plan
 
 
 PRESETS = {
-    "quick": Preset(1000, 250, Plan(rate=2e-3, batch=32, epochs=10, patience=6, decay=0.8)),
-    "full": Preset(
+    "quick": NetworkPreset(1000, 250, TrainingPlan(rate=2e-3, batch=32, epochs=10, patience=6, decay=0.8)),
+    "full": NetworkPreset(
         24_000,
         2000,
-        Plan(rate=2e-3, batch=64, epochs=20, patience=8, decay=0.87),
-        Plan(rate=1e-3, batch=128, epochs=30, patience=5, decay=0.92),
+        TrainingPlan(rate=2e-3, batch=64, epochs=20, patience=8, decay=0.87),
+        TrainingPlan(rate=1e-3, batch=128, epochs=30, patience=5, decay=0.92),
     ),
 }
 
@@ -368,21 +385,38 @@ def learn_images(
     skin: Skin,
     folder: str | Path,
     *,
-    preset: str | Preset = "full",
+    preset: str | NetworkPreset = "full",
     design: str = "unrolled",
     touches: int | None = None,
     seed: int = 0,
     client: Any = None,
     progress: Callable[[str], None] | None = None,
 ) -> LearntImages:
-    """Simulate touches of a skin, train a network on them, and write it to `folder`, as `network.jeit`.
+    """Simulate touches of a skin, train a network on them, and write it to a folder, as `network.jeit`.
 
     If it is interrupted, the same call resumes: touches are stored in chunks in the folder `work`, and trainings in
-    checkpoints. `preset`: "quick", under two minutes, "full", or a `Preset`; `design`: "unrolled", a network with the
-    skin's forward model, or "three-stages", that of Park et al. 2022; `touches`: number of training touches, by default
-    that of the preset, limited only by the disk; `client`: client of a dask cluster for the simulation. `progress` is
-    called with a description of the progress. Raises `ValueError` for curved skins, unknown names, an invalid number of
-    touches, and a folder with work on another skin; `ImportError` without the extras `learn` and `cluster`.
+    checkpoints.
+
+    **Arguments:**
+
+    - `skin`: the skin, which is flat.
+    - `folder`: the folder, which is created if needed.
+    - `preset`: "quick", under two minutes, "full", or a `NetworkPreset`.
+    - `design`: "unrolled", a network with the skin's forward model, or "three-stages", that of Park et al. 2022.
+    - `touches`: number of training touches, by default that of the preset, limited only by the disk.
+    - `seed`: random seed.
+    - `client`: client of a dask cluster for the simulation.
+    - `progress`: called with a description of the progress.
+
+    Raises `ValueError` for curved skins, unknown names, an invalid number of touches, and a folder with work on another
+    skin; `ImportError` without the extras `learn` and `cluster`.
+
+    **Example:**
+
+    ```python
+    preset = NetworkPreset(20, 10, TrainingPlan(batch=10, epochs=1))
+    learnt_images = learn_images(sheet, "network", preset=preset)
+    ```
     """
     need_extra("learn", "a network that images touches")
     need_extra("cluster", "a store of simulated touches")
@@ -393,7 +427,7 @@ def learn_images(
             "as a rectangle, skin.width_mm and skin.height_mm in place of the table [surface]."
         )
     check_name("design", design, DESIGNS)
-    if not isinstance(preset, Preset):
+    if not isinstance(preset, NetworkPreset):
         check_name("preset", preset, PRESETS)
         preset = PRESETS[preset]
     if touches is not None:
@@ -456,7 +490,7 @@ def evaluate_network(network: ImageNetwork, skin: Skin, examples: TouchExamples,
     maps = estimate_maps(examples.change)
     explained = 1 - float(np.mean((maps - examples.depth) ** 2) / np.mean(examples.depth**2))
     grid = touches_away_from_the_edge(skin.outline, _BALL / 2, _PLACES, _PLACES)
-    tip, depth = ball(_BALL), min(_DEPTH * float(skin.thickness), _BALL / 2)
+    tip, depth = ball_indenter(_BALL), min(_DEPTH * float(skin.thickness), _BALL / 2)
     ball_maps = estimate_maps(relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places]))
     rows, columns = network.shape
     place = error_statistics(depth_centroids(ball_maps, image_places(skin, columns, rows)), grid.places)

@@ -13,15 +13,15 @@ from jeit.design import Bell, Skin, touches_away_from_the_edge
 from jeit.forward.changes import ContactSensitivity
 from jeit.forward.model import select_channels
 from jeit.touch.simulate import (
-    Bar,
-    Disc,
+    BarIndenter,
+    DiscIndenter,
     Indent,
     IndentDraws,
     JoinedIndenters,
     PlacedIndenter,
-    Revolved,
-    Ring,
-    ball,
+    RevolvedIndenter,
+    RingIndenter,
+    ball_indenter,
     material,
 )
 from jeit.touch.simulate.contact.indent_sets import image_places
@@ -71,17 +71,17 @@ _MARGIN = 0.04
 
 def wrench() -> JoinedIndenters:
     """An open-ended wrench laid flat, 100 mm long."""
-    jaw = PlacedIndenter(Ring(0.030, 0.014), (0.040, 0.0))
-    return JoinedIndenters(PlacedIndenter(Bar(0.070, 0.010), (-0.010, 0.0)), jaw)
+    jaw = PlacedIndenter(RingIndenter(0.030, 0.014), (0.040, 0.0))
+    return JoinedIndenters(PlacedIndenter(BarIndenter(0.070, 0.010), (-0.010, 0.0)), jaw)
 
 
 def touching_bodies() -> list[AbstractIndenter]:
     """Bodies that touch the skin: bells, balls, discs, bars, and a wrench."""
     return [
-        *(Revolved(Bell(0.02, deviation)) for deviation in (5e-3, 7.5e-3, 10e-3)),
-        *(ball(diameter) for diameter in (0.015, 0.020, 0.030)),
-        *(Disc(diameter) for diameter in (0.010, 0.020, 0.030)),
-        *(Bar(length, width) for length, width in ((0.040, 0.008), (0.030, 0.015), (0.060, 0.010))),
+        *(RevolvedIndenter(Bell(0.02, deviation)) for deviation in (5e-3, 7.5e-3, 10e-3)),
+        *(ball_indenter(diameter) for diameter in (0.015, 0.020, 0.030)),
+        *(DiscIndenter(diameter) for diameter in (0.010, 0.020, 0.030)),
+        *(BarIndenter(length, width) for length, width in ((0.040, 0.008), (0.030, 0.015), (0.060, 0.010))),
         wrench(),
     ]
 
@@ -102,7 +102,7 @@ def detection_noise(skin: Skin, limit: float = _DETECTED_FORCE) -> float:
     the noise is a third of the median of these maxima. Park et al. 2022 detect 0.7 N; this load indents a hydrogel of
     100 kPa by 1.7 mm.
     """
-    tip = ball(0.015)
+    tip = ball_indenter(0.015)
     depth = material("hydrogel").support.pressure(tip, limit).approach
     grid = touches_away_from_the_edge(skin.flat_outline, 0.0075, _PLACES, _PLACES)
     change = relative_changes(skin, [[Indent(tip, depth, place)] for place in grid.places])

@@ -32,9 +32,21 @@ class FrameDepth(NamedTuple):
 
 
 def resting_frame(frames: Float[np.ndarray, "r M"], name: str = "reference") -> Float[np.ndarray, " M"]:
-    """Mean (M,) of frames (r, M) of the untouched skin, volts; NaN for channels without a reading.
+    """Mean (M,) of frames of the untouched skin, volts; NaN for channels without a reading.
+
+    **Arguments:**
+
+    - `frames`: the frames (r, M), volts.
+    - `name`: what they are called in the error.
 
     Raises `ValueError` if more than half of the channels have no reading.
+
+    **Example:**
+
+    ```python
+    reference = resting_frame(empty)
+    image = linear.image(frame - reference)
+    ```
     """
     known = np.isfinite(frames)
     number = known.sum(axis=0)
@@ -82,11 +94,26 @@ def _check_extent(network: ImageNetwork, measurement: Measurement) -> None:
 
 
 def stream_depths(network: ImageNetwork, frames: Iterable, rest: Float[np.ndarray, " M"]) -> Iterator[FrameDepth]:
-    """Image frames (M,), volts, one after the other, relative to the frame `rest` (M,), volts, of the untouched skin.
+    """Image frames one after the other, relative to a frame of the untouched skin.
 
     The network is compiled before the first frame is requested. A frame is refused, and the stream continues, if it has
     another number of channels, if too many of its channels are missing, or if its map is unreliable (see
-    `ImageNetwork.doubts`). Raises `ValueError` if `frames` is not iterable.
+    `ImageNetwork.doubts`).
+
+    **Arguments:**
+
+    - `network`: the network.
+    - `frames`: frames (M,), volts.
+    - `rest`: frame (M,) of the untouched skin, volts, as from `resting_frame`.
+
+    Raises `ValueError` if `frames` is not iterable.
+
+    **Example:**
+
+    ```python
+    for imaged in stream_depths(read_network("network"), [rest, rest], rest):
+        print(imaged.number, imaged.reason)
+    ```
     """
     check_kind("frames", frames, Iterable, "frames one after another, each (M,) volts")
     network.doubts(np.ones((1, len(rest))), network.share(np.zeros((1, len(rest)))))

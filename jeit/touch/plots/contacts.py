@@ -39,9 +39,26 @@ def plot_contacts(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw an image (m,) with the outline of every contact, a cross at its centroid, and the centroid in millimetres.
+    """Draw an image with the outline of every contact, a cross at its centroid, and the centroid in millimetres.
 
-    Arguments as in `plot_image`. Raises `ValueError` as `plot_image`, and for elements that are not contacts.
+    **Arguments:**
+
+    - `mesh`: mesh of the image.
+    - `image`: change of conductivity (m,) in every cell, S (3-D: S/m).
+    - `contacts`: contacts, as from `find_contacts`.
+    - `electrodes`: electrodes to be drawn.
+    - `scale`: mapping from values to colours.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` as `jeit.plot.plot_image`, and for elements that are not contacts.
+
+    **Example:**
+
+    ```python
+    ax = plot_contacts(model.mesh, image, find_contacts(finder, image, noise), model.electrodes)
+    ax.figure.savefig("contacts.png")
+    ```
     """
     check_contacts(contacts)
     ax = plot_image(mesh, image, electrodes, scale=scale, title=title, ax=ax)
@@ -89,11 +106,23 @@ _TITLES = ("region of interest", "grey", "adaptive threshold", "opened", "contou
 
 
 def plot_contact_stages(stages: RasterStages, *, unit: str = "S", axes: np.ndarray | None = None) -> np.ndarray:
-    """Draw the result of every step of `RasterFinder` on six axes.
+    """Draw the result of every step of `RasterFinder` on six axes: the region of interest, grey levels, threshold,
+    opened mask, contours, and centroids in millimetres.
 
-    The steps are the region of interest, grey levels, threshold, opened mask, contours, and centroids in millimetres.
-    `stages`: result of `finder.stages(image, noise)`; `unit`: unit of the image; `axes`: (6,) axes to draw on, default:
-    those of a new figure. Raises `ValueError` for stages of another type and another number of axes.
+    **Arguments:**
+
+    - `stages`: result of `RasterFinder.stages`.
+    - `unit`: unit of the image.
+    - `axes`: six axes to draw on; by default those of a new figure.
+
+    Raises `ValueError` for stages of another type and another number of axes.
+
+    **Example:**
+
+    ```python
+    stages = RasterFinder(model.mesh).stages(image, noise)
+    axes = plot_contact_stages(stages)
+    ```
     """
     check_kind("stages", stages, RasterStages, "what finder.stages(image, noise) of a RasterFinder gives")
     axes = _new_axes() if axes is None else np.asarray(axes, object).ravel()

@@ -37,11 +37,27 @@ def plot_health(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a skin with its cuts and failed electrodes, over an `image` (m,) of the skin, if one is given.
+    """Draw a skin with its cuts and failed electrodes.
 
     Each cut is labelled with its length, the standard deviation of the length, and the time when it occurred; mended
-    cuts are dashed. A cross marks every failed electrode. `scale` as in `plot_image`. Raises `ValueError` for a skin
-    without a model, and as `plot_image`.
+    cuts are dashed. A cross marks every failed electrode.
+
+    **Arguments:**
+
+    - `health`: the monitored skin, with a model.
+    - `image`: image (m,) that is drawn below, as from `SkinHealth.images`, S (3-D: S/m).
+    - `scale`: mapping from its values to colours.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for a skin without a model, and as `jeit.plot.plot_image`.
+
+    **Example:**
+
+    ```python
+    ax = plot_health(modelled_health)
+    ax.figure.savefig("health.png")
+    ```
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of SkinHealth.fit(frames, model=model, …)")
     if health.skin is None:
@@ -103,11 +119,27 @@ _MOST_LABELS, _LEAST = 12, 1.5
 def plot_health_course(
     health: SkinHealth, times: ArrayLike, frames: ArrayLike, *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw the change of frames (F, M) at `times` (F,) relative to the healthy skin, and a line at the time of every
-    event.
+    """Draw the change of frames relative to the healthy skin, and a line at the time of every event.
 
     The change is given in multiples of the limit above which a lasting change counts as damage. Touches may cause
-    changes as large as damage, but only for a time. Raises `ValueError` for shapes that do not match.
+    changes as large as damage, but only for a time.
+
+    **Arguments:**
+
+    - `health`: the monitored skin after these frames.
+    - `times`: times (F,), seconds.
+    - `frames`: frames (F, M), volts.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for shapes that do not match.
+
+    **Example:**
+
+    ```python
+    ax = plot_health_course(watch(health, damaged), np.arange(len(damaged)), damaged)
+    ax.figure.savefig("course.png")
+    ```
     """
     check_kind("health", health, SkinHealth, "a SkinHealth, as of watch(health, frames)")
     when, read = np.asarray(times, float), np.asarray(frames, float)

@@ -29,12 +29,25 @@ def plot_map(
 ) -> Axes:
     """Draw the neurons of a map and lines between neighbours; neurons whose place is NaN are left out.
 
-    - `places`: (R, C, 2), in metres, such as `PlacedMap.places`, or, with `on_skin=False` and without a scale bar, in
-      any unit, such as from `drawn_map`.
-    - `values`: (R, C), values of the neurons, such as the activity in a frame, drawn in colour; `label`: their name.
-    - `touches`: touches, each drawn as a cross.
+    **Arguments:**
+
+    - `places`: places (R, C, 2), metres, such as `PlacedMap.places`, or, with `on_skin=False`, in any unit, such as
+      from `drawn_map`.
+    - `values`: values (R, C) of the neurons, such as the activity in a frame, drawn in colour.
+    - `label`: name of the values.
+    - `touches`: touches, as from `touches_reported`, each drawn as a cross.
+    - `on_skin`: whether places are on the skin, with a scale bar.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
 
     Raises `ValueError` for arrays of other shapes, and if no neuron has a place.
+
+    **Example:**
+
+    ```python
+    ax = plot_map(placed.places, learnt_map.activity(map_frames[:1])[0])
+    ax.figure.savefig("map.png")
+    ```
     """
     places = real_array("places", places, "places (R, C, 2) of neurons")
     if places.ndim != 3 or places.shape[2] != 2:

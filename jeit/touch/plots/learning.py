@@ -58,7 +58,21 @@ def plot_force_errors(force: Standing, *, title: str | None = None, ax: Axes | N
 
 
 def plot_confusion(label: Standing, *, title: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the confusion matrix of held-out presses, in per cent of the presses of each label."""
+    """Draw the confusion matrix of held-out presses, in per cent of the presses of each label.
+
+    **Arguments:**
+
+    - `label`: accuracy with which labels were learnt.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    **Example:**
+
+    ```python
+    ax = plot_confusion(gestures.standing)
+    ax.figure.savefig("confusion.png")
+    ```
+    """
     ax = axes_or_new(ax)
     kinds = np.unique(label.right)
     counts = np.array([[np.sum((label.right == one) & (label.held_out == other)) for other in kinds] for one in kinds])

@@ -69,10 +69,25 @@ def plot_changes(
 def plot_timeline(
     touches: Sequence[NamedTouch], names: Sequence[str], *, title: str | None = None, ax: Axes | None = None
 ) -> Axes:
-    """Draw named touches from onset to end, each in the lane of its predicted gesture.
+    """Draw classified touches from onset to end, each in the lane of its predicted gesture.
 
-    Bars are fainter for less probable gestures; touches unlike any in the training set have their own lane. `names`:
-    (C,), names of the gestures. Raises `ValueError` for elements that are not named touches.
+    Bars are fainter for less probable gestures; touches unlike any in the training set have their own lane.
+
+    **Arguments:**
+
+    - `touches`: the touches, as from `TouchWatch.follow`.
+    - `names`: names (C,) of the gestures.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for elements that are not named touches.
+
+    **Example:**
+
+    ```python
+    ax = plot_timeline(named_touches, gestures.names)
+    ax.figure.savefig("timeline.png")
+    ```
     """
     check_named_touches(touches)
     ax = axes_or_new(ax, (9.0, 2.6))
@@ -117,9 +132,26 @@ def plot_touch_paths(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the skin and the paths of touches, each a line from a dot at its start, in the colour of its gesture.
+    """Draw the skin and the paths of touches, each a line from a dot at its start, in the colour of its gesture. The
+    number of each touch is written beside it.
 
-    The number of each touch is written beside it. Raises `ValueError` for elements that are not named touches.
+    **Arguments:**
+
+    - `mesh`: mesh of the images.
+    - `touches`: the touches, as from `TouchWatch.follow`.
+    - `names`: names (C,) of the gestures.
+    - `electrodes`: electrodes to be drawn.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for elements that are not named touches.
+
+    **Example:**
+
+    ```python
+    ax = plot_touch_paths(images.mesh, named_touches, gestures.names)
+    ax.figure.savefig("paths.png")
+    ```
     """
     check_named_touches(touches)
     ax = axes_or_new(ax)
@@ -182,7 +214,21 @@ def _reduce_points(times: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, n
 
 def plot_sound_labels(labels: SoundLabels, *, title: str | None = None, ax: Axes | None = None) -> Axes:
     """Draw the probability of every name over time, one row per name, with a bar below the chosen name during each
-    sound; quiet windows are blank."""
+    sound; quiet windows are blank.
+
+    **Arguments:**
+
+    - `labels`: the classified recording, as from `Listener.hear`.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    **Example:**
+
+    ```python
+    ax = plot_sound_labels(listener.hear(recordings[0]))
+    ax.figure.savefig("sounds.png")
+    ```
+    """
     ax = axes_or_new(ax, (8.0, 3.2))
     names, times = labels.names, labels.times
     shown = np.where((labels.named != "")[:, None], labels.probabilities, np.nan).T

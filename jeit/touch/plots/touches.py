@@ -110,10 +110,25 @@ def plot_depth_map(
     title: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw a map of indentation depth (rows, columns) in metres, row 0 at the minimum y, such as from `ImageNetwork`.
+    """Draw a map of indentation depth, such as from `ImageNetwork.depth`.
 
-    `extent`: (x_min, x_max, y_min, y_max), metres; `most`: depth at the end of the colour scale, metres, default: the
-    maximum of the map. Raises `ValueError` for an array of another shape.
+    **Arguments:**
+
+    - `depth`: the map (rows, columns), metres, row 0 at the minimum y.
+    - `extent`: (x_min, x_max, y_min, y_max) of the map, metres.
+    - `most`: depth at the end of the colour scale, metres; by default the maximum of the map.
+    - `colour_bar`: whether to draw a colour bar.
+    - `title`: title of the plot.
+    - `ax`: axes to draw into; by default new ones.
+
+    Raises `ValueError` for an array of another shape.
+
+    **Example:**
+
+    ```python
+    network = read_network("network")
+    ax = plot_depth_map(network.depth(rest, rest), network.extent)
+    ```
     """
     depth = real_array("depth", depth, "a map (rows, columns) of depths in metres")
     if depth.ndim != 2:

@@ -17,9 +17,21 @@ _PACKAGES = ("jeit", "jax", "numpy", "scipy", "scikit-learn")
 
 
 def write_listener(listener: Listener, folder: str | Path) -> None:
-    """Write `listener.jeit`, `report.json` and the picture `learning.png` into `folder`, which is created if needed.
+    """Write `listener.jeit`, `report.json` and the picture `learning.png` into a folder.
+
+    **Arguments:**
+
+    - `listener`: the trained classifier.
+    - `folder`: the folder, which is created if needed.
 
     Raises `ValueError` if `folder` cannot be a folder.
+
+    **Example:**
+
+    ```python
+    write_listener(listener, "listener")
+    listener = Listener.read("listener")
+    ```
     """
     with results(folder, LISTENER_FILES) as made:
         listener.write(made / "listener.jeit")
@@ -28,13 +40,27 @@ def write_listener(listener: Listener, folder: str | Path) -> None:
 
 
 def write_sound_labels(labels: SoundLabels, folder: str | Path, *, model: str) -> None:
-    """Write `events.csv`, `report.json` and the picture `timeline.png` of sounds classified by the listener `model`.
+    """Write `events.csv`, `report.json` and the picture `timeline.png` of classified sounds into a folder.
 
-    `folder` is created if it does not exist. The table has a line for each window, every 0.1 s: `time_s`, the middle of
-    the window; `heard`, the most probable name, empty if the window is quiet; `probability`, the probability of this
-    name, and `p_…`, those of all names; `microphone`, the number, from 0, of the loudest microphone; and, if positions
-    were estimated, `x_m`, `y_m` (`z_m`) and `std_x_m` …, empty for windows without a position. Raises `ValueError` if
-    `folder` cannot be a folder.
+    The table has a line for each window, every 0.1 s: `time_s`, the middle of the window; `heard`, the most probable
+    name, empty if the window is quiet; `probability`, the probability of this name, and `p_…`, those of all names;
+    `microphone`, the number, from 0, of the loudest microphone; and, if positions were estimated, `x_m`, `y_m` (`z_m`)
+    and `std_x_m` …, empty for windows without a position.
+
+    **Arguments:**
+
+    - `labels`: the classified recording, as from `Listener.hear`.
+    - `folder`: the folder, which is created if needed.
+    - `model`: name of the listener, for the report.
+
+    Raises `ValueError` if `folder` cannot be a folder.
+
+    **Example:**
+
+    ```python
+    sounds = listener.hear(recordings[0])
+    write_sound_labels(sounds, "out", model="listener")
+    ```
     """
     columns = _table_columns(labels)
     with results(folder, SOUND_LABEL_FILES) as made:

@@ -1,6 +1,14 @@
 from .contact.half_space import HalfSpace
 from .contact.indent_sets import IndentSet
-from .contact.indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
+from .contact.indenters import (
+    BarIndenter,
+    DepthMapIndenter,
+    DiscIndenter,
+    PrismIndenter,
+    RevolvedIndenter,
+    RingIndenter,
+    ball_indenter,
+)
 from .contact.indents import Indent, IndentDraws, PressDraws, depth_maps, indented_cells, relative_changes
 from .contact.joined import JoinedIndenters, PlacedIndenter, TwoSheets
 from .contact.materials import Foundation, Material, material
@@ -11,9 +19,9 @@ from .people.person import Person
 from .people.simulated_gestures import GestureStream, simulate_gesture_stream, simulate_gestures
 
 __all__ = [
-    "Bar",
-    "DepthMap",
-    "Disc",
+    "BarIndenter",
+    "DepthMapIndenter",
+    "DiscIndenter",
     "Foundation",
     "GestureStream",
     "HalfSpace",
@@ -29,11 +37,11 @@ __all__ = [
     "PressDraws",
     "PressSet",
     "PressedSkin",
-    "Prism",
-    "Revolved",
-    "Ring",
+    "PrismIndenter",
+    "RevolvedIndenter",
+    "RingIndenter",
     "TwoSheets",
-    "ball",
+    "ball_indenter",
     "depth_maps",
     "indented_cells",
     "material",

@@ -1,8 +1,8 @@
 """Train networks on arrays, and store them as files.
 
-`fit` trains any equinox network by Adam with early stopping, and resumes after an interruption; `write_model` and
-`read_model` store networks as arrays of numbers with a JSON header, never a pickle. Training needs the extra `learn`;
-using a trained network does not.
+`fit_network` trains any equinox network by Adam with early stopping, and resumes after an interruption; `write_model`
+and `read_model` store networks as arrays of numbers with a JSON header, never a pickle. Training needs the extra
+`learn`; using a trained network does not.
 """
 
 from __future__ import annotations

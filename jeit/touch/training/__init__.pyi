@@ -1,16 +1,16 @@
 from .batches import ArrayRows, MappedRows, Rows
-from .fitting import Objective, Plan, TrainingResult, fit
+from .fitting import TrainingObjective, TrainingPlan, TrainingResult, fit_network
 from .model_file import check_same, read_head, read_model, write_model
 
 __all__ = [
     "ArrayRows",
     "MappedRows",
-    "Objective",
-    "Plan",
     "Rows",
+    "TrainingObjective",
+    "TrainingPlan",
     "TrainingResult",
     "check_same",
-    "fit",
+    "fit_network",
     "read_head",
     "read_model",
     "write_model",

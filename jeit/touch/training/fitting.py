@@ -1,4 +1,4 @@
-"""`fit`: train a network by Adam with early stopping on held-out rows, with checkpoints to resume from."""
+"""`fit_network`: train a network by Adam with early stopping on held-out rows, with checkpoints to resume from."""
 
 from __future__ import annotations
 
@@ -24,13 +24,25 @@ from jeit.touch.training.model_file import Checkpoint, Course, State
 _CHECKPOINT_BATCHES, _AT_ONCE = 32, 256
 
 
-class Objective(NamedTuple):
-    """The objective of a training; both functions are compiled.
+class TrainingObjective(NamedTuple):
+    """The objective of a training; its functions are compiled.
 
-    **Fields**: `loss(network, batch, key)`: returns the loss of a batch of rows, which is minimised, and the network,
-    in which leaves that are not trained, such as running means, may have changed; `held_out(network, batch)`: returns
-    the loss (b,) of each held-out row; `trained`: selects the leaves (arrays) of the network that are trained: a
-    function of a leaf that returns true or false, or a tree of booleans like the network, as in `equinox.filter`.
+    **Fields**
+
+    - `loss`: function of a network, a batch of rows and a random key, which returns the loss of the batch, which is
+      minimised, and the network, in which leaves that are not trained, such as running means, may have changed.
+    - `held_out`: function of a network and a batch of rows, which returns the loss (b,) of each held-out row.
+    - `trained`: selects the leaves (arrays) of the network that are trained: a function of a leaf that returns true or
+      false, or a tree of booleans like the network, as in `equinox.filter`.
+
+    **Example:**
+
+    ```python
+    objective = TrainingObjective(
+        loss=lambda network, batch, key: (jnp.mean((network * batch[0] - batch[1]) ** 2), network),
+        held_out=lambda network, batch: (network * batch[0] - batch[1]) ** 2,
+    )
+    ```
     """
 
     loss: Callable[[Any, Any, Array], tuple[Float[Array, ""], Any]]
@@ -39,7 +51,7 @@ class Objective(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """Settings of a training.
 
     **Fields**: `rate`: learning rate of Adam, which is multiplied by `decay` after every `decay_epochs` epochs;
@@ -47,6 +59,13 @@ class Plan:
     evaluations of the held-out rows, by default an epoch; `patience`: number of consecutive evaluations without
     improvement after which training stops; `seconds`: time between checkpoints, which may be exceeded by some dozen
     batches.
+
+    **Example:**
+
+    ```python
+    plan = TrainingPlan(rate=1e-2, batch=16, epochs=20, patience=5)
+    trained = fit_network(jnp.array(0.0), objective, rows, rows, plan, key=key)
+    ```
     """
 
     rate: float = 1e-3
@@ -85,30 +104,47 @@ class TrainingResult:
     reason: str
 
 
-def fit(
+def fit_network(
     network: Any,
-    objective: Objective,
+    objective: TrainingObjective,
     training: Any,
     validation: Any,
-    plan: Plan | None = None,
+    plan: TrainingPlan | None = None,
     *,
     key: Array,
     checkpoint: str | Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> TrainingResult:
-    """Train a `network`, any tree of arrays and functions, on rows.
+    """Train a network by Adam with early stopping on held-out rows.
 
-    `training` and `validation`: arrays (n, …) in any tree, such as (inputs, targets); `training` may also be `Rows` of
-    many chunks. The same `key` gives identical results on the same machine. `checkpoint`: a file; if the training is
-    killed at any moment, the same call resumes from it, with results identical to those of an uninterrupted training;
-    the file remains after the training. `progress`: is called with a description of the progress after every evaluation
-    of the held-out rows. Raises `ValueError` for arguments that do not fit together, a checkpoint of another training,
-    and losses that are not finite from the first evaluation on; `ImportError` without the extra `learn`.
+    The same `key` gives identical results on the same machine.
+
+    **Arguments:**
+
+    - `network`: the network, any tree of arrays and functions.
+    - `objective`: its losses.
+    - `training`: arrays (n, …) in any tree, such as (inputs, targets), or `Rows` of many chunks.
+    - `validation`: the held-out rows, in the same form, but in memory.
+    - `plan`: settings of the training, by default `TrainingPlan()`.
+    - `key`: random key.
+    - `checkpoint`: a file; if the training is killed at any moment, the same call resumes from it, with results
+      identical to those of an uninterrupted training; the file remains after the training.
+    - `progress`: called with a description of the progress after every evaluation of the held-out rows.
+
+    Raises `ValueError` for arguments that do not fit together, a checkpoint of another training, and losses that are
+    not finite from the first evaluation on; `ImportError` without the extra `learn`.
+
+    **Example:**
+
+    ```python
+    trained = fit_network(jnp.array(0.0), objective, rows, rows, TrainingPlan(epochs=20), key=key)
+    print(trained.network)
+    ```
     """
     need_extra("learn", "training")
     check_key(key)
-    check_kind("objective", objective, Objective, "an Objective(loss, held_out)")
-    plan = Plan() if plan is None else plan
+    check_kind("objective", objective, TrainingObjective, "a TrainingObjective(loss, held_out)")
+    plan = TrainingPlan() if plan is None else plan
     rows = training if _are_rows(training) else ArrayRows(training)
     held = ArrayRows(validation, "validation")
     held_out_arrays = jax.tree.map(jnp.asarray, held.arrays)
@@ -150,7 +186,7 @@ def fit(
 class _CompiledTraining:
     """Compiled functions of one training, and methods that apply them to the state of the training."""
 
-    def __init__(self, network, objective: Objective, plan: Plan, order: BatchOrder, key: Array):
+    def __init__(self, network, objective: TrainingObjective, plan: TrainingPlan, order: BatchOrder, key: Array):
         import optax
 
         steps = plan.decay_epochs * order.batches_per_epoch
@@ -221,7 +257,7 @@ class _CompiledTraining:
         return State(state.step, course, state.moving, state.optimiser, best, jnp.zeros(()))
 
 
-def _end_reason(state: State, plan: Plan, last_batch: int) -> str | None:
+def _end_reason(state: State, plan: TrainingPlan, last_batch: int) -> str | None:
     """Return the reason why the training has ended, or None if it has not."""
     looks = len(state.course.validation)
     if looks and looks - 1 - state.course.best >= plan.patience:
@@ -229,7 +265,7 @@ def _end_reason(state: State, plan: Plan, last_batch: int) -> str | None:
     return f"{plan.epochs} epochs done" if state.step >= last_batch else None
 
 
-def _describe_progress(state: State, plan: Plan, batches_per_epoch: int) -> str:
+def _describe_progress(state: State, plan: TrainingPlan, batches_per_epoch: int) -> str:
     own = state.course
     return (
         f"epoch {state.step / batches_per_epoch:.3g} of {plan.epochs}: {own.training[-1]:.4g}, held out "

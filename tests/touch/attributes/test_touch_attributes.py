@@ -8,7 +8,7 @@ import pytest
 
 from jeit import BoundaryElectrodes, Disk, ForwardModel, adjacent, one_step, ring
 from jeit.touch import CellFinder, touch_attributes
-from jeit.touch.simulate import Disc, MovingPress, Press, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, MovingPress, Press, PressedSkin, material
 
 KEY = jax.random.key(1)
 
@@ -22,7 +22,7 @@ def film(noise):
     skin = PressedSkin(jax.random.key(0), fine, dataclasses.replace(own, noise=noise * own.noise))
 
     def press(touches):
-        presses = [tuple(Press(Disc(d), n, place) for place, n, d in discs) for discs in touches]
+        presses = [tuple(Press(DiscIndenter(d), n, place) for place, n, d in discs) for discs in touches]
         return skin.frames(jax.random.key(2), presses)
 
     return press, one_step(model, 2e-5), CellFinder(model.mesh), skin
@@ -32,7 +32,7 @@ def film(noise):
 def test_a_film_and_a_noisy_one():
     *quiet_film, skin = film(1.0)
     seconds = np.arange(0, 1.5, 1 / 60)
-    motion = MovingPress(Disc(0.01), np.where((seconds > 0.2) & (seconds < 0.7), 1.0, 0.0))
+    motion = MovingPress(DiscIndenter(0.01), np.where((seconds > 0.2) & (seconds < 0.7), 1.0, 0.0))
     recording = seconds, skin.record(jax.random.key(3), motion, seconds)
     quiet = touch_attributes(KEY, *quiet_film, recording=recording)
     noisy = touch_attributes(KEY, *film(10.0)[:3])

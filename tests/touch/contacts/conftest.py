@@ -13,7 +13,7 @@ from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit.touch.contacts import ImageNoise
-from jeit.touch.simulate import Disc, Press, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, Press, PressedSkin, material
 
 
 @pytest.fixture(scope="session")
@@ -25,8 +25,8 @@ def skin():
     empty = pressed.frames(jax.random.key(1), [()] * 1100)
     before, reference = empty[1000:], empty[1000:].mean(axis=0)
     reconstruction = one_step(coarse, float(pressed.conductivity[0]), noise=before.std(axis=0))
-    two = (Press(Disc(0.008), 1.0, (0.025, 0.0)), Press(Disc(0.008), 2.0, (-0.02, 0.01)))
-    touched = pressed.touched([two, Press(Disc(0.0115), 1.0, (0.01, 0.005))])
+    two = (Press(DiscIndenter(0.008), 1.0, (0.025, 0.0)), Press(DiscIndenter(0.008), 2.0, (-0.02, 0.01)))
+    touched = pressed.touched([two, Press(DiscIndenter(0.0115), 1.0, (0.01, 0.005))])
     change = np.zeros((2, fine.mesh.num_cells))
     np.add.at(change, (np.arange(2)[:, None], np.asarray(touched.cells)), np.asarray(touched.change))
     exact = np.stack([np.asarray(fine.voltages(pressed.conductivity * (1 + one))) for one in change])

@@ -14,7 +14,7 @@ from jeit.mesh import Disk, Rectangle, centroids, disk, layer, measures
 from jeit.protocol import adjacent
 from jeit.touch.contacts import CellFinder, ImageNoise, RasterFinder, find_contacts
 from jeit.touch.contacts.cell_finder import outline_of_cells
-from jeit.touch.simulate import Disc, Press, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, Press, PressedSkin, material
 
 FINDERS = [CellFinder, RasterFinder]
 MESH = disk(0.05, num_points=2500)
@@ -118,7 +118,7 @@ def test_deviation_on_a_raster_counts_cells_that_join_and_leave(shape):
     low, wide = points.min(axis=0), np.ptp(points, axis=0)
     random, told, strayed = np.random.default_rng(0), [], []
     for share in ((0.63, 0.63), (0.28, 0.6), (0.45, 0.4), (0.7, 0.35), (0.37, 0.52), (0.55, 0.7)):
-        (frame,) = skin.frames(jax.random.key(2), [Press(Disc(0.01), 2.0, low + np.array(share) * wide)])
+        (frame,) = skin.frames(jax.random.key(2), [Press(DiscIndenter(0.01), 2.0, low + np.array(share) * wide)])
         frames = frame - empty.mean(axis=0) + deviation * random.normal(size=(12, len(deviation)))
         found = [find_contacts(finder, image, noise)[0] for image in np.asarray(linear.image(frames))]
         strayed.append(np.var([one.centroid for one in found], axis=0).sum())
@@ -166,7 +166,7 @@ def test_large_artefacts_are_no_noise():
     finder = CellFinder(coarse.mesh)
     drawn = np.random.default_rng(0).uniform(-0.026, 0.026, (40, 2, 2))
     pairs = [two for two in drawn if np.linalg.norm(two[0] - two[1]) > 0.03]
-    presses = [tuple(Press(Disc(0.01), 5.0, place) for place in two) for two in pairs]
+    presses = [tuple(Press(DiscIndenter(0.01), 5.0, place) for place in two) for two in pairs]
     images = np.asarray(linear.image(skin.frames(jax.random.key(2), presses) - reference))
     assert sum(len(find_contacts(finder, image)) == 2 for image in images) >= 8  # of 17; 5 were
     untouched = np.asarray(linear.image(empty[100:] - reference))

@@ -12,7 +12,7 @@ from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit.touch.contacts import CellFinder, Contact, LoadCalibration, find_contacts
-from jeit.touch.simulate import Disc, Press, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, Press, PressedSkin, material
 
 RADIUS = 0.05
 
@@ -73,7 +73,7 @@ def test_a_skin_is_calibrated_over_its_radius(skin):
     def peaks(key, radii, loads):
         turned = np.arange(len(radii)) * 2.4
         presses = [
-            Press(Disc(0.01), load, (r * np.cos(a), r * np.sin(a)))
+            Press(DiscIndenter(0.01), load, (r * np.cos(a), r * np.sin(a)))
             for r, load, a in zip(radii, loads, turned, strict=True)
         ]
         images = np.asarray(skin.reconstruction.image(pressed.frames(jax.random.key(key), presses) - pressed.rest()))

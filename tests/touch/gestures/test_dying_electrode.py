@@ -11,7 +11,7 @@ from jeit.layout import perimeter
 from jeit.mesh import Rectangle
 from jeit.protocol import reference_electrode
 from jeit.touch import TouchLevel, find_touches
-from jeit.touch.simulate import Disc, MovingPress, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, MovingPress, PressedSkin, material
 
 KEY, FRAMES = jax.random.key(0), 64
 
@@ -26,7 +26,7 @@ def recorded():
     skin, linear = PressedSkin(KEY, model, own), one_step(model, own.conductivity * own.thickness)
     seconds = np.arange(FRAMES) / 60
     load = 3 * np.sin(np.pi * np.clip((seconds - 0.2) / 0.2, 0, 1))
-    film = skin.record(KEY, MovingPress(Disc(0.03), load, (0.06, 0.02)), seconds)
+    film = skin.record(KEY, MovingPress(DiscIndenter(0.03), load, (0.06, 0.02)), seconds)
     quiet = skin.record(jax.random.key(1), [], np.arange(60) / 60)
     reference = quiet.mean(axis=0)
     level = TouchLevel.of_untouched(model.mesh, np.asarray(linear.image(quiet - reference)))

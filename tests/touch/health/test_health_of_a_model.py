@@ -14,7 +14,7 @@ from jeit.protocol import adjacent
 from jeit.touch import CellFinder, SkinHealth, find_contacts, watch
 from jeit.touch.health import EventKind, EventStatus
 from jeit.touch.plots import plot_health
-from jeit.touch.simulate import Disc, MovingPress, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, MovingPress, PressedSkin, material
 from jeit.touch.simulate.damage import Cut, Mishap, record_mishaps
 
 CUT = Cut([(-0.005, 0.014), (0.02, 0.024)])
@@ -45,7 +45,7 @@ def press(places, starts, load=2.0, last=1.0) -> MovingPress:
     for place, start in zip(places, starts, strict=True):
         there = (start <= SECONDS) & (start + last > SECONDS)
         loads[there], position[there] = load, place
-    return MovingPress(Disc(0.012), loads, position)
+    return MovingPress(DiscIndenter(0.012), loads, position)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def test_touches_are_placed_beside_the_cut(after, damaged):
 
 
 def pressed(skin: PressedSkin, place) -> np.ndarray:
-    motion = MovingPress(Disc(0.012), np.array([2.0]), place)
+    motion = MovingPress(DiscIndenter(0.012), np.array([2.0]), place)
     touched = skin.touched_in_time(motion, np.array([0.0]))
     change = np.bincount(np.asarray(touched.cells)[0], np.asarray(touched.change)[0], skin.model.mesh.num_cells)
     return np.asarray(skin.model.voltages(skin.conductivity * (1 + change)))[None]

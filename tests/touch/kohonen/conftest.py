@@ -6,7 +6,7 @@ import pytest
 from ringed_sensors import CHANNELS, NOISE, drawn_places, frames_at
 
 from jeit.touch import PlacedMap, SelfOrganisingMap
-from jeit.touch.kohonen import Schedule
+from jeit.touch.kohonen import MapSchedule
 
 
 @pytest.fixture(scope="session")
@@ -22,7 +22,7 @@ def pressed(places):
 
 @pytest.fixture(scope="session")
 def learnt(pressed):
-    return SelfOrganisingMap.fit(pressed, jax.random.key(0), shape=(16, 16), schedule=Schedule(6000, 6000))
+    return SelfOrganisingMap.fit(pressed, jax.random.key(0), shape=(16, 16), schedule=MapSchedule(6000, 6000))
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ from minisom import MiniSom
 from ringed_sensors import CHANNELS, REST, drawn_places, frames_at
 
 from jeit.touch import PlacedMap, SelfOrganisingMap
-from jeit.touch.kohonen import Schedule, drawn_map, fit_maps, map_quality, neuron_shares, read_map, touches_reported
+from jeit.touch.kohonen import MapSchedule, drawn_map, fit_maps, map_quality, neuron_shares, read_map, touches_reported
 
 
 def test_a_neurons_own_frame_activates_it_fully(learnt):
@@ -73,9 +73,9 @@ BAD = {
     "one neuron": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, shape=(1, 1)), "two neurons or more"),
     "one number": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, shape=16), "rows and columns"),
     "no schedule": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, schedule=100), "schedule"),
-    "no scale": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, schedule=Schedule(10, 0), scale=0.0), "scale"),
+    "no scale": (lambda s: SelfOrganisingMap.fit(FRAMES, KEY, schedule=MapSchedule(10, 0), scale=0.0), "scale"),
     "no keys": (lambda s: fit_maps(FRAMES, []), "one at least"),
-    "other lengths": (lambda s: fit_maps(FRAMES, [KEY], schedules=[Schedule(9), Schedule(8)]), "as many frames"),
+    "other lengths": (lambda s: fit_maps(FRAMES, [KEY], schedules=[MapSchedule(9), MapSchedule(8)]), "as many frames"),
     "weights": (lambda s: SelfOrganisingMap(np.full((2, 2, 3), np.nan), 1.0), "weights must be finite"),
     "other channels": (lambda s: s["learnt"].activity(np.ones((2, 207))), "207 channels"),
     "few to compare": (lambda s: map_quality(s["learnt"], FRAMES[:20]), "too few"),

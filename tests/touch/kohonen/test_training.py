@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from minisom import MiniSom
 
-from jeit.touch.kohonen import Schedule, SelfOrganisingMap, fit_maps, learning_curves, time_constant
+from jeit.touch.kohonen import MapSchedule, SelfOrganisingMap, fit_maps, learning_curves, time_constant
 from jeit.touch.kohonen.training import train
 
 
@@ -26,7 +26,7 @@ def minisoms(weights, frames, order, rates, radii):
 def test_weights_are_minisoms(ordering, tuning):
     random = np.random.default_rng(1)
     frames, weights = random.normal(5.0, 1.0, (80, 12)), random.normal(0, 0.1, (7, 5, 12))
-    schedule = Schedule(ordering, tuning, (0.4, 0.05))
+    schedule = MapSchedule(ordering, tuning, (0.4, 0.05))
     order = random.integers(0, 80, schedule.steps)
     rates, radii = schedule.rates(), schedule.radii((7, 5))
     learnt, curve = train(jnp.asarray(weights), jnp.asarray(frames), order, rates, radii)
@@ -45,13 +45,13 @@ def test_tuning_moves_the_winner_alone():
 
 
 def _one_step():
-    schedule = Schedule(0, 1, (0.5, 0.5))
+    schedule = MapSchedule(0, 1, (0.5, 0.5))
     return schedule.rates(), schedule.radii((4, 4))
 
 
 def test_maps_at_once_are_those_one_by_one():
     frames = np.random.default_rng(3).normal(size=(60, 5))
-    keys, schedules = [jax.random.key(0), jax.random.key(1)], [Schedule(100, 50), Schedule(50, 100, (0.1, 0.1))]
+    keys, schedules = [jax.random.key(0), jax.random.key(1)], [MapSchedule(100, 50), MapSchedule(50, 100, (0.1, 0.1))]
     together = fit_maps(frames, keys, shape=(5, 4), schedules=schedules)
     assert len(together) == 4
     for key, one in zip(keys, together[1::2], strict=True):
@@ -78,7 +78,7 @@ def test_a_phase_may_end_anywhere_in_what_is_shown_at_once():
     """Frames are shown some at once, and the last of them are filled up: of those nothing is seen."""
     random = np.random.default_rng(5)
     frames, weights = random.normal(size=(30, 6)), random.normal(size=(4, 3, 6))
-    schedule = Schedule(37, 101)
+    schedule = MapSchedule(37, 101)
     order, rates, radii = random.integers(0, 30, schedule.steps), schedule.rates(), schedule.radii((4, 3))
     whole, curve = train(jnp.asarray(weights), jnp.asarray(frames), order, rates, radii)
     first, begun = train(jnp.asarray(weights), jnp.asarray(frames), order[:50], rates[:50], radii)
@@ -91,14 +91,14 @@ def test_a_phase_may_end_anywhere_in_what_is_shown_at_once():
 
 
 BAD = {
-    "no frames shown": (lambda: Schedule(0, 0), "nothing would be learnt"),
-    "half a frame": (lambda: Schedule(10.5, 0), "ordering must be a whole number"),
-    "negative": (lambda: Schedule(10, -1), "tuning must be a whole number"),
-    "text": (lambda: Schedule("many", 0), "ordering must be a whole number"),
-    "rising rate": (lambda: Schedule(rate=(0.01, 0.1)), "rate must be"),
-    "rate above one": (lambda: Schedule(rate=(2.0, 0.1)), "rate must be"),
-    "one radius": (lambda: Schedule(radius=3.0), "radius must be"),
-    "no radius": (lambda: Schedule(radius=(3.0, 0.0)), "radius must be"),
+    "no frames shown": (lambda: MapSchedule(0, 0), "nothing would be learnt"),
+    "half a frame": (lambda: MapSchedule(10.5, 0), "ordering must be a whole number"),
+    "negative": (lambda: MapSchedule(10, -1), "tuning must be a whole number"),
+    "text": (lambda: MapSchedule("many", 0), "ordering must be a whole number"),
+    "rising rate": (lambda: MapSchedule(rate=(0.01, 0.1)), "rate must be"),
+    "rate above one": (lambda: MapSchedule(rate=(2.0, 0.1)), "rate must be"),
+    "one radius": (lambda: MapSchedule(radius=3.0), "radius must be"),
+    "no radius": (lambda: MapSchedule(radius=(3.0, 0.0)), "radius must be"),
     "short curve": (lambda: time_constant(np.ones(5)), "ten steps or more"),
 }
 

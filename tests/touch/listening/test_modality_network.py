@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jeit.acoustic import Recording
-from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, microphone_grid, sound_clips
+from jeit.acoustic.simulate import SoundingPerson, SoundingSkin, microphone_grid, simulate_sound_clips
 from jeit.acoustic.simulate.microphones import MicrophoneModel
 from jeit.acoustic.simulate.people import MODALITIES
 from jeit.touch.listening import Levels, Listener, ModalityNetwork, SoundImages, sound_images
@@ -57,7 +57,7 @@ def test_a_small_training_tells_people_it_never_met():
     skin = SoundingSkin(jax.random.key(0), microphone_grid(3), microphone_model=MicrophoneModel(snr_db=12.0))
     people = [SoundingPerson.draw(key) for key in jax.random.split(KEY, 5)]
     parts, right, person = [], [], []
-    for clip in sound_clips(KEY, skin, people, 3, duration=1.6):
+    for clip in simulate_sound_clips(KEY, skin, people, 3, duration=1.6):
         parts.append(sound_images(Recording(clip.samples, skin.rate))[::2])
         right += [MODALITIES.index(clip.modality)] * len(parts[-1])
         person += [clip.person] * len(parts[-1])

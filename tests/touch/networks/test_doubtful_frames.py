@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from jeit.touch.networks.image_network import fill_missing
-from jeit.touch.simulate import Disc, Indent, relative_changes
+from jeit.touch.simulate import DiscIndenter, Indent, relative_changes
 
 PLACE = (0.012, -0.02)
 
 
 @pytest.fixture(scope="module")
 def change(small_skin):
-    return relative_changes(small_skin, [[Indent(Disc(0.02), 5e-3, PLACE)]])
+    return relative_changes(small_skin, [[Indent(DiscIndenter(0.02), 5e-3, PLACE)]])
 
 
 def test_missing_channels_are_what_is_expected_of_them():

@@ -24,10 +24,10 @@ from jeit.design.skin.protocol import skin_protocol
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle
 from jeit.protocol import adjacent
-from jeit.touch.networks import Preset, learn_images, read_network, write_network
+from jeit.touch.networks import NetworkPreset, learn_images, read_network, write_network
 from jeit.touch.networks.learn import TouchExamples, evaluate_network
-from jeit.touch.simulate import Disc, Indent, relative_changes
-from jeit.touch.training import Plan
+from jeit.touch.simulate import DiscIndenter, Indent, relative_changes
+from jeit.touch.training import TrainingPlan
 
 
 def cloudpickle_copy(one):
@@ -77,7 +77,9 @@ def test_a_network_that_says_nothing_explains_nothing(small_skin, learnt):
 
 def test_frames(small_skin, learnt):
     _, found = learnt
-    given, rest = voltages(small_skin, [[Indent(Disc(0.02), 5e-3, (0.01, -0.02))], [Indent(Disc(0.02), 5e-3)]])
+    given, rest = voltages(
+        small_skin, [[Indent(DiscIndenter(0.02), 5e-3, (0.01, -0.02))], [Indent(DiscIndenter(0.02), 5e-3)]]
+    )
     depth = found.network.depth(given, rest)
     assert depth.shape == (2, *SHAPE)
     assert np.allclose(found.network.depth(given[1], rest), depth[1], atol=1e-6)
@@ -96,7 +98,7 @@ def test_frames(small_skin, learnt):
     ],
 )
 def test_frames_of_another_kind(small_skin, learnt, change, said):
-    given, rest = voltages(small_skin, [[Indent(Disc(0.02), 5e-3)]])
+    given, rest = voltages(small_skin, [[Indent(DiscIndenter(0.02), 5e-3)]])
     with pytest.raises(ValueError, match=said):
         learnt[1].network.depth(*change(given[0], rest))
 
@@ -179,7 +181,7 @@ def test_no_such_thing(small_skin, tmp_path, change, said):
 
 def test_work_of_another_set_is_refused(small_skin, learnt):
     with pytest.raises(ValueError, match="another"):
-        learn_images(small_skin, learnt[0], preset=Preset(201, 50, Plan()))
+        learn_images(small_skin, learnt[0], preset=NetworkPreset(201, 50, TrainingPlan()))
 
 
 @pytest.mark.parametrize("package", ["xarray", "zarr"])

@@ -4,12 +4,12 @@ import jax
 import numpy as np
 import pytest
 
-from jeit.touch.networks import Preset, learn_images, read_network
+from jeit.touch.networks import NetworkPreset, learn_images, read_network
 from jeit.touch.networks.linear_channels import touch_draws
-from jeit.touch.simulate import Disc, Indent, IndentSet, indented_cells, relative_changes
-from jeit.touch.training import Plan
+from jeit.touch.simulate import DiscIndenter, Indent, IndentSet, indented_cells, relative_changes
+from jeit.touch.training import TrainingPlan
 
-PRESET = Preset(150, 30, Plan(rate=2e-3, batch=25, epochs=10, patience=10, decay=0.9))
+PRESET = NetworkPreset(150, 30, TrainingPlan(rate=2e-3, batch=25, epochs=10, patience=10, decay=0.9))
 
 
 @pytest.mark.slow
@@ -35,6 +35,8 @@ def test_it_learns(layer, tmp_path):
     assert learnt.standing.place["mean"] < 0.01
     network, rest = read_network(tmp_path, skin=layer), np.asarray(layer.model.voltages(layer.model_conductivity))
     place = (0.008, -0.006)
-    frames = [rest * (1 + relative_changes(layer, [[Indent(Disc(0.02), deep, place)]])[0]) for deep in (2e-3, 7e-3)]
+    frames = [
+        rest * (1 + relative_changes(layer, [[Indent(DiscIndenter(0.02), deep, place)]])[0]) for deep in (2e-3, 7e-3)
+    ]
     shallow, deep = network.depth(np.stack(frames), rest)
     assert deep.max() > 1.5 * shallow.max() > 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jeit.touch.networks.linear_channels import LinearChannels, depth_from_strength, strength, touching_bodies
-from jeit.touch.simulate import Disc, Indent, depth_maps, indented_cells, relative_changes
+from jeit.touch.simulate import DiscIndenter, Indent, depth_maps, indented_cells, relative_changes
 from jeit.touch.simulate.contact.indent_sets import image_places
 
 
@@ -26,7 +26,7 @@ def missed(found, right):
 @pytest.mark.parametrize(("depth", "most"), [(0.5e-3, 0.04), (4e-3, 0.12), (7e-3, 0.25)])
 def test_nearly_the_exact_changes(small_skin, sensed, depth, most):
     """Of a disc of 24 mm; without the square root 7 mm are missed by half."""
-    touches = [[Indent(Disc(0.024), depth, place)] for place in [(0.0, 0.005), (0.02, -0.018), (-0.03, 0.01)]]
+    touches = [[Indent(DiscIndenter(0.024), depth, place)] for place in [(0.0, 0.005), (0.02, -0.018), (-0.03, 0.01)]]
     maps = depth_maps(touches, image_places(small_skin, 48, 48)) / float(small_skin.thickness)
     exact = relative_changes(small_skin, touches)
     assert missed(felt(sensed, maps), exact) < most
@@ -62,7 +62,7 @@ def test_strength():
 def test_a_layer_feels_less_of_the_same_indent(layer):
     """Its electrodes are below, and what is taken is above."""
     own = LinearChannels.from_skin(layer, (24, 24))
-    touches = [[Indent(Disc(0.02), 2.5e-3, (0.002, 0.004))]]
+    touches = [[Indent(DiscIndenter(0.02), 2.5e-3, (0.002, 0.004))]]
     maps = depth_maps(touches, image_places(layer, 24, 24)) / float(layer.thickness)
     touched, conductivity = (
         indented_cells(layer, touches),

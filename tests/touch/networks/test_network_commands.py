@@ -11,7 +11,7 @@ from jeit.cli import main
 from jeit.data import Measurement, screen
 from jeit.data.exchange import write_table
 from jeit.protocol import adjacent
-from jeit.touch.simulate import Disc, Indent, relative_changes
+from jeit.touch.simulate import DiscIndenter, Indent, relative_changes
 
 PLACES = ((0.01, -0.02), (-0.025, 0.01))
 
@@ -22,7 +22,7 @@ def recorded(small_skin, tmp_path_factory):
     folder = tmp_path_factory.mktemp("recorded")
     model = small_skin.model
     rest = np.asarray(model.voltages(small_skin.model_conductivity))
-    touched = rest * (1 + relative_changes(small_skin, [[Indent(Disc(0.02), 5e-3, one)] for one in PLACES]))
+    touched = rest * (1 + relative_changes(small_skin, [[Indent(DiscIndenter(0.02), 5e-3, one)] for one in PLACES]))
     for name, frames in (("rest", rest[None]), ("touched", np.concatenate([touched, touched[:1]]))):
         mask = np.ones(frames.shape, bool)
         if name == "touched":

@@ -20,10 +20,10 @@ from jeit.touch.networks.learn import (
 )
 from jeit.touch.networks.linear_channels import touch_draws
 from jeit.touch.simulate import IndentSet, simulate_presses
-from jeit.touch.training import MappedRows, Plan, TrainingResult
+from jeit.touch.training import MappedRows, TrainingPlan, TrainingResult
 from jeit.touch.training.model_file import Course
 
-PLAN = Plan(rate=2e-3, batch=20, epochs=3, seconds=0.0)
+PLAN = TrainingPlan(rate=2e-3, batch=20, epochs=3, seconds=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -232,7 +232,7 @@ def test_the_paper_s_network_learns_from_voltages(stored, other):
     """Taught other touches' maps it learns none of them."""
     found = stored[2]
     right = TouchExamples(found["change"].to_numpy(), found["depth"].to_numpy())
-    runs = TrainingRuns(Plan(rate=3e-3, batch=20, epochs=12, patience=12), jax.random.key(1))
+    runs = TrainingRuns(TrainingPlan(rate=3e-3, batch=20, epochs=12, patience=12), jax.random.key(1))
     own, lost = (
         train_three_stages(taught, other, 1e-3, runs).courses["projection"].course
         for taught in (right, shuffle_pairs(right))

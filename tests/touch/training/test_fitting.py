@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jeit.touch.training import ArrayRows, Objective, Plan, fit
+from jeit.touch.training import ArrayRows, TrainingObjective, TrainingPlan, fit_network
 from jeit.touch.training.batches import BatchOrder
 
 
@@ -36,8 +36,8 @@ def network(seed: int = 0):
     return eqx.nn.MLP(2, 1, 16, 2, jnp.tanh, dtype=jnp.float32, key=jax.random.key(seed))
 
 
-OBJECTIVE = Objective(loss, held_out)
-PLAN = Plan(rate=1e-2, batch=32, epochs=30, seconds=0.0)
+OBJECTIVE = TrainingObjective(loss, held_out)
+PLAN = TrainingPlan(rate=1e-2, batch=32, epochs=30, seconds=0.0)
 KEY = jax.random.key(3)
 
 
@@ -47,7 +47,7 @@ def bits(tree):
 
 @pytest.fixture(scope="module")
 def trained():
-    return fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY)
+    return fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY)
 
 
 def test_it_learns(trained):
@@ -63,8 +63,8 @@ def test_the_best_network_is_kept(trained):
 
 
 def test_a_key_decides_all(trained):
-    again = fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY)
-    other = fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=jax.random.key(4))
+    again = fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY)
+    other = fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=jax.random.key(4))
     assert bits(again.network) == bits(trained.network)
     assert bits(other.network) != bits(trained.network)
 
@@ -74,8 +74,8 @@ def test_it_stops_early():
     inputs, _ = rows(64)
     noise = np.random.default_rng(1).normal(size=(64, 1)).astype(np.float32)
     other = np.random.default_rng(2).normal(size=(64, 1)).astype(np.float32)
-    plan = Plan(rate=3e-2, batch=16, epochs=500, patience=5)
-    found = fit(network(), OBJECTIVE, (inputs, noise), (inputs, other), plan, key=KEY)
+    plan = TrainingPlan(rate=3e-2, batch=16, epochs=500, patience=5)
+    found = fit_network(network(), OBJECTIVE, (inputs, noise), (inputs, other), plan, key=KEY)
     assert found.reason == "no better at 5 looks in a row"
     assert len(found.course.steps) == found.course.best + 6 < 500
 
@@ -86,9 +86,9 @@ class Stopped(Exception):
 
 def test_what_was_stopped_goes_on_to_the_same_bits(tmp_path):
     """Also amid epochs, with rates that fall."""
-    plan = Plan(rate=1e-2, batch=32, epochs=3, look_every=4, seconds=0.0, decay=0.5, decay_epochs=1)
+    plan = TrainingPlan(rate=1e-2, batch=32, epochs=3, look_every=4, seconds=0.0, decay=0.5, decay_epochs=1)
     given = network(), OBJECTIVE, rows(500), rows(100, 1), plan
-    whole = fit(*given, key=KEY)
+    whole = fit_network(*given, key=KEY)
     told = []
 
     def stop(said):
@@ -98,14 +98,14 @@ def test_what_was_stopped_goes_on_to_the_same_bits(tmp_path):
 
     for _ in range(20):
         try:
-            found = fit(*given, key=KEY, checkpoint=tmp_path / "state", progress=stop)
+            found = fit_network(*given, key=KEY, checkpoint=tmp_path / "state", progress=stop)
             break
         except Stopped:
             continue
     assert len(told) > 5
     assert found.course == whole.course
     assert bits(found.network) == bits(whole.network)
-    assert bits(fit(*given, key=KEY, checkpoint=tmp_path / "state").network) == bits(whole.network)
+    assert bits(fit_network(*given, key=KEY, checkpoint=tmp_path / "state").network) == bits(whole.network)
 
 
 @pytest.mark.slow
@@ -115,9 +115,10 @@ def test_killed_at_any_moment(tmp_path, trained):
     script.write_text(
         "import sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
-        "from test_fitting import KEY, OBJECTIVE, PLAN, fit, network, rows\n"
+        "from test_fitting import KEY, OBJECTIVE, PLAN, fit_network, network, rows\n"
         "def tell(said):\n    print(said, flush=True)\n"
-        "fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY, checkpoint=sys.argv[1], progress=tell)\n",
+        "kept = sys.argv[1]\n"
+        "fit_network(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY, checkpoint=kept, progress=tell)\n",
         "utf-8",
     )
     command = [sys.executable, str(script), str(tmp_path / "killed")]
@@ -130,20 +131,20 @@ def test_killed_at_any_moment(tmp_path, trained):
     assert process.returncode == -signal.SIGKILL
     said = []
     given = network(), OBJECTIVE, rows(500), rows(100, 1), PLAN
-    found = fit(*given, key=KEY, checkpoint=tmp_path / "killed", progress=said.append)
+    found = fit_network(*given, key=KEY, checkpoint=tmp_path / "killed", progress=said.append)
     assert 0 < len(said) < len(trained.course.steps)
     assert bits(found.network) == bits(trained.network)
 
 
 def test_a_checkpoint_of_another_training_is_refused(tmp_path):
     given = network(), OBJECTIVE, rows(100), rows(50, 1)
-    fit(*given, Plan(epochs=2), key=KEY, checkpoint=tmp_path / "state")
+    fit_network(*given, TrainingPlan(epochs=2), key=KEY, checkpoint=tmp_path / "state")
     with pytest.raises(ValueError, match="of another training \\(plan was"):
-        fit(*given, Plan(epochs=3), key=KEY, checkpoint=tmp_path / "state")
+        fit_network(*given, TrainingPlan(epochs=3), key=KEY, checkpoint=tmp_path / "state")
     with pytest.raises(ValueError, match="training was"):
-        fit(*given[:2], rows(101), given[3], Plan(epochs=2), key=KEY, checkpoint=tmp_path / "state")
+        fit_network(*given[:2], rows(101), given[3], TrainingPlan(epochs=2), key=KEY, checkpoint=tmp_path / "state")
     with pytest.raises(ValueError, match="key was"):
-        fit(*given, Plan(epochs=2), key=jax.random.key(0), checkpoint=tmp_path / "state")
+        fit_network(*given, TrainingPlan(epochs=2), key=jax.random.key(0), checkpoint=tmp_path / "state")
 
 
 class Chunks:
@@ -163,7 +164,7 @@ class Chunks:
 def test_chunks():
     """A set larger than memory is learnt as well, chunk by chunk."""
     chunks = Chunks(rows(500), (200, 200, 100))
-    found = fit(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
+    found = fit_network(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
     assert found.course.validation[found.course.best] < 0.02 / 9
     assert len(chunks.loaded) <= 3 * PLAN.epochs
 
@@ -172,7 +173,7 @@ def test_chunks():
 def test_what_was_stopped_amid_chunks_goes_on(tmp_path):
     """Amid an epoch."""
     chunks = Chunks(rows(500), (200, 200, 100))
-    found = fit(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
+    found = fit_network(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY)
     given = network(), OBJECTIVE, Chunks(rows(500), (200, 200, 100)), rows(100, 1), PLAN
     given[2].chunk = lambda number, whole=given[2].chunk: whole(number) if len(given[2].loaded) < 7 else stop()
 
@@ -180,8 +181,8 @@ def test_what_was_stopped_amid_chunks_goes_on(tmp_path):
         raise Stopped
 
     with pytest.raises(Stopped):
-        fit(*given, key=KEY, checkpoint=tmp_path / "state")
-    again = fit(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY, checkpoint=tmp_path / "state")
+        fit_network(*given, key=KEY, checkpoint=tmp_path / "state")
+    again = fit_network(network(), OBJECTIVE, chunks, rows(100, 1), PLAN, key=KEY, checkpoint=tmp_path / "state")
     assert bits(again.network) == bits(found.network)
 
 
@@ -220,9 +221,9 @@ def test_leaves_that_are_not_trained():
     inputs = np.linspace(-1, 1, 128)[:, None]
     start = Counting(*(jnp.asarray(value) for value in (0.0, 0.5, 0.0)))
     wanted = Counting(True, False, False)  # pyright: ignore[reportArgumentType]
-    plan = Plan(rate=0.05, batch=32, epochs=100, patience=100)
+    plan = TrainingPlan(rate=0.05, batch=32, epochs=100, patience=100)
     given = inputs, 2 * inputs + 0.5
-    found = fit(start, Objective(line, each, wanted), given, given, plan, key=KEY)
+    found = fit_network(start, TrainingObjective(line, each, wanted), given, given, plan, key=KEY)
     assert float(found.network.slope) == pytest.approx(2, abs=1e-2)
     assert float(found.network.offset) == 0.5
     assert float(found.network.seen) == found.course.steps[found.course.best]
@@ -234,22 +235,24 @@ def test_leaves_that_are_not_trained():
         ({"training": (np.zeros((3, 2)), np.zeros((4, 1)))}, "training must be arrays of one and the same number"),
         ({"validation": ()}, "validation must be arrays"),
         ({"key": 3}, "key must be one random key"),
-        ({"objective": loss}, "objective must be an Objective"),
+        ({"objective": loss}, "objective must be a TrainingObjective"),
     ],
 )
 def test_what_does_not_fit(change, said):
     given = {"objective": OBJECTIVE, "training": rows(10), "validation": rows(10), "key": KEY, **change}
     with pytest.raises(ValueError, match=said):
-        fit(network(), given.pop("objective"), given.pop("training"), given.pop("validation"), **given)
+        fit_network(network(), given.pop("objective"), given.pop("training"), given.pop("validation"), **given)
 
 
 @pytest.mark.parametrize("change", [{"rate": 0.0}, {"batch": 0}, {"epochs": 1.5}, {"look_every": 0}, {"seconds": -1}])
 def test_no_plan(change):
     with pytest.raises(ValueError, match=f"{next(iter(change))} must be"):
-        Plan(**change)
+        TrainingPlan(**change)
 
 
 def test_losses_that_are_not_finite():
     inputs, targets = rows(100)
     with pytest.raises(ValueError, match="are all rows finite"):
-        fit(network(), OBJECTIVE, (inputs, np.full_like(targets, np.nan)), rows(50), Plan(epochs=1), key=KEY)
+        fit_network(
+            network(), OBJECTIVE, (inputs, np.full_like(targets, np.nan)), rows(50), TrainingPlan(epochs=1), key=KEY
+        )

@@ -1,6 +1,14 @@
 from .half_space import HalfSpace
 from .indent_sets import IndentSet
-from .indenters import Bar, DepthMap, Disc, Prism, Revolved, Ring, ball
+from .indenters import (
+    BarIndenter,
+    DepthMapIndenter,
+    DiscIndenter,
+    PrismIndenter,
+    RevolvedIndenter,
+    RingIndenter,
+    ball_indenter,
+)
 from .indents import Indent, IndentDraws, PressDraws, depth_maps, indented_cells, relative_changes
 from .joined import JoinedIndenters, PlacedIndenter, TwoSheets
 from .materials import Foundation, Material, material
@@ -9,9 +17,9 @@ from .press_sets import PressSet, open_presses, simulate_presses
 from .pressed_skin import PressedSkin
 
 __all__ = [
-    "Bar",
-    "DepthMap",
-    "Disc",
+    "BarIndenter",
+    "DepthMapIndenter",
+    "DiscIndenter",
     "Foundation",
     "HalfSpace",
     "Indent",
@@ -25,11 +33,11 @@ __all__ = [
     "PressDraws",
     "PressSet",
     "PressedSkin",
-    "Prism",
-    "Revolved",
-    "Ring",
+    "PrismIndenter",
+    "RevolvedIndenter",
+    "RingIndenter",
     "TwoSheets",
-    "ball",
+    "ball_indenter",
     "depth_maps",
     "indented_cells",
     "material",

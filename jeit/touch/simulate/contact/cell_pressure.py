@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from jeit.design.skin.reached_cells import millimetre_text
 from jeit.design.skin.touched_cells import pad_rows
-from jeit.touch.simulate.contact.indenters import Disc
+from jeit.touch.simulate.contact.indenters import DiscIndenter
 from jeit.touch.simulate.contact.press import AbstractSupport, Press
 from jeit.touch.simulate.contact.samples import Samples
 
@@ -177,7 +177,7 @@ def _pressures_on_finer_lattice(samples: Samples, support: AbstractSupport, pres
         )
     nearest = np.linalg.norm(samples.points[cells[cell]] - press.position, axis=-1).argmin()
     here, small = np.zeros((1, 1, 2)), (share[0, cell] * samples.area[cells[cell]]).reshape(1, 1)
-    pressure[cell, nearest] = support.spread(Disc(samples.radius), load, here, small)[0, 0]
+    pressure[cell, nearest] = support.spread(DiscIndenter(samples.radius), load, here, small)[0, 0]
     return pressure
 
 

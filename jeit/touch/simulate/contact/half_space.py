@@ -38,6 +38,13 @@ class HalfSpace(AbstractSupport):
 
     **Fields**: `modulus`: Young's modulus E in pascals; `poisson`: Poisson's ratio; `pixels`: number of pixels along a
     side of the raster on which the pressure is computed, a rectangle slightly larger than the contact.
+
+    **Example:**
+
+    ```python
+    rubber = HalfSpace(modulus=1e6, poisson=0.5, pixels=32)
+    pressure = rubber.pressure(ball_indenter(0.02), 2.0)
+    ```
     """
 
     modulus: float

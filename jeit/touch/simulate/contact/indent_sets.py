@@ -46,7 +46,7 @@ class IndentSet:
         """Create a set. Raises `ValueError` for invalid arguments, and for depths that reach the thickness of the
         skin."""
         check_kind("skin", skin, Skin, "a Skin, as of Skin.create(named_layout('park-inner'))")
-        check_kind("draws", draws, IndentDraws, "IndentDraws([ball(0.015)], skin.flat_outline, (1e-3, 8e-3))")
+        check_kind("draws", draws, IndentDraws, "IndentDraws([ball_indenter(0.015)], skin.flat_outline, (1e-3, 8e-3))")
         for name, given in (("number", number), ("chunk", chunk)):
             if not (isinstance(given, int) and given >= 1):
                 raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")

@@ -29,8 +29,18 @@ class AbstractIndenter(Module):
         """Distance in metres from the frame's origin beyond which the body does not extend."""
 
 
-class Disc(AbstractIndenter):
-    """The flat end of a cylinder with `diameter` in metres, such as of a weight."""
+class DiscIndenter(AbstractIndenter):
+    """The flat end of a cylinder, such as of a weight.
+
+    **Fields**: `diameter`: diameter, metres.
+
+    **Example:**
+
+    ```python
+    press = Press(DiscIndenter(0.01), load=2.0, position=(0.01, 0.02))
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     diameter: float
 
@@ -49,8 +59,18 @@ class Disc(AbstractIndenter):
         return self.diameter / 2
 
 
-class Ring(AbstractIndenter):
-    """The flat end of a tube with `outer_diameter` and `inner_diameter` in metres."""
+class RingIndenter(AbstractIndenter):
+    """The flat end of a tube.
+
+    **Fields**: `outer_diameter`, `inner_diameter`: diameters, metres.
+
+    **Example:**
+
+    ```python
+    press = Press(RingIndenter(0.02, 0.014), load=2.0)
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     outer_diameter: float
     inner_diameter: float
@@ -77,9 +97,18 @@ class Ring(AbstractIndenter):
         return self.outer_diameter / 2
 
 
-class Bar(AbstractIndenter):
-    """A flat rectangle, such as the face of a cube or the edge of a ruler, with `length` along x and `width` along y in
-    metres."""
+class BarIndenter(AbstractIndenter):
+    """A flat rectangle, such as the face of a cube or the edge of a ruler.
+
+    **Fields**: `length`: side along x, metres; `width`: side along y, metres.
+
+    **Example:**
+
+    ```python
+    press = Press(BarIndenter(0.03, 0.004), load=2.0, angle=0.5)
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     length: float
     width: float
@@ -100,9 +129,19 @@ class Bar(AbstractIndenter):
         return float(np.hypot(self.length, self.width) / 2)
 
 
-class Prism(AbstractIndenter):
-    """A prism that touches with an edge along x, like a roof upside down: `length` of the edge, `width` and `height` of
-    the triangular section, all in metres."""
+class PrismIndenter(AbstractIndenter):
+    """A prism that touches with an edge along x, like a roof upside down.
+
+    **Fields**: `length`: length of the edge, metres; `width`, `height`: width and height of the triangular section,
+    metres.
+
+    **Example:**
+
+    ```python
+    press = Press(PrismIndenter(0.03, 0.01, 0.008), load=1.0)
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     length: float
     width: float
@@ -126,9 +165,18 @@ class Prism(AbstractIndenter):
         return float(np.hypot(self.length, self.width) / 2)
 
 
-class Revolved(AbstractIndenter):
-    """A rigid body of revolution with the profile of an `indentation` of `jeit.design`, such as `Bell()`; its depth in
-    the skin follows from the load."""
+class RevolvedIndenter(AbstractIndenter):
+    """A rigid body of revolution; its depth in the skin follows from the load.
+
+    **Fields**: `indentation`: its profile, an indentation of `jeit.design`, such as `Bell()`.
+
+    **Example:**
+
+    ```python
+    press = Press(RevolvedIndenter(Bell(depth=5e-3, deviation=5e-3)), load=1.0)
+    frames = skin.frames(key, [press])
+    ```
+    """
 
     indentation: AbstractIndentation
 
@@ -150,17 +198,38 @@ class Revolved(AbstractIndenter):
         return float(self.indentation.reach)
 
 
-def ball(diameter: float) -> Revolved:
-    """The lower half of a ball with `diameter` in metres. Raises `ValueError` for a diameter that is not positive."""
+def ball_indenter(diameter: float) -> RevolvedIndenter:
+    """The lower half of a ball.
+
+    **Arguments:**
+
+    - `diameter`: diameter of the ball, metres.
+
+    Raises `ValueError` for a diameter that is not positive.
+
+    **Example:**
+
+    ```python
+    press = Press(ball_indenter(0.015), load=2.0, position=(0.01, 0.02))
+    frames = skin.frames(key, [press])
+    ```
+    """
     check_metres("diameter", diameter)
-    return Revolved(Hemisphere(diameter / 2, diameter))
+    return RevolvedIndenter(Hemisphere(diameter / 2, diameter))
 
 
-class DepthMap(AbstractIndenter):
+class DepthMapIndenter(AbstractIndenter):
     """An indenter given by an image of its surface, centred at the origin and interpolated linearly between pixels.
 
     **Fields**: `height`: (rows, columns), height of the surface towards the skin in metres, NaN where there is no
     surface; row 0 is at the minimum y; `pixel`: side of a pixel in metres.
+
+    **Example:**
+
+    ```python
+    roof = -np.abs(np.linspace(-5e-3, 5e-3, 21))[:, None] * np.ones(21)
+    press = Press(DepthMapIndenter(roof, pixel=5e-4), load=1.0)
+    ```
     """
 
     height: Float[np.ndarray, "rows columns"]
@@ -194,7 +263,7 @@ class DepthMap(AbstractIndenter):
 
 def check_indenter(name: str, value) -> None:
     """Check that the argument `name` is an indenter. Raises `ValueError` otherwise."""
-    check_kind(name, value, AbstractIndenter, "an indenter, such as Disc(0.02) or ball(0.015)")
+    check_kind(name, value, AbstractIndenter, "an indenter, such as DiscIndenter(0.02) or ball_indenter(0.015)")
 
 
 def _check_size(name: str, value, maximum: float = np.inf, limit: str = "") -> None:

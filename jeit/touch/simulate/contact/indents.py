@@ -32,11 +32,20 @@ class PressDraws(Module):
     """Distribution of random touches. All draws are independent and uniform, except for the load, whose logarithm is
     uniform; the angle of the indenter is uniform, too.
 
+    **Arguments:**
+
     - `indenters`: the indenters.
     - `outline`: outline of the skin, within which places are drawn.
-    - `margin`: minimum distance of places from the outline, metres.
     - `load`: minimum and maximum load, newtons.
+    - `margin`: minimum distance of places from the outline, metres.
     - `at_once`: maximum number of simultaneous presses of a touch; the minimum is one.
+
+    **Example:**
+
+    ```python
+    draws = PressDraws([DiscIndenter(0.01)], outline, load=(1.0, 5.0), margin=0.01)
+    frames = skin.frames(key, draws.draw(key, 5))
+    ```
     """
 
     indenters: tuple[AbstractIndenter, ...]
@@ -56,10 +65,10 @@ class PressDraws(Module):
     ):
         """Create the distribution. Raises `ValueError` without indenters, for invalid arguments, for loads that are not
         positive and in order, and for a margin that leaves no place."""
-        check_kind("indenters", indenters, (list, tuple), "a list of them, such as [ball(0.015)]")
+        check_kind("indenters", indenters, (list, tuple), "a list of them, such as [ball_indenter(0.015)]")
         indenters = tuple(indenters)
         if not indenters:
-            raise ValueError("indenters: give one at least, such as [ball(0.015)].")
+            raise ValueError("indenters: give one at least, such as [ball_indenter(0.015)].")
         for number, indenter in enumerate(indenters):
             check_indenter(f"indenters[{number}]", indenter)
         check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
@@ -120,8 +129,18 @@ _FLOOR = 1e-3
 
 
 class Indent(Module):
-    """An `indenter` pressed to a `depth` in metres, with its origin at `position` (x, y) in metres, rotated by `angle`
-    in radians."""
+    """An indenter pressed to a given depth.
+
+    **Fields**: `indenter`: the indenter; `depth`: depth of its lowest point, metres; `position`: position (x, y) of its
+    origin, metres; `angle`: angle by which it is rotated, radians.
+
+    **Example:**
+
+    ```python
+    indent = Indent(DiscIndenter(0.02), depth=2e-3, position=(0.01, 0.0))
+    changes = relative_changes(sheet, [[indent]])
+    ```
+    """
 
     indenter: AbstractIndenter
     depth: float
@@ -143,8 +162,24 @@ class Indent(Module):
 
 
 class IndentDraws(Module):
-    """Distribution of random touches of one to `at_once` indents, as `PressDraws`, but with a minimum and maximum
-    `depth` in metres instead of a load; the logarithm of the depth is uniform."""
+    """Distribution of random touches of one or several indents, as `PressDraws`, but with a depth instead of a load;
+    the logarithm of the depth is uniform.
+
+    **Arguments:**
+
+    - `indenters`: the indenters.
+    - `outline`: outline of the skin, within which places are drawn.
+    - `depth`: minimum and maximum depth, metres.
+    - `margin`: minimum distance of places from the outline, metres.
+    - `at_once`: maximum number of simultaneous indents of a touch; the minimum is one.
+
+    **Example:**
+
+    ```python
+    draws = IndentDraws([DiscIndenter(0.01)], outline, depth=(1e-3, 3e-3), margin=0.01)
+    touches = draws.draw(key, 10)
+    ```
+    """
 
     presses: PressDraws
 
@@ -177,8 +212,20 @@ class IndentDraws(Module):
 def depth_maps(
     touches: Sequence[Sequence[Indent]], places: Float[np.ndarray, "*shape 2"]
 ) -> Float[np.ndarray, "n *shape"]:
-    """Depth of the indentation by each of n touches at `places` (…, 2), metres: the maximum over the indents of the
-    touch."""
+    """Depth (n, …) of the indentation by each of n touches, metres: the maximum over the indents of the touch.
+
+    **Arguments:**
+
+    - `touches`: the touches, each a sequence of indents.
+    - `places`: positions (…, 2), metres.
+
+    **Example:**
+
+    ```python
+    depths = depth_maps([[Indent(DiscIndenter(0.02), 2e-3)]], grid(0.06, 0.06, 8, 8))
+    print(depths.shape)  # (1, 64)
+    ```
+    """
     maps = np.zeros((len(touches), *places.shape[:-1]))
     for number, touch in enumerate(touches):
         for indent in touch:
@@ -229,8 +276,20 @@ def relative_changes(
 ) -> Float[np.ndarray, "n M"]:
     """Exact changes (n, M) of a skin's voltages due to n touches, relative to the voltages at rest (see `relative_to`).
 
-    `resting`: data of the same skin at rest, from `resting_skin`, which several calls can share. Raises `ValueError` as
-    `indented_cells`.
+    **Arguments:**
+
+    - `skin`: the skin.
+    - `touches`: the touches, each a sequence of indents.
+    - `resting`: data of the same skin at rest, from `resting_skin`, which several calls can share.
+
+    Raises `ValueError` as `indented_cells`.
+
+    **Example:**
+
+    ```python
+    changes = relative_changes(sheet, [[Indent(DiscIndenter(0.02), 2e-3)]])
+    frames = rest * (1 + changes)
+    ```
     """
     touched = indented_cells(skin, touches)
     if resting is not None:

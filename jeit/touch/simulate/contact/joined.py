@@ -41,6 +41,13 @@ class TwoSheets(Module):
 
     **Fields**: `model`: forward model of the lower sheet; `pattern`, `plan`: sparsity pattern and factorisation plan of
     the system.
+
+    **Example:**
+
+    ```python
+    sheets = TwoSheets(model)
+    voltages = sheets.voltages(2e-5, 2e-5, 1e-3)
+    ```
     """
 
     model: ForwardModel
@@ -109,7 +116,17 @@ def _check_conductance(conductance, num_cells: int) -> Float[np.ndarray, " m"]:
 
 
 class PlacedIndenter(AbstractIndenter):
-    """An `indenter` rotated counter-clockwise by `angle` in radians, then moved to `position` (x, y) in metres."""
+    """An indenter that is rotated counter-clockwise, then moved, as a part of `JoinedIndenters`.
+
+    **Fields**: `indenter`: the indenter; `position`: position (x, y) of its origin, metres; `angle`: angle, radians.
+
+    **Example:**
+
+    ```python
+    beside = PlacedIndenter(BarIndenter(0.02, 0.005), (0.015, 0.0), angle=0.6)
+    press = Press(JoinedIndenters(ball_indenter(0.01), beside), load=3.0)
+    ```
+    """
 
     indenter: AbstractIndenter
     position: Float[np.ndarray, "2"]
@@ -132,8 +149,20 @@ class PlacedIndenter(AbstractIndenter):
 
 
 class JoinedIndenters(AbstractIndenter):
-    """One rigid body of several `parts` under one load, with their lowest points at the same height. Parts beside each
-    other are `PlacedIndenter`."""
+    """One rigid body of several parts under one load, with their lowest points at the same height. Parts beside each
+    other are `PlacedIndenter`.
+
+    **Arguments:**
+
+    - `parts`: the indenters.
+
+    **Example:**
+
+    ```python
+    beside = PlacedIndenter(ball_indenter(0.01), (0.015, 0.0))
+    press = Press(JoinedIndenters(DiscIndenter(0.01), beside), load=3.0)
+    ```
+    """
 
     parts: tuple[AbstractIndenter, ...]
 
@@ -141,8 +170,8 @@ class JoinedIndenters(AbstractIndenter):
         """Create the body. Raises `ValueError` without parts, and for parts that are not indenters."""
         if not parts:
             raise ValueError(
-                "parts: give one indenter at least, such as JoinedIndenters(Disc(0.01), PlacedIndenter(Disc(0.01), "
-                "(0.02, 0)))"
+                "parts: give one indenter at least, such as JoinedIndenters(DiscIndenter(0.01), "
+                "PlacedIndenter(DiscIndenter(0.01), (0.02, 0)))"
             )
         for number, part in enumerate(parts):
             check_indenter(f"part {number}", part)

@@ -43,6 +43,13 @@ class Foundation(AbstractSupport):
 
     It applies to layers that are thin compared with the width of the contact. **Fields**: `modulus`: modulus E in
     pascals of the layer under compression without lateral expansion; `thickness`: in metres.
+
+    **Example:**
+
+    ```python
+    foam = Foundation(modulus=1e5, thickness=5e-3)
+    soft = dataclasses.replace(material("velostat"), support=foam)
+    ```
     """
 
     modulus: float
@@ -131,6 +138,8 @@ def check_modulus(modulus) -> None:
 class Material(Module):
     """Material of a skin, in SI units. To change values: `dataclasses.replace(material("velostat"), noise=0.0)`.
 
+    **Fields**
+
     - `conductivity`: S/m, and `thickness`: metres, of the conductor at rest.
     - `support`: mechanical support that carries the load.
     - `saturation`, `half_pressure`: c and p½ (pascals) of the conductivity σ = σ₀ (1 + c q / (q + p½)) under an
@@ -142,6 +151,13 @@ class Material(Module):
     - `conductivity_walk`, `contact_walk`: standard deviation of their random walk, relative, per √s.
     - `noise`: standard deviation of the noise of each voltage, relative to the root mean square of all voltages.
     - `gain_spread`: standard deviation of the logarithm of the gain of each channel.
+
+    **Example:**
+
+    ```python
+    foam = Foundation(modulus=1e5, thickness=5e-3)
+    own = Material(2.0, 5e-3, foam, saturation=1.5, half_pressure=2e4, noise=1e-4)
+    ```
     """
 
     conductivity: float
@@ -261,7 +277,20 @@ MATERIALS = {
 
 
 def material(name: str) -> Material:
-    """Return the material with the given name: "velostat", "conductive fabric" or "hydrogel". Raises `ValueError` for
-    another name."""
+    """Return the material with the given name.
+
+    **Arguments:**
+
+    - `name`: "velostat", "conductive fabric" or "hydrogel".
+
+    Raises `ValueError` for another name.
+
+    **Example:**
+
+    ```python
+    quiet = dataclasses.replace(material("velostat"), noise=0.0)
+    skin = PressedSkin(key, model, quiet)
+    ```
+    """
     check_name("name", name, MATERIALS)
     return MATERIALS[name]

@@ -126,12 +126,21 @@ def check_support(name: str, value) -> None:
 
 
 class Press(Module):
-    """An `indenter` under a `load` in newtons, with its origin at `position` (x, y) in metres, rotated by `angle` in
-    radians.
+    """An indenter under a load.
 
-    On a curved skin, `position` is (x, y, z) on the touched face, and the indenter moves along the inward normal. With
-    angle 0, seen from outside, its x axis points to the right and its y axis up: along the projection of the z axis
-    onto the surface, or of the y axis where the surface is nearly horizontal.
+    On a curved skin, the position is (x, y, z) on the touched face, and the indenter moves along the inward normal.
+    With angle 0, seen from outside, its x axis points to the right and its y axis up: along the projection of the z
+    axis onto the surface, or of the y axis where the surface is nearly horizontal.
+
+    **Fields**: `indenter`: the indenter; `load`: load, newtons; `position`: position (x, y) of its origin, metres;
+    `angle`: angle by which it is rotated, radians.
+
+    **Example:**
+
+    ```python
+    press = Press(ball_indenter(0.015), load=2.0, position=(0.01, 0.02))
+    frames = skin.frames(key, [press, ()])  # pressed, and untouched
+    ```
     """
 
     indenter: AbstractIndenter
@@ -150,8 +159,15 @@ class Press(Module):
 class MovingPress(Module):
     """A press over time, with one value for each of T frames; constant values may be given once.
 
-    **Fields**: `indenter`; `load`: (T,) newtons, 0 while lifted; `position`: (T, 2) metres, or (T, 3) on a curved skin;
-    `angle`: (T,) radians.
+    **Fields**: `indenter`: the indenter; `load` (T,): load, newtons, 0 while lifted; `position` (T, 2), or (T, 3) on a
+    curved skin: position of its origin, metres; `angle` (T,): angle by which it is rotated, radians.
+
+    **Example:**
+
+    ```python
+    stroke = MovingPress(DiscIndenter(0.01), 2.0, np.linspace((-0.02, 0.0), (0.02, 0.0), 10))
+    film = skin.record(key, stroke, np.arange(10) / 10)
+    ```
     """
 
     indenter: AbstractIndenter

@@ -37,10 +37,23 @@ _MEANINGS = {
 
 
 class PressSet:
-    """A set of `number` random touches drawn from `draws`, with the frames of `skin`, determined by `seed`.
+    """A set of random touches with the frames of a skin, for `simulate_presses`; determined by its seed.
 
-    `held`, `elapsed`: seconds, as in `PressedSkin.frames`; `chunk`: number of touches that are simulated and written at
-    once; it also affects the random numbers.
+    **Arguments:**
+
+    - `skin`: the skin.
+    - `draws`: the distribution of the touches.
+    - `number`: number of touches.
+    - `seed`: random seed.
+    - `held`, `elapsed`: times as in `PressedSkin.frames`, seconds.
+    - `chunk`: number of touches that are simulated and written at once; it also affects the random numbers.
+
+    **Example:**
+
+    ```python
+    draws = PressDraws([DiscIndenter(0.01)], outline, load=(1.0, 5.0), margin=0.01)
+    data = simulate_presses(PressSet(skin, draws, number=8), "presses.zarr")  # with zarr
+    ```
     """
 
     def __init__(
@@ -57,7 +70,12 @@ class PressSet:
         """Create a set. Raises `ValueError` for invalid arguments, and if the skin cannot carry the maximum load of
         each indenter in its middle; at the edge, indenters go deeper, which is not checked."""
         check_kind("skin", skin, PressedSkin, "a PressedSkin")
-        check_kind("draws", draws, PressDraws, "PressDraws, such as PressDraws([ball(0.015)], Disk(0.05), (0.1, 10.0))")
+        check_kind(
+            "draws",
+            draws,
+            PressDraws,
+            "PressDraws, such as PressDraws([ball_indenter(0.015)], Disk(0.05), (0.1, 10.0))",
+        )
         for name, given in (("number", number), ("chunk", chunk)):
             if not (isinstance(given, int) and given >= 1):
                 raise ValueError(f"{name} must be a whole number, 1 or more; it is {given!r}.")
@@ -143,10 +161,23 @@ def simulate_presses(
 ):
     """Simulate the unfinished chunks of a set of presses or indents, and return the set as `open_presses`.
 
-    An interrupted simulation resumes after the last finished chunk when it is run again with the same store. `path`,
-    `client` and `progress` as in `jeit.design.run_study`. Raises `ValueError` for the store of another set, for a store
-    in use by another process, and as `PressedSkin.frames`; `ImportError` without the extra `cluster`; `OSError` if the
-    store cannot be written.
+    An interrupted simulation resumes after the last finished chunk when it is run again with the same store.
+
+    **Arguments:**
+
+    - `presses`: the set.
+    - `path`: path of the Zarr store, which is created if it does not exist.
+    - `client`, `progress`: as in `jeit.design.run_study`.
+
+    Raises `ValueError` for the store of another set, for a store in use by another process, and as
+    `PressedSkin.frames`; `ImportError` without the extra `cluster`; `OSError` if the store cannot be written.
+
+    **Example:**
+
+    ```python
+    draws = PressDraws([DiscIndenter(0.01)], outline, load=(1.0, 5.0), margin=0.01)
+    data = simulate_presses(PressSet(skin, draws, number=8), "presses.zarr")  # with zarr
+    ```
     """
     need_extra("cluster", "a set of touches")
     check_kind("presses", presses, (PressSet, IndentSet), "a PressSet(skin, draws, number), or an IndentSet")
@@ -164,8 +195,22 @@ def open_presses(presses: PressSet | IndentSet, path: str | Path):
     """Open the set in a store as an `xarray.Dataset` with dimensions touch, channel and press, or, for indents, row and
     column instead of press.
 
-    Data are read on access; `finished` (touch,) marks the touches that have been simulated. Raises as
-    `jeit.design.study.store.Store`.
+    Data are read on access; `finished` (touch,) marks the touches that have been simulated.
+
+    **Arguments:**
+
+    - `presses`: the set.
+    - `path`: path of the Zarr store.
+
+    Raises as `jeit.design.study.store.Store`.
+
+    **Example:**
+
+    ```python
+    presses = PressSet(skin, PressDraws([DiscIndenter(0.01)], outline, (1.0, 5.0), margin=0.01), 8)
+    simulate_presses(presses, "presses.zarr")  # with zarr
+    data = open_presses(presses, "presses.zarr")
+    ```
     """
     need_extra("cluster", "a set of touches")
     store = Store(presses.contents(), path, create=False)

@@ -122,14 +122,26 @@ class PressedSkin(Module):
     """A sheet or layer of a material that is pressed. Voltages are exact; they are computed by low-rank updates of one
     factorisation.
 
-    - `model`: forward model of a sheet, or of a layer with its top at the maximum z.
-    - `material`: the material.
-    - `conductivity`: at rest, S/m (2-D: S); may be tensors, which are scaled by presses.
-    - `gain`: (M,), gain of each channel.
-    - `face`: pressed face of a curved layer, "outer" or "inner".
-
     The sheet may be a surface in space, and the layer a shell. Presses are then at (x, y, z), and the support of the
     material must be a `Foundation`.
+
+    **Arguments:**
+
+    - `key`: random key from which the gains of the channels are drawn.
+    - `model`: forward model of a sheet, or of a layer with its top at the maximum z.
+    - `material`: the material.
+    - `conductivity`: conductivity at rest, S/m (2-D: S); may be tensors, which are scaled by presses. By default that
+      of the material.
+    - `face`: pressed face of a curved layer, "outer" or "inner".
+
+    **Fields**: the arguments except `key`, and `gain` (M,): gain of each channel.
+
+    **Example:**
+
+    ```python
+    skin = PressedSkin(key, model, material("velostat"))
+    frames = skin.frames(key, [Press(DiscIndenter(0.01), 2.0, (0.01, 0.02))])
+    ```
     """
 
     model: ForwardModel

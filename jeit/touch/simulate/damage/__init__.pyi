@@ -1,4 +1,4 @@
-from .cut import Cut, draw_cut, mended
+from .cut import Cut, draw_cut, mend_cut
 from .recording import FAULTS, ElectrodeFault, Mishap, record_mishaps
 
 __all__ = [
@@ -7,6 +7,6 @@ __all__ = [
     "ElectrodeFault",
     "Mishap",
     "draw_cut",
-    "mended",
+    "mend_cut",
     "record_mishaps",
 ]

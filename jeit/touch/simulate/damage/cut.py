@@ -25,6 +25,13 @@ class Cut(Module):
 
     **Fields**: `path`: (k, 2) vertices in metres; `depth`: depth of the cut as a share of the thickness, 1 for a cut
     through the skin; `residual`: factor by which the conductivity of the cut cells is multiplied.
+
+    **Example:**
+
+    ```python
+    cut = Cut([(-0.01, 0.0), (0.01, 0.005)], depth=1.0)
+    conductivity = cut.conductivity(model.mesh, skin.conductivity)
+    ```
     """
 
     path: Float[np.ndarray, "k 2"]
@@ -124,11 +131,25 @@ def draw_cut(
     bent: float = 0.5,
     margin: float = 5e-3,
 ) -> Cut:
-    """Draw a random cut inside an `outline`, more than `margin` metres from its edge.
+    """Draw a random cut inside an outline.
 
-    The length is uniform between the minimum and maximum `length`, in metres, and the direction is uniform. With
-    probability `bent`, the cut has one bend of 20 to 70 degrees. Raises `ValueError` for invalid arguments, and if the
-    skin is too small for the cut.
+    **Arguments:**
+
+    - `key`: random key.
+    - `outline`: outline of the skin.
+    - `length`: minimum and maximum length, metres, between which the length is uniform.
+    - `depth`: depth as a share of the thickness, 1 for a cut through the skin.
+    - `bent`: probability that the cut has one bend of 20 to 70 degrees.
+    - `margin`: minimum distance from the edge, metres.
+
+    Raises `ValueError` for invalid arguments, and if the skin is too small for the cut.
+
+    **Example:**
+
+    ```python
+    cut = draw_cut(key, outline, length=(0.02, 0.03))
+    conductivity = cut.conductivity(model.mesh, skin.conductivity)
+    ```
     """
     check_key(key)
     check_kind("outline", outline, Domain, "an outline, such as Disk(0.05)")
@@ -171,14 +192,29 @@ def _orientation(first, second) -> np.ndarray:
 _HYSTERESIS_FACTOR = 1.5
 
 
-def mended(
+def mend_cut(
     mesh: Mesh, conductivity: ArrayLike, cut: Cut, material: Material, share: float = 1.0
 ) -> tuple[Float[np.ndarray, " m"], Material]:
     """Conductivity (m,) of a skin whose cut was repaired, S/m (2-D: S), and its material.
 
-    `conductivity`: that of the skin before the cut, S/m (2-D: S); `share`: factor of the conductivity of the repaired
-    cells, about 0.9 to 1.1. The hysteresis of the material is multiplied by 1.5, up to 0.9. Raises `ValueError` for
-    invalid arguments, and as `Cut.cells`.
+    The hysteresis of the material is multiplied by 1.5, up to 0.9.
+
+    **Arguments:**
+
+    - `mesh`: mesh of the skin.
+    - `conductivity`: conductivity of the skin before the cut, S/m (2-D: S).
+    - `cut`: the cut.
+    - `material`: material of the skin.
+    - `share`: factor of the conductivity of the repaired cells, about 0.9 to 1.1.
+
+    Raises `ValueError` for invalid arguments, and as `Cut.cells`.
+
+    **Example:**
+
+    ```python
+    cut = Cut([(-0.01, 0.0), (0.01, 0.005)])
+    conductivity, glued = mend_cut(model.mesh, skin.conductivity, cut, skin.material, 0.95)
+    ```
     """
     check_kind("cut", cut, Cut, "the Cut that was mended")
     check_kind("material", material, Material, 'a Material, such as material("hydrogel")')

@@ -32,12 +32,21 @@ _STRAY = 0.02
 class ElectrodeFault(Module):
     """A fault of an electrode.
 
+    **Fields**
+
     - `electrode`: its number, from 0.
-    - `kind`: one of `FAULTS`. "dead": the contact impedance is multiplied by 10⁷, the source is limited to five times
-      its maximum voltage at rest, and measurements on the electrode read only noise. "loose": the factor of the contact
-      impedance fluctuates between 10 and 1,000, with a time constant of half a second. "torn": the electrode is
-      disconnected; its channels read noise, or the constant `rail`.
+    - `kind`: "dead": the contact impedance is multiplied by 10⁷, the source is limited to five times its maximum
+      voltage at rest, and measurements on the electrode read only noise. "loose": the factor of the contact impedance
+      fluctuates between 10 and 1,000, with a time constant of half a second. "torn": the electrode is disconnected; its
+      channels read noise, or the constant `rail`.
     - `rail`: constant reading of the channels of a torn electrode, volts, or None.
+
+    **Example:**
+
+    ```python
+    mishap = Mishap(1.0, faults=(ElectrodeFault(3, "dead"),))
+    frames = record_mishaps(key, skin, [], np.arange(4.0), [mishap])
+    ```
     """
 
     electrode: int
@@ -132,6 +141,13 @@ class Mishap(Module):
 
     **Fields**: `time`: when it happens, seconds; `skin`: the skin from then on, with the same channels and gains, or
     None for no change of the skin; `faults`: faults of electrodes from then on.
+
+    **Example:**
+
+    ```python
+    mishap = Mishap(time=1.0, faults=(ElectrodeFault(3, "torn"),))
+    frames = record_mishaps(key, skin, [], np.arange(4.0), [mishap])
+    ```
     """
 
     time: float
@@ -156,11 +172,27 @@ def record_mishaps(
     seconds: Float[np.ndarray, " T"],
     mishaps: Sequence[Mishap],
 ) -> Float[np.ndarray, "T M"]:
-    """Simulate voltages (T, M) at times `seconds` (T,) of a skin under moving presses (`[]` for none) with mishaps.
+    """Simulate voltages (T, M) of a skin under moving presses with mishaps.
 
     Each mishap sets the skin and the faults until the next one. Drift, gains and noise continue through all of them.
-    Every frame is solved with its own conductivity. Raises `ValueError` for invalid mishaps, for a skin with other
-    channels, and as `PressedSkin.touched_in_time`.
+    Every frame is solved with its own conductivity.
+
+    **Arguments:**
+
+    - `key`: random key.
+    - `skin`: the skin.
+    - `motions`: the presses; `[]` for none.
+    - `seconds`: times (T,), seconds.
+    - `mishaps`: the mishaps, in order of time.
+
+    Raises `ValueError` for invalid mishaps, for a skin with other channels, and as `PressedSkin.touched_in_time`.
+
+    **Example:**
+
+    ```python
+    mishap = Mishap(2.0, faults=(ElectrodeFault(3, "torn"),))
+    frames = record_mishaps(key, skin, [], np.arange(4.0), [mishap])
+    ```
     """
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from jeit.arguments import check_key, check_kind, check_name, describe, is_number
 from jeit.mesh import Domain
-from jeit.touch.simulate.contact.indenters import Disc
+from jeit.touch.simulate.contact.indenters import DiscIndenter
 from jeit.touch.simulate.contact.joined import JoinedIndenters, PlacedIndenter
 from jeit.touch.simulate.contact.press import MovingPress
 from jeit_solvers.module import Module
@@ -126,11 +126,11 @@ def gesture_motion(
     middle, angle, length = _random_path(rng, outline, length)
     along = (1 - np.abs((sweeps * share) % 2 - 1) - 0.5) * length
     place = middle + along[:, None] * np.array([np.cos(angle), np.sin(angle)])
-    indenter: Disc | JoinedIndenters = Disc(2 * radius)
+    indenter: DiscIndenter | JoinedIndenters = DiscIndenter(2 * radius)
     if gesture == "scratch":
         tip = radius / np.sqrt(_TIPS)
         offsets = _APART * tip * (np.arange(_TIPS) - (_TIPS - 1) / 2)
-        indenter = JoinedIndenters(*(PlacedIndenter(Disc(2 * tip), (0.0, offset)) for offset in offsets))
+        indenter = JoinedIndenters(*(PlacedIndenter(DiscIndenter(2 * tip), (0.0, offset)) for offset in offsets))
     # The hand may extend over the edge of the skin, but its path lies on the skin.
     return MovingPress(indenter, load, place, angle), seconds
 
@@ -167,8 +167,18 @@ _LEAST_SIDE = 0.06
 
 
 class Person(Module):
-    """A simulated person. **Fields**: `medians`: (6, 5), median of each of the `TRAITS` (columns) in touches of this
-    person, for each of the `GESTURES` (rows), in SI units."""
+    """A simulated person, who touches skins in a manner of their own.
+
+    **Fields**: `medians` (6, 5): median of each of the five traits (columns) in touches of this person, for each of the
+    six gestures (rows), in SI units.
+
+    **Example:**
+
+    ```python
+    person = Person.draw(key)
+    motion, times = person.touch(key, "stroke", outline)
+    ```
+    """
 
     medians: Float[np.ndarray, "6 5"]
 

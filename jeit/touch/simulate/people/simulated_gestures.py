@@ -34,11 +34,29 @@ def simulate_gestures(
     rate: float = 60.0,
     progress: Callable[[str], None] | None = None,
 ) -> GestureSet:
-    """Simulate `each` recordings of each of the `gestures` by each of the `people` on a skin with this `outline`.
+    """Simulate recordings of the gestures of people on a skin.
 
-    Before each recording, the skin has drifted for up to a minute since its reference, without load. `rate`: frames/s.
-    `progress` is called with a description of the progress. Raises `ValueError` for invalid arguments, and as
-    `Person.touch` and `PressedSkin.record`.
+    Before each recording, the skin has drifted for up to a minute since its reference, without load.
+
+    **Arguments:**
+
+    - `key`: random key.
+    - `skin`: the skin.
+    - `outline`: outline of the skin.
+    - `people`: the people.
+    - `each`: number of recordings of each gesture by each person.
+    - `gestures`: names of the gestures.
+    - `rate`: frames/s.
+    - `progress`: called with a description of the progress.
+
+    Raises `ValueError` for invalid arguments, and as `Person.touch` and `PressedSkin.record`.
+
+    **Example:**
+
+    ```python
+    recordings = simulate_gestures(key, skin, outline, people, 1, gestures=("tap",), rate=15.0)
+    print(recordings.gesture, recordings.voltages.shape)
+    ```
     """
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")
@@ -113,11 +131,28 @@ def simulate_gesture_stream(
     pause: float = 1.0,
     rate: float = 60.0,
 ) -> GestureStream:
-    """Simulate a stream of `number` random gestures of random people on a skin with this `outline`.
+    """Simulate a stream of random gestures of random people on a skin.
 
-    The skin is not touched for the first two seconds, and for at least `pause` seconds between gestures. It creeps and
-    drifts throughout. `rate`: frames/s. Raises `ValueError` for invalid arguments, and as `Person.touch` and
-    `PressedSkin.record`.
+    The skin is not touched for the first two seconds. It creeps and drifts throughout.
+
+    **Arguments:**
+
+    - `key`: random key.
+    - `skin`: the skin.
+    - `outline`: outline of the skin.
+    - `people`: the people.
+    - `number`: number of gestures.
+    - `pause`: minimum time between gestures, seconds.
+    - `rate`: frames/s.
+
+    Raises `ValueError` for invalid arguments, and as `Person.touch` and `PressedSkin.record`.
+
+    **Example:**
+
+    ```python
+    stream = simulate_gesture_stream(key, skin, outline, people, 1, rate=15.0)
+    print(stream.gesture, stream.onset, stream.offset)
+    ```
     """
     check_key(key)
     check_kind("skin", skin, PressedSkin, "a PressedSkin")

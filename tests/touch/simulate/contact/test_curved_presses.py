@@ -16,14 +16,14 @@ from jeit.mesh.geodesic import Geodesics, Triangles
 from jeit.protocol import adjacent, two_terminal
 from jeit.touch.contacts import CellFinder, find_contacts
 from jeit.touch.simulate.contact import (
-    Bar,
-    Disc,
+    BarIndenter,
+    DiscIndenter,
     Foundation,
     HalfSpace,
     MovingPress,
     Press,
     PressedSkin,
-    ball,
+    ball_indenter,
     material,
 )
 from jeit.touch.simulate.contact.cell_pressure import pressed_cells
@@ -68,7 +68,11 @@ def test_far_enough_from_its_axis_a_bent_skin_is_flat():
     flat = PLANE.mesh(num_points=300)
     wanted = np.stack(np.meshgrid([-0.03, 0, 0.03], [-0.025, 0, 0.025]), axis=-1).reshape(-1, 2)
     nodes = np.linalg.norm(np.asarray(flat.points)[:, None] - wanted, axis=-1).argmin(axis=0)
-    presses = [(ball(0.015), 2.0, (0.0, 0.01)), (Disc(0.02), 5.0, (0.0, -0.015)), (Bar(0.03, 0.004), 3.0, (0.0, 0.0))]
+    presses = [
+        (ball_indenter(0.015), 2.0, (0.0, 0.01)),
+        (DiscIndenter(0.02), 5.0, (0.0, -0.015)),
+        (BarIndenter(0.03, 0.004), 3.0, (0.0, 0.0)),
+    ]
     exact = pressed(points_at(flat, nodes), [Press(*one, angle=0.4) for one in presses])
     change = np.abs(exact - points_at(flat, nodes).rest()).max()
     errors = []
@@ -97,7 +101,11 @@ def test_pressures_carry_the_load(kind):
     assert isinstance(surface, Triangles)
     assert samples.area.sum() * samples.points.shape[1] == pytest.approx(surface.areas.sum(), rel=1e-9)
     middle = surface.nearest([[0.05, 0.0, 0.05], [0.0, -0.05, 0.06], [-0.05, 0.01, 0.099]]).points
-    presses = [Press(ball(0.02), 2.0, middle[0]), Press(Disc(0.012), 4.0, middle[1]), Press(ball(0.02), 1.0, middle[2])]
+    presses = [
+        Press(ball_indenter(0.02), 2.0, middle[0]),
+        Press(DiscIndenter(0.012), 4.0, middle[1]),
+        Press(ball_indenter(0.02), 1.0, middle[2]),
+    ]
     cells, pressure = pressed_cells(samples, Foundation(1e6, 4e-3), [(press,) for press in presses])
     out = surface.normals_at(surface.nearest(middle))
     along = np.einsum("ncd,nd->nc", samples.curved.cells[cells], out)
@@ -113,7 +121,7 @@ def test_a_ball_on_a_ball_touches_a_smaller_circle():
     surface = sphere(0.05, num_points=8000)
     samples, support = Samples.from_mesh(surface), Foundation(1e6, 4e-3)
     place = Triangles.of(surface).nearest([[0.02, 0.03, 0.04]]).points[0]
-    cells, pressure = pressed_cells(samples, support, [(Press(ball(0.04), 2.0, place),)])
+    cells, pressure = pressed_cells(samples, support, [(Press(ball_indenter(0.04), 2.0, place),)])
     there = samples.points[cells[0]][pressure[0] > 0]
     area = np.count_nonzero(pressure[0] > 0, axis=-1) @ samples.area[cells[0]]
     radius = (4 * 2.0 / (np.pi * support.stiffness * (1 / 0.02 + 1 / 0.05))) ** 0.25
@@ -124,14 +132,18 @@ def test_a_ball_on_a_ball_touches_a_smaller_circle():
 def test_a_weight_on_a_tube_rests_along_it():
     surface = tube(0.04, 0.1, num_points=8000)
     samples = Samples.from_mesh(surface)
-    cells, pressure = pressed_cells(samples, Foundation(1e6, 4e-3), [(Press(Disc(0.02), 0.5, (0.04, 0.0, 0.05)),)])
+    cells, pressure = pressed_cells(
+        samples, Foundation(1e6, 4e-3), [(Press(DiscIndenter(0.02), 0.5, (0.04, 0.0, 0.05)),)]
+    )
     points = samples.points[cells[0]][pressure[0] > 0]
     assert np.ptp(points[:, 2]) == pytest.approx(0.02, rel=0.1)
     assert np.ptp(points[:, 1]) < 0.8 * np.ptp(points[:, 2])
     upright, level = (
         samples.points[cells[0]][pressure[0] > 0]
         for cells, pressure in (
-            pressed_cells(samples, Foundation(1e8, 4e-3), [(Press(Bar(0.03, 0.003), 1.0, (0, 0.04, 0.05), angle),)])
+            pressed_cells(
+                samples, Foundation(1e8, 4e-3), [(Press(BarIndenter(0.03, 0.003), 1.0, (0, 0.04, 0.05), angle),)]
+            )
             for angle in (np.pi / 2, 0.0)
         )
     )
@@ -149,7 +161,10 @@ def test_a_press_on_a_tube_is_imaged_where_it_was():
         for one in (fine, coarse)
     ]
     places = spread(fine, 12, margin=0.015)
-    presses, skin = [Press(ball(0.02), 3.0, place) for place in places], PressedSkin(KEY, skins[0].model, STILL)
+    presses, skin = (
+        [Press(ball_indenter(0.02), 3.0, place) for place in places],
+        PressedSkin(KEY, skins[0].model, STILL),
+    )
     touched, ways = skin.touched(presses), Geodesics.create(coarse)
     middles = np.asarray(fine.points)[np.asarray(fine.cells)].mean(axis=1)[np.asarray(touched.cells)]
     weight = np.asarray(touched.change) * np.asarray(measures(fine))[np.asarray(touched.cells)]
@@ -171,9 +186,9 @@ def test_a_moving_press_is_its_presses():
     layout = SurfaceLayout.spread(arm, 8, 12e-3, contact_impedance=1e-4)
     skin = PressedSkin(KEY, Skin.create(layout, num_layers=0).model, STILL)
     places = Triangles.of(arm).nearest([[0.04, 0, 0.04], [0.04, 0.005, 0.05], [0.035, 0.01, 0.06]]).points
-    moving = MovingPress(ball(0.015), [1.0, 0.0, 2.0], places)
+    moving = MovingPress(ball_indenter(0.015), [1.0, 0.0, 2.0], places)
     record = skin.record(KEY, moving, np.array([0.0, 1.0, 2.0]))
-    presses = [Press(ball(0.015), 1.0, places[0]), (), Press(ball(0.015), 2.0, places[2])]
+    presses = [Press(ball_indenter(0.015), 1.0, places[0]), (), Press(ball_indenter(0.015), 2.0, places[2])]
     still = skin.frames(KEY, presses)
     np.testing.assert_allclose(record, still, rtol=1e-9)
     exact = pressed(skin, presses)
@@ -183,7 +198,7 @@ def test_a_moving_press_is_its_presses():
 def test_says_what_cannot_be_pressed():
     surface = tube(0.04, 0.1, num_points=700)
     curved, flat = Samples.from_mesh(surface), Samples.from_mesh(PLANE.mesh(num_points=300))
-    layer, shape = Foundation(1e6, 4e-3), ball(0.02)
+    layer, shape = Foundation(1e6, 4e-3), ball_indenter(0.02)
     for samples, place, match in (
         (curved, (0.0, 0.0), r"a press on a curved skin is at \(x, y, z\) on it.*has 2 coordinates"),
         (flat, (0.0, 0.0, 0.0), r"a press on a flat skin is at \(x, y\).*has 3 coordinates"),

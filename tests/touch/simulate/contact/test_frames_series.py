@@ -14,7 +14,7 @@ from jeit.forward import ForwardModel
 from jeit.forward.exact import ConductingDisk, arc_transfer_impedance, point_inclusion_effect
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
-from jeit.touch.simulate.contact import Disc, Press, PressedSkin, material
+from jeit.touch.simulate.contact import DiscIndenter, Press, PressedSkin, material
 
 KEY = jax.random.key(0)
 RADIUS, SHEET, PUNCH, LOAD = 0.05, 2e-5, 0.012, 15.0
@@ -41,7 +41,7 @@ def errors(electrodes, place, exact, levels) -> list[float]:
     for number in levels:
         model = ForwardModel(Disk(RADIUS).mesh(num_points=number), electrodes, PROTOCOL)
         skin = PressedSkin(KEY, model, VELOSTAT, conductivity=SHEET)
-        touched, conductivity = skin.touched([Press(Disc(2 * PUNCH), LOAD, place)]), np.array(skin.conductivity)
+        touched, conductivity = skin.touched([Press(DiscIndenter(2 * PUNCH), LOAD, place)]), np.array(skin.conductivity)
         conductivity[touched.cells[0]] *= 1 + np.asarray(touched.change[0])  # frames are those of such a model
         change = np.asarray(model.voltages(conductivity)) - skin.rest()
         found.append(np.linalg.norm(change - exact) / np.linalg.norm(exact))

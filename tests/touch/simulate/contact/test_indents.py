@@ -8,12 +8,12 @@ from jeit.design import Skin
 from jeit.layout import named_layout
 from jeit.mesh import Rectangle, measures
 from jeit.touch.simulate import (
-    Bar,
-    Disc,
+    BarIndenter,
+    DiscIndenter,
     Indent,
     IndentDraws,
     IndentSet,
-    ball,
+    ball_indenter,
     depth_maps,
     indented_cells,
     open_presses,
@@ -36,7 +36,7 @@ def sheet():
 def test_a_ball_leaves_a_cap(sheet):
     """Of π d² (R − d / 3)."""
     places = image_places(sheet, 240, 240)
-    (depth,) = depth_maps([[Indent(ball(0.02), 4e-3, (0.003, -0.004))]], places)
+    (depth,) = depth_maps([[Indent(ball_indenter(0.02), 4e-3, (0.003, -0.004))]], places)
     volume = depth.sum() * (0.06 / 240) ** 2
     assert volume == pytest.approx(np.pi * 4e-3**2 * (0.01 - 4e-3 / 3), rel=1e-3)
     assert np.linalg.norm(places.reshape(-1, 2)[depth.argmax()] - (0.003, -0.004)) < 0.3e-3
@@ -44,7 +44,7 @@ def test_a_ball_leaves_a_cap(sheet):
 
 def test_turned_and_several(sheet):
     places = image_places(sheet, 120, 120)
-    bar = Bar(0.03, 0.006)
+    bar = BarIndenter(0.03, 0.006)
     along, across = (depth_maps([[Indent(bar, 2e-3, angle=one)]], places)[0] for one in (0.0, np.pi / 2))
     assert np.allclose(along, across.T)
     both = depth_maps([[Indent(bar, 2e-3), Indent(bar, 3e-3, angle=np.pi / 2)]], places)[0]
@@ -56,7 +56,7 @@ def test_what_is_indented_conducts_no_more(num_layers):
     """The share of a skin's volume that cells lose is that of the indented body."""
     skin = made(num_layers)
     depth = 4e-3
-    cells = indented_cells(skin, [[Indent(Disc(0.03), depth)]])
+    cells = indented_cells(skin, [[Indent(DiscIndenter(0.03), depth)]])
     lost = -np.sum(np.asarray(cells.change) * np.asarray(measures(skin.model.mesh))[np.asarray(cells.cells)])
     whole = float(skin.outline.area) * (float(skin.thickness) if num_layers else 1.0)
     wanted = np.pi * 0.015**2 * depth / (0.06**2 * float(skin.thickness))
@@ -65,7 +65,7 @@ def test_what_is_indented_conducts_no_more(num_layers):
 
 def test_changes_are_those_of_the_model(sheet):
     """Against the model solved anew; and none where nothing is touched."""
-    touch = [Indent(ball(0.02), 5e-3, (0.004, 0.002)), Indent(Disc(0.01), 2e-3, (-0.015, 0.0))]
+    touch = [Indent(ball_indenter(0.02), 5e-3, (0.004, 0.002)), Indent(DiscIndenter(0.01), 2e-3, (-0.015, 0.0))]
     cells = indented_cells(sheet, [touch])
     conductivity = np.full(sheet.model.mesh.num_cells, float(sheet.model_conductivity))
     conductivity[np.asarray(cells.cells[0])] *= 1 + np.asarray(cells.change[0])
@@ -77,7 +77,7 @@ def test_changes_are_those_of_the_model(sheet):
 
 @pytest.fixture
 def draws(sheet):
-    return IndentDraws([ball(0.015), Disc(0.01)], sheet.outline, (1e-3, 6e-3), margin=5e-3, at_once=2)
+    return IndentDraws([ball_indenter(0.015), DiscIndenter(0.01)], sheet.outline, (1e-3, 6e-3), margin=5e-3, at_once=2)
 
 
 def test_draws(draws):
@@ -91,7 +91,7 @@ def test_draws(draws):
 
 def test_a_set_goes_on(sheet, tmp_path):
     """Stopped after its first chunk, it ends with the same arrays."""
-    draws = IndentDraws([Disc(0.01)], sheet.outline, (1e-3, 6e-3), margin=5e-3, at_once=2)
+    draws = IndentDraws([DiscIndenter(0.01)], sheet.outline, (1e-3, 6e-3), margin=5e-3, at_once=2)
     indents = IndentSet(sheet, draws, 8, seed=3, shape=(12, 12), chunk=4)
     whole = simulate_presses(indents, tmp_path / "whole.zarr")
 
@@ -121,15 +121,15 @@ def test_a_set_goes_on(sheet, tmp_path):
     ("make", "said"),
     [
         (lambda skin, draws: Indent("ball", 1e-3), "indenter must be an indenter"),
-        (lambda skin, draws: Indent(Disc(0.01), 0.0), "depth must be a positive length"),
-        (lambda skin, draws: IndentDraws([Disc(0.01)], skin.outline, (1.0, 8.0)), "were millimetres given"),
-        (lambda skin, draws: indented_cells(skin, [[Indent(Disc(0.01), 0.02)]]), "indent it less"),
+        (lambda skin, draws: Indent(DiscIndenter(0.01), 0.0), "depth must be a positive length"),
+        (lambda skin, draws: IndentDraws([DiscIndenter(0.01)], skin.outline, (1.0, 8.0)), "were millimetres given"),
+        (lambda skin, draws: indented_cells(skin, [[Indent(DiscIndenter(0.01), 0.02)]]), "indent it less"),
         (lambda skin, draws: indented_cells("skin", []), "skin must be a Skin"),
         (lambda skin, draws: IndentSet(skin, draws, 0), "number must be a whole number"),
         (lambda skin, draws: IndentSet(skin, draws, 1, seed=-1), "seed must be a whole number"),
         (lambda skin, draws: IndentSet(skin, "draws", 1), "draws must be IndentDraws"),
         (
-            lambda skin, draws: IndentSet(skin, IndentDraws([Disc(0.01)], skin.outline, (1e-3, 0.02)), 1),
+            lambda skin, draws: IndentSet(skin, IndentDraws([DiscIndenter(0.01)], skin.outline, (1e-3, 0.02)), 1),
             "draw less depth",
         ),
         (lambda skin, draws: simulate_presses("set", "here"), "presses must be a PressSet"),

@@ -18,12 +18,12 @@ from jeit.layout import ring
 from jeit.mesh import Disk
 from jeit.protocol import adjacent
 from jeit.touch.simulate.contact import (
-    Bar,
-    Disc,
+    BarIndenter,
+    DiscIndenter,
     PressDraws,
     PressedSkin,
     PressSet,
-    ball,
+    ball_indenter,
     material,
     open_presses,
     press_sets,
@@ -62,12 +62,12 @@ simulate_presses(presses, sys.argv[2])
 """
 
 # As they touch every cell, one program serves all chunks.
-EVERYWHERE = Disc(0.3)
+EVERYWHERE = DiscIndenter(0.3)
 
 
 def small_set(**options) -> PressSet:
     model = ForwardModel(Disk(0.05).mesh(num_points=150), BoundaryElectrodes(ring(0.05, 8), 0.008, 0.2), adjacent(8))
-    draws = PressDraws([EVERYWHERE, Disc(0.2)], Disk(0.05), (0.5, 5.0), margin=0.01, at_once=2)
+    draws = PressDraws([EVERYWHERE, DiscIndenter(0.2)], Disk(0.05), (0.5, 5.0), margin=0.01, at_once=2)
     return PressSet(PressedSkin(KEY, model, material("velostat")), draws, 16, chunk=8, **options)
 
 
@@ -94,7 +94,7 @@ def solved(monkeypatch):
 
 
 def test_draws_are_spread_as_said():
-    draws = PressDraws([ball(0.02), Bar(0.03, 0.01)], Disk(0.05), (0.1, 10.0), margin=0.01, at_once=3)
+    draws = PressDraws([ball_indenter(0.02), BarIndenter(0.03, 0.01)], Disk(0.05), (0.1, 10.0), margin=0.01, at_once=3)
     touches = draws.draw(KEY, 3000)
     assert np.bincount([len(touch) for touch in touches]) == pytest.approx([0, 1000, 1000, 1000], abs=90)
     presses = [press for touch in touches for press in touch]
@@ -201,17 +201,20 @@ def test_workers_simulate_the_same(presses, whole, tmp_path):
     [
         (lambda path: PressDraws([], Disk(0.05), (0.1, 1.0)), "indenters: give one"),
         (lambda path: PressDraws([0.1], Disk(0.05), (0.1, 1.0)), r"indenters\[0\] must be"),
-        (lambda path: PressDraws([ball(0.01)], 0.05, (0.1, 1.0)), "outline must be"),
-        (lambda path: PressDraws([ball(0.01)], Disk(0.05), (1.0, 0.1)), "load must be the least"),
-        (lambda path: PressDraws([ball(0.01)], Disk(0.05), (0.1, 1.0), margin=0.06), "margin is 60 mm"),
-        (lambda path: PressDraws([ball(0.01)], Disk(0.05), (0.1, 1.0), at_once=0), "at_once must be"),
-        (lambda path: PressDraws(ball(0.01), Disk(0.05), (0.1, 1.0)), "indenters must be a list"),
-        (lambda path: PressDraws([ball(0.01)], Disk(0.05), 1.0), "load must be the least"),
-        (lambda path: PressDraws([ball(0.01)], Disk(0.05), ("a", "b")), "load must be the least"),
-        (lambda path: PressDraws([ball(0.01)], Disk(0.05), (0.1, 1.0), margin=-0.01), "margin must be metres"),
+        (lambda path: PressDraws([ball_indenter(0.01)], 0.05, (0.1, 1.0)), "outline must be"),
+        (lambda path: PressDraws([ball_indenter(0.01)], Disk(0.05), (1.0, 0.1)), "load must be the least"),
+        (lambda path: PressDraws([ball_indenter(0.01)], Disk(0.05), (0.1, 1.0), margin=0.06), "margin is 60 mm"),
+        (lambda path: PressDraws([ball_indenter(0.01)], Disk(0.05), (0.1, 1.0), at_once=0), "at_once must be"),
+        (lambda path: PressDraws(ball_indenter(0.01), Disk(0.05), (0.1, 1.0)), "indenters must be a list"),
+        (lambda path: PressDraws([ball_indenter(0.01)], Disk(0.05), 1.0), "load must be the least"),
+        (lambda path: PressDraws([ball_indenter(0.01)], Disk(0.05), ("a", "b")), "load must be the least"),
+        (lambda path: PressDraws([ball_indenter(0.01)], Disk(0.05), (0.1, 1.0), margin=-0.01), "margin must be metres"),
         (lambda path: small_set().draws.draw(jax.random.key(0), 2.5), "number must be a whole number of touches"),
         (lambda path: PressSet(None, None, 1), "skin must be"),
-        (lambda path: PressSet(small_set().skin, PressDraws([ball(0.01)], Disk(0.05), (0.1, 1e4)), 1), "into a layer"),
+        (
+            lambda path: PressSet(small_set().skin, PressDraws([ball_indenter(0.01)], Disk(0.05), (0.1, 1e4)), 1),
+            "into a layer",
+        ),
         (lambda path: PressSet(small_set().skin, None, 1), "draws must be"),
         (lambda path: PressSet(small_set().skin, small_set().draws, 0), "number must be"),
         (lambda path: small_set(seed=1.5), "seed must be a whole number"),

@@ -13,8 +13,8 @@ from jeit.layout import named_layout, ring
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import adjacent
 from jeit.touch.simulate.contact import (
-    Bar,
-    Disc,
+    BarIndenter,
+    DiscIndenter,
     Foundation,
     HalfSpace,
     JoinedIndenters,
@@ -22,7 +22,7 @@ from jeit.touch.simulate.contact import (
     PlacedIndenter,
     Press,
     PressedSkin,
-    ball,
+    ball_indenter,
     material,
 )
 from jeit.touch.simulate.contact.cell_pressure import pressed_cells
@@ -36,10 +36,15 @@ STILL = dataclasses.replace(
     contact_walk=0.0, noise=0.0, gain_spread=0.0,
 )  # fmt: skip
 PRESSES = [
-    Press(ball(0.015), 2.0, (0.01, 0.02)),
-    Press(Disc(0.016), 5.0, (-0.02, 0.0)),
-    Press(Bar(0.03, 0.004), 3.0, (0.0, -0.02), 0.5),
-    Press(JoinedIndenters(Disc(0.006), PlacedIndenter(Disc(0.006), (0.012, 0.0))), 1.0, (0.02, -0.01), -1.0),
+    Press(ball_indenter(0.015), 2.0, (0.01, 0.02)),
+    Press(DiscIndenter(0.016), 5.0, (-0.02, 0.0)),
+    Press(BarIndenter(0.03, 0.004), 3.0, (0.0, -0.02), 0.5),
+    Press(
+        JoinedIndenters(DiscIndenter(0.006), PlacedIndenter(DiscIndenter(0.006), (0.012, 0.0))),
+        1.0,
+        (0.02, -0.01),
+        -1.0,
+    ),
 ]
 
 
@@ -70,7 +75,7 @@ def anew(skin, touched):
 def test_cells_carry_the_load(model, support):
     """To rounding: also what hangs over the edge, and what falls between the samples."""
     samples = Samples.from_mesh(model.mesh)
-    presses = [*PRESSES, Press(Disc(0.01), 1.0, (0.049, 0.0)), Press(ball(0.001), 1e-3, (0.0123, 0.0))]
+    presses = [*PRESSES, Press(DiscIndenter(0.01), 1.0, (0.049, 0.0)), Press(ball_indenter(0.001), 1e-3, (0.0123, 0.0))]
     found = pressed_cells(samples, support, [(press,) for press in presses])
     carried = np.einsum("ncs,nc->n", found.pressure, samples.area[found.cells])
     np.testing.assert_allclose(carried, [press.load for press in presses], rtol=1e-12)
@@ -79,7 +84,7 @@ def test_cells_carry_the_load(model, support):
 
 def test_a_ball_beyond_the_edge_is_carried_by_all_that_it_touches(model):
     """Less of the skin is under it, so that it comes down farther, and touches more."""
-    samples, layer, shape = Samples.from_mesh(model.mesh), Foundation(1e6, 2e-3), ball(0.02)
+    samples, layer, shape = Samples.from_mesh(model.mesh), Foundation(1e6, 2e-3), ball_indenter(0.02)
     found = pressed_cells(samples, layer, [(Press(shape, 2.0, (0.053, 0.0)),)])
     points = (samples.points - np.array([0.053, 0.0])).reshape(1, -1, 2)
     area = np.repeat(samples.area, samples.points.shape[1])[None]
@@ -92,9 +97,9 @@ def test_a_ball_beyond_the_edge_is_carried_by_all_that_it_touches(model):
 @pytest.mark.parametrize(
     ("shape", "place", "spread"),
     [
-        (PlacedIndenter(Disc(0.0005), (0.02, 0.0)), (0.02, 0.0), 0.0),
-        (PlacedIndenter(Bar(0.04, 0.0004), (0.0, 0.003), 0.1), (0.0, 0.003), 0.04 / np.sqrt(12)),
-        (Disc(1e-9), (0.0, 0.0), 0.0),
+        (PlacedIndenter(DiscIndenter(0.0005), (0.02, 0.0)), (0.02, 0.0), 0.0),
+        (PlacedIndenter(BarIndenter(0.04, 0.0004), (0.0, 0.003), 0.1), (0.0, 0.003), 0.04 / np.sqrt(12)),
+        (DiscIndenter(1e-9), (0.0, 0.0), 0.0),
     ],
     ids=["moved in its frame", "an edge", "a point"],
 )
@@ -135,7 +140,7 @@ def test_frames_are_those_of_the_model_solved_anew(skin):
 def test_a_layer_is_pressed_too():
     layer = Skin.create(named_layout("grid-3x3", Rectangle(0.08, 0.08)), num_layers=1, cell_size=0.008)
     skin = PressedSkin(KEY, layer.model, dataclasses.replace(material("hydrogel"), noise=0.0, gain_spread=0.0))
-    presses = [Press(ball(0.04), 3.0, (0.015, 0.01)), Press(Disc(0.03), 3.0, (-0.015, 0.0))]
+    presses = [Press(ball_indenter(0.04), 3.0, (0.015, 0.01)), Press(DiscIndenter(0.03), 3.0, (-0.015, 0.0))]
     samples = Samples.from_mesh(layer.model.mesh)
     cells, pressure = pressed_cells(samples, skin.material.support, [(press,) for press in presses])
     np.testing.assert_allclose(np.einsum("ncs,nc->n", pressure, samples.area[cells]), 3.0, rtol=1e-12)
@@ -145,7 +150,7 @@ def test_a_layer_is_pressed_too():
 
 
 def test_several_at_once_press_as_their_sum(skin):
-    near = [Press(Disc(0.01), 1.0, (0.0, 0.0)), Press(Disc(0.01), 2.0, (0.004, 0.0))]
+    near = [Press(DiscIndenter(0.01), 1.0, (0.0, 0.0)), Press(DiscIndenter(0.01), 2.0, (0.004, 0.0))]
     samples, support = Samples.from_mesh(skin.model.mesh), STILL.support
     both = pressed_cells(samples, support, [tuple(near)])
     total = np.zeros((skin.model.mesh.num_cells, samples.points.shape[1]))
@@ -172,7 +177,7 @@ def test_a_stroke_leaves_a_trace_that_fades(model):
     skin = PressedSkin(KEY, model, dataclasses.replace(STILL, creep=((0.2, 1.0),)))
     seconds = np.array([0.0, 0.5, 1.0, 1.5, 1.6, 3.6, 60.0])
     place = np.array([[-0.02, 0.0], [0.0, 0.0], [0.02, 0.0], [0.02, 0.01], [0, 0], [0, 0], [0, 0]])
-    stroke = MovingPress(Disc(0.01), [3.0, 3.0, 3.0, 3.0, 0.0, 0.0, 0.0], place)
+    stroke = MovingPress(DiscIndenter(0.01), [3.0, 3.0, 3.0, 3.0, 0.0, 0.0, 0.0], place)
     touched = skin.touched_in_time(stroke, seconds)
     found = skin.record(KEY, stroke, seconds)
     exact = anew(skin, touched)
@@ -203,7 +208,7 @@ def test_drift_is_that_of_another_skin(model):
     other = ForwardModel(model.mesh, electrodes, model.protocol)
     exact = np.asarray(other.voltages(skin.conductivity * np.exp(0.03)))
     assert np.abs(found - exact).max() < 2e-3 * np.abs(exact - skin.rest()).max()
-    recorded = skin.record(KEY, MovingPress(Disc(0.01), [0.0, 1.0]), [300.0, 301.0])[0]
+    recorded = skin.record(KEY, MovingPress(DiscIndenter(0.01), [0.0, 1.0]), [300.0, 301.0])[0]
     np.testing.assert_allclose(recorded, found, rtol=1e-12)
     alone = np.asarray(other.voltages(skin.conductivity)) - skin.rest()
     slope = skin._contact_slope.sum(axis=0)
@@ -229,7 +234,7 @@ def test_an_untouched_skin_drifts_in_time(model):
     assert film.shape == (20, model.protocol.num_measurements)
     gone = np.linalg.norm(film - skin.rest(), axis=1)
     assert gone[-5:].mean() > 3 * gone[0]  # drift, not noise alone
-    light = skin.record(KEY, MovingPress(Disc(0.01), np.full(20, 1e-9)), seconds)
+    light = skin.record(KEY, MovingPress(DiscIndenter(0.01), np.full(20, 1e-9)), seconds)
     np.testing.assert_allclose(film, light, rtol=1e-6, atol=1e-9)
 
 
@@ -237,8 +242,14 @@ def test_a_half_space_is_not_pressed_beside_its_edge(model):
     """Its free contact is cut off at the edge: what is left of it would be scaled up to carry all of the load."""
     skin = PressedSkin(KEY, model, dataclasses.replace(STILL, support=HalfSpace(3e5, pixels=24)))
     with pytest.raises(ValueError, match="of its pressure would lie on the skin"):
-        skin.touched([Press(ball(0.02), 2.0, (0.052, 0.0))])
-    skin.touched([Press(ball(0.02), 2.0, (0.0495, 0.0)), Press(ball(0.001), 1e-3, (0.03, 0.0)), Press(Disc(1e-9), 1.0)])
+        skin.touched([Press(ball_indenter(0.02), 2.0, (0.052, 0.0))])
+    skin.touched(
+        [
+            Press(ball_indenter(0.02), 2.0, (0.0495, 0.0)),
+            Press(ball_indenter(0.001), 1e-3, (0.03, 0.0)),
+            Press(DiscIndenter(1e-9), 1.0),
+        ]
+    )
 
 
 @pytest.mark.parametrize(
@@ -247,25 +258,34 @@ def test_a_half_space_is_not_pressed_beside_its_edge(model):
         (lambda skin: skin.frames(0, PRESSES), "key must be"),
         (lambda skin: skin.frames(KEY, PRESSES[0]), "presses must be a list"),
         (lambda skin: skin.frames(KEY, []), "presses: give one"),
-        (lambda skin: skin.frames(KEY, [Disc(0.01)]), r"presses\[0\] must be a Press"),
+        (lambda skin: skin.frames(KEY, [DiscIndenter(0.01)]), r"presses\[0\] must be a Press"),
         (lambda skin: skin.frames(KEY, PRESSES, held=-1.0), "held must be seconds"),
         (lambda skin: skin.frames(KEY, PRESSES, elapsed=np.nan), "elapsed must be seconds"),
-        (lambda skin: skin.frames(KEY, [Press(Disc(0.01), 1.0, (20.0, 0.0))]), "lie off the skin"),
-        (lambda skin: skin.frames(KEY, [Press(Disc(0.01), 1.0, (0.0552, 0.0))]), r"\(55.2, 0\) mm touches no skin"),
-        (lambda skin: skin.frames(KEY, [Press(Disc(1e-4), 100.0)]), "into a layer 2 mm thick"),
-        (lambda skin: skin.frames(KEY, [Press(Disc(0.004), 100.0)]), "into a layer 2 mm thick"),
-        (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [1.0, 1.0]), [1.0, 0.0]), "nor fall"),
-        (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [1.0, 1.0]), [1.0]), "has 2 frames"),
-        (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [0.0, 0.0]), [0.0, 1.0]), "no press has any load"),
+        (lambda skin: skin.frames(KEY, [Press(DiscIndenter(0.01), 1.0, (20.0, 0.0))]), "lie off the skin"),
+        (
+            lambda skin: skin.frames(KEY, [Press(DiscIndenter(0.01), 1.0, (0.0552, 0.0))]),
+            r"\(55.2, 0\) mm touches no skin",
+        ),
+        (lambda skin: skin.frames(KEY, [Press(DiscIndenter(1e-4), 100.0)]), "into a layer 2 mm thick"),
+        (lambda skin: skin.frames(KEY, [Press(DiscIndenter(0.004), 100.0)]), "into a layer 2 mm thick"),
+        (lambda skin: skin.record(KEY, MovingPress(DiscIndenter(0.01), [1.0, 1.0]), [1.0, 0.0]), "nor fall"),
+        (lambda skin: skin.record(KEY, MovingPress(DiscIndenter(0.01), [1.0, 1.0]), [1.0]), "has 2 frames"),
+        (
+            lambda skin: skin.record(KEY, MovingPress(DiscIndenter(0.01), [0.0, 0.0]), [0.0, 1.0]),
+            "no press has any load",
+        ),
         (lambda skin: skin.record(KEY, PRESSES[0], [0.0]), "motions"),
-        (lambda skin: MovingPress(Disc(0.01), [1.0, -1.0]), "loads, in newtons"),
-        (lambda skin: skin.record(KEY, MovingPress(Disc(0.01), [1.0, 1.0]), ["a", "b"]), "seconds must be times"),
-        (lambda skin: skin.touched_in_time(MovingPress(Disc(0.01), [1.0, 1.0]), [1.0, 0.0]), "nor fall"),
-        (lambda skin: MovingPress(Disc(0.01), [1.0, 1.0], 0.01), r"position must be \(x, y\)"),
-        (lambda skin: MovingPress(Disc(0.01), [1.0, 1.0], np.zeros((2, 1))), r"it has shape \(2, 1\)"),
-        (lambda skin: MovingPress(Disc(0.01), ["1", "2"]), "load must be newtons"),
-        (lambda skin: MovingPress(Disc(0.01), [1.0, 1.0], np.zeros((3, 2))), "for T frames"),
-        (lambda skin: Press(Disc(0.01), -1.0), "load must be positive"),
+        (lambda skin: MovingPress(DiscIndenter(0.01), [1.0, -1.0]), "loads, in newtons"),
+        (
+            lambda skin: skin.record(KEY, MovingPress(DiscIndenter(0.01), [1.0, 1.0]), ["a", "b"]),
+            "seconds must be times",
+        ),
+        (lambda skin: skin.touched_in_time(MovingPress(DiscIndenter(0.01), [1.0, 1.0]), [1.0, 0.0]), "nor fall"),
+        (lambda skin: MovingPress(DiscIndenter(0.01), [1.0, 1.0], 0.01), r"position must be \(x, y\)"),
+        (lambda skin: MovingPress(DiscIndenter(0.01), [1.0, 1.0], np.zeros((2, 1))), r"it has shape \(2, 1\)"),
+        (lambda skin: MovingPress(DiscIndenter(0.01), ["1", "2"]), "load must be newtons"),
+        (lambda skin: MovingPress(DiscIndenter(0.01), [1.0, 1.0], np.zeros((3, 2))), "for T frames"),
+        (lambda skin: Press(DiscIndenter(0.01), -1.0), "load must be positive"),
         (lambda skin: PressedSkin(KEY, skin, STILL), "model must be"),
         (lambda skin: PressedSkin(KEY, skin.model, "velostat"), "material must be"),
         (lambda skin: PressedSkin(KEY, skin.model, STILL, conductivity=-1.0), "must be positive"),

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from jeit.touch.simulate.contact import (
-    Bar,
-    DepthMap,
-    Disc,
+    BarIndenter,
+    DepthMapIndenter,
+    DiscIndenter,
     Foundation,
     HalfSpace,
     JoinedIndenters,
     PlacedIndenter,
-    Prism,
-    Ring,
-    ball,
+    PrismIndenter,
+    RingIndenter,
+    ball_indenter,
 )
 from jeit.touch.simulate.contact.half_space import displacement_function
 from jeit.touch.simulate.contact.indenters import AbstractIndenter
@@ -23,14 +23,16 @@ RADIUS, LOAD = 0.01, 0.05
 MIDDLE = np.zeros((1, 2))
 RUBBER = HalfSpace(1e6, 0.5)
 LAYER = Foundation(1e6, 3e-3)
-TWO = JoinedIndenters(PlacedIndenter(Disc(0.01), (0.01, 0.0)), PlacedIndenter(ball(0.02), (-0.01, 0.002)))
-ROUGH = DepthMap(1e-4 * np.random.default_rng(0).normal(size=(24, 24)), 5e-4)
+TWO = JoinedIndenters(
+    PlacedIndenter(DiscIndenter(0.01), (0.01, 0.0)), PlacedIndenter(ball_indenter(0.02), (-0.01, 0.002))
+)
+ROUGH = DepthMapIndenter(1e-4 * np.random.default_rng(0).normal(size=(24, 24)), 5e-4)
 SHAPES = {
-    "disc": Disc(0.02),
-    "ring": Ring(0.02, 0.012),
-    "bar": Bar(0.03, 0.004),
-    "prism": Prism(0.03, 0.02, 0.01),
-    "ball": ball(0.02),
+    "disc": DiscIndenter(0.02),
+    "ring": RingIndenter(0.02, 0.012),
+    "bar": BarIndenter(0.03, 0.004),
+    "prism": PrismIndenter(0.03, 0.02, 0.01),
+    "ball": ball_indenter(0.02),
     "two": TWO,
 }
 
@@ -76,7 +78,7 @@ def test_a_flat_punch_on_a_half_space():
     errors = []
     for pixels in (32, 64, 128):
         support = HalfSpace(1e6, 0.5, pixels)
-        found = support.pressure(Disc(2 * RADIUS), LOAD)
+        found = support.pressure(DiscIndenter(2 * RADIUS), LOAD)
         errors.append(abs(2 * RADIUS * support.plane_modulus * found.approach / LOAD - 1))
         assert found.at(MIDDLE) == pytest.approx(LOAD / (2 * np.pi * RADIUS**2), rel=0.03)
     assert errors[-1] < 4e-3
@@ -98,7 +100,7 @@ def test_the_surface_sinks_under_a_pressed_square():
 @pytest.mark.parametrize("load", [1e-3, 1.0, 8.0])
 def test_a_ball_on_a_foundation(load):
     """The cap's volume: F = k π δ² (R − δ/3), and k π R δ² where δ ≪ R."""
-    found = LAYER.pressure(ball(2 * RADIUS), load)
+    found = LAYER.pressure(ball_indenter(2 * RADIUS), load)
     depth = found.approach
     assert LAYER.stiffness * np.pi * depth**2 * (RADIUS - depth / 3) == pytest.approx(load, rel=2e-4)
     assert found.reach == pytest.approx(np.sqrt(depth * (2 * RADIUS - depth)), rel=0.05)
@@ -108,8 +110,8 @@ def test_a_ball_on_a_foundation(load):
 def test_a_flat_punch_on_a_foundation():
     """Uniform pressure F / A; a hole in it raises it."""
     area = np.pi * RADIUS**2
-    assert float(LAYER.pressure(Disc(2 * RADIUS), 20.0).at(MIDDLE)[0]) == pytest.approx(20 / area, rel=5e-3)
-    ring = LAYER.pressure(Ring(2 * RADIUS, RADIUS), 20.0)
+    assert float(LAYER.pressure(DiscIndenter(2 * RADIUS), 20.0).at(MIDDLE)[0]) == pytest.approx(20 / area, rel=5e-3)
+    ring = LAYER.pressure(RingIndenter(2 * RADIUS, RADIUS), 20.0)
     assert float(ring.at(MIDDLE)[0]) == 0
     assert float(ring.at(np.array([0.0, 0.8 * RADIUS]))) == pytest.approx(20 / (0.75 * area), rel=5e-3)
 
@@ -148,11 +150,11 @@ def test_bodies_do_not_overlap(shape):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: LAYER.pressure(ball(0.01), 0.0), "load must be positive, in newtons"),
-        (lambda: RUBBER.pressure(ball(0.01), np.nan), "load must be positive"),
-        (lambda: LAYER.pressure(Disc(0.01), 100.0), "presses the indenter 3.8. mm into a layer 3 mm thick"),
-        (lambda: LAYER.pressure(Bar(0.04, 1e-5), 1.0), "thinner than a pixel"),
-        (lambda: RUBBER.pressure(PlacedIndenter(Disc(1e-5), (0.02, 0.0)), 1.0), "thinner than a pixel"),
+        (lambda: LAYER.pressure(ball_indenter(0.01), 0.0), "load must be positive, in newtons"),
+        (lambda: RUBBER.pressure(ball_indenter(0.01), np.nan), "load must be positive"),
+        (lambda: LAYER.pressure(DiscIndenter(0.01), 100.0), "presses the indenter 3.8. mm into a layer 3 mm thick"),
+        (lambda: LAYER.pressure(BarIndenter(0.04, 1e-5), 1.0), "thinner than a pixel"),
+        (lambda: RUBBER.pressure(PlacedIndenter(DiscIndenter(1e-5), (0.02, 0.0)), 1.0), "thinner than a pixel"),
         (lambda: Foundation(-1.0, 1e-3), "modulus must be positive"),
         (lambda: Foundation(1e6, 0.0), "thickness must be"),
         (lambda: HalfSpace(1e6, 0.6), "poisson must be"),

@@ -12,8 +12,8 @@ from jeit.forward import ForwardModel
 from jeit.layout import ring
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import adjacent, two_terminal
-from jeit.touch.simulate import Disc, MovingPress, PressedSkin, material
-from jeit.touch.simulate.damage import FAULTS, Cut, ElectrodeFault, Mishap, draw_cut, mended, record_mishaps
+from jeit.touch.simulate import DiscIndenter, MovingPress, PressedSkin, material
+from jeit.touch.simulate.damage import FAULTS, Cut, ElectrodeFault, Mishap, draw_cut, mend_cut, record_mishaps
 
 WIDTH, HEIGHT = 0.06, 0.03
 
@@ -108,10 +108,10 @@ def test_a_recording_goes_on_through_its_mishaps():
     model, film = disk_model(cut, 400), dataclasses.replace(material("velostat"), noise=0.0)
     skin = PressedSkin(jax.random.key(0), model, film)
     damaged = eqx.tree_at(lambda one: one.conductivity, skin, cut.conductivity(model.mesh, skin.conductivity))
-    values, glued = mended(model.mesh, skin.conductivity, cut, film, 1.05)
+    values, glued = mend_cut(model.mesh, skin.conductivity, cut, film, 1.05)
     whole = eqx.tree_at(lambda one: (one.conductivity, one.material), skin, (values, glued))
     seconds = np.arange(12) / 2
-    press = MovingPress(Disc(0.012), np.where((seconds > 1) & (seconds < 5), 2.0, 0.0), (0.0, -0.02))
+    press = MovingPress(DiscIndenter(0.012), np.where((seconds > 1) & (seconds < 5), 2.0, 0.0), (0.0, -0.02))
     mishaps = [Mishap(2.0, damaged), Mishap(4.0, whole)]
     found = record_mishaps(jax.random.key(1), skin, press, seconds, mishaps)
     plain = record_mishaps(jax.random.key(1), skin, press, seconds, [])

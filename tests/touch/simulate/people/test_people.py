@@ -13,7 +13,7 @@ from jeit.forward import ForwardModel
 from jeit.layout import perimeter
 from jeit.mesh import Disk, Rectangle
 from jeit.protocol import reference_electrode
-from jeit.touch.simulate import Disc, MovingPress, PressedSkin, material
+from jeit.touch.simulate import DiscIndenter, MovingPress, PressedSkin, material
 from jeit.touch.simulate.people import GESTURES, MANNERS, TRAITS, Person, simulate_gestures
 
 KEY = jax.random.key(0)
@@ -105,8 +105,8 @@ def test_recordings_together_are_those_of_each():
     """Without noise and drift, which have keys of their own."""
     still = still_skin()
     seconds = np.arange(6) / 60
-    press = MovingPress(Disc(0.03), [0, 1, 2, 2, 1, 0], (0.05, 0.02))
-    two = [press, MovingPress(Disc(0.02), [0, 0, 1, 1, 0, 0], (-0.06, 0.0))]
+    press = MovingPress(DiscIndenter(0.03), [0, 1, 2, 2, 1, 0], (0.05, 0.02))
+    two = [press, MovingPress(DiscIndenter(0.02), [0, 0, 1, 1, 0, 0], (-0.06, 0.0))]
     recordings = [(press, seconds), ([], seconds[:3]), (two, seconds + 5.0)]
     for one, (motion, times) in zip(still.record_each(KEY, recordings), recordings, strict=True):
         scale = np.abs(still.rest()).max()
