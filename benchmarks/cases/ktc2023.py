@@ -82,6 +82,6 @@ CASE = Case(
     "the Kuopio Tomography Challenge's score table, on measured data",
     run,
     4,
-    page=("docs/how-to-choose-a-method.md", "ktc2023"),
+    page=("docs/explanation/methods.md", "ktc2023"),
     timed=False,
 )

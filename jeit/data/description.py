@@ -86,7 +86,7 @@ class TableLayout:
 @dataclass(frozen=True)
 class Description:
     """A checked description of measured data, with the body, the electrodes and the protocol, as `load_description`
-    reads it from a TOML file. docs/data.md explains its sections.
+    reads it from a TOML file. docs/reference/description.md explains its sections.
 
     **Fields**: `origin`: the file, for messages; `title`; `domain`: the body, or None; `electrodes`: the electrodes, or
     None; `layout`: how a table holds the voltages; `notes`: assumptions, in sentences; `protocol_section`: the table

@@ -184,7 +184,7 @@ def find_description(
         raise ValueError(
             f"{path.name}: no protocol of common kinds has as many channels{wanted} as there are numbers: "
             f"{numbers.shape}. Are there columns of other things? Otherwise write a description with your own "
-            "[protocol], see docs/data.md."
+            "[protocol], see docs/reference/description.md."
         )
     found.sort(key=lambda one: np.hypot(one.spread, 0.3 if one.reciprocity is None else one.reciprocity))
     progress("uniform body")

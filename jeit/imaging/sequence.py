@@ -88,7 +88,7 @@ def image_sequence(
       early.
     - `progress`: called with the name of each step when it begins.
 
-    Spikes in single channels are replaced by what other channels determine (`jeit.data.imageable.mask_spikes`).
+    Spikes in single channels are replaced by what other channels determine (`jeit.data.mask_spikes`).
     Channels missing in more than half of the frames are not used; frames that lack any other channel are refused. The
     images need four bytes per cell and frame. Raises `ValueError` as `image_difference`, for a measurement with
     one frame, for an iterative method, and for images that would not fit in memory.

@@ -20,7 +20,7 @@ import jax
 def take_double_precision() -> None:
     """Set JAX to double precision: a light touch changes voltages by 1e-4, for which single precision is not accurate
     enough. If the user has set JAX_ENABLE_X64, it takes precedence; single precision then raises a warning about its
-    cost (docs/numerics.md).
+    cost (docs/explanation/numerics.md).
 
     Products of matrices in single precision keep its 24 bits: on graphics processors JAX would round their factors to
     11 bits. A precision that the user has set (JAX_DEFAULT_MATMUL_PRECISION) takes precedence.

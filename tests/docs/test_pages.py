@@ -99,8 +99,11 @@ def _hearing(names: dict, folder: Path, printed: list[str]) -> None:
     assert (folder / "track.png").stat().st_size > 10_000
 
 
-def _instruments(names: dict, folder: Path, printed: list[str]) -> None:
+def _all_electrodes(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["differences"] == sorted(names["differences"], reverse=True)
+
+
+def _series(names: dict, folder: Path, printed: list[str]) -> None:
     assert abs(names["slow"].frequency - 0.3) < 0.01
     phase = float(printed[0].split()[-1])
     assert abs(phase - np.degrees(np.pi - 0.5)) < 5
@@ -113,7 +116,7 @@ def _pressing(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["data"].finished.values.all()
 
 
-def _reconstruction(names: dict, folder: Path, printed: list[str]) -> None:
+def _conductivity(names: dict, folder: Path, printed: list[str]) -> None:
     assert names["result"].status == "converged"
     assert 1.8e-3 < float(names["result"].conductivity.max()) < 5e-3  # S; the inclusion has 3 mS
 
@@ -130,7 +133,7 @@ def _readme(names: dict, folder: Path, printed: list[str]) -> None:
 
 
 def _looking_inside(names: dict, folder: Path, printed: list[str]) -> None:
-    made = ("overview.png", "slices.png", "oblique.png", "image.vtu", "filling.pvd", "filling.xdmf")
+    made = ("overview.png", "slices.png", "oblique.png")
     assert all((folder / name).stat().st_size > 200 for name in made)
     assert [line.split(",")[0] for line in printed[:2]] == ["conductive", "resistive"]
     for one, middle in zip(names["found"], ((0.03, -0.05, 0.1), (-0.03, 0.06, 0.06)), strict=True):
@@ -138,29 +141,59 @@ def _looking_inside(names: dict, folder: Path, printed: list[str]) -> None:
     assert printed[2].endswith("cm²")
 
 
+def _contact_impedance(names: dict, folder: Path, printed: list[str]) -> None:
+    conductivity, impedances = printed[0].split(" ", 1)
+    assert abs(float(conductivity) - 1.3e-3) < 1e-7
+    assert np.allclose([float(one) for one in impedances.strip("[]").split()], 0.02, rtol=1e-3)
+
+
+def _solid(names: dict, folder: Path, printed: list[str]) -> None:
+    found = [float(one) for one in printed[0].strip("[]").split()]
+    assert np.linalg.norm(np.array(found) - [0.06, 0.02, 0.1]) < 0.03
+
+
+def _error_bars(names: dict, folder: Path, printed: list[str]) -> None:
+    misfit, least, most = (float(one) for one in printed[0].split())
+    assert misfit < 1.5
+    assert 0 < least < most
+
+
+def _export(names: dict, folder: Path, printed: list[str]) -> None:
+    made = ("out/image.npz", "image.vtu", "filling.pvd", "filling.xdmf")
+    assert all((folder / name).stat().st_size > 200 for name in made)
+
+
 HOLDS: dict[str, Callable[[dict, Path, list[str]], None]] = {
-    "docs/looking-inside.md": _looking_inside,
+    "docs/how-to/look-inside-a-solid.md": _looking_inside,
+    "docs/how-to/drive-all-electrodes.md": _all_electrodes,
+    "docs/how-to/image-a-series.md": _series,
+    "docs/how-to/image-conductivity.md": _conductivity,
+    "docs/how-to/give-a-contact-impedance.md": _contact_impedance,
+    "docs/how-to/image-a-solid.md": _solid,
+    "docs/how-to/get-error-bars.md": _error_bars,
+    "docs/how-to/export-an-image.md": _export,
+    "docs/how-to/model-a-surface.md": _surfaces,
     "README.md": _readme,
     "docs/contacts.md": _contacts,
     "docs/design.md": _design,
     "docs/gestures.md": _gestures,
     "docs/health.md": _health,
     "docs/hearing.md": _hearing,
-    "docs/instruments.md": _instruments,
     "docs/pressing.md": _pressing,
-    "docs/reconstruction.md": _reconstruction,
-    "docs/surfaces.md": _surfaces,
 }
 
 
 # Pages whose files those after them use too, and then what a reader types first.
 TYPED = [
-    "docs/data.md",
+    "docs/how-to/read-a-file.md",
+    "docs/how-to/find-the-wiring.md",
+    "docs/how-to/check-a-measurement.md",
+    "docs/how-to/image-a-series.md",
     "docs/hearing.md",
     "docs/learning.md",
     "docs/gestures.md",
     "docs/health.md",
-    "docs/choosing-a-hyperparameter.md",
+    "docs/how-to/choose-the-hyperparameter.md",
     "README.md",
 ]
 # Minutes, until Ctrl-C, or files that no page makes; each has tests of its own. The image of the tank is that of
@@ -265,6 +298,16 @@ def test_links_lead_somewhere(page):
     """Links to files lead to files of the repository."""
     links = re.findall(r"\]\((?!\w+:|#)([^)#\s]+)", page.read_text("utf-8"))
     assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_benchmarks_find_their_place_in_the_pages():
+    """`python -m benchmarks --write` puts tables between two marks of a page."""
+    cases = "\n".join(path.read_text("utf-8") for path in (ROOT / "benchmarks" / "cases").rglob("*.py"))
+    places = re.findall(r'\bpage=\("([^"]+)", "([^"]+)"\)', cases)
+    assert len(places) >= 4
+    for page, mark in places:
+        text = (ROOT / page).read_text("utf-8")
+        assert text.count(f"<!-- {mark}:begin -->") == text.count(f"<!-- {mark}:end -->") == 1, f"{page}: {mark}"
 
 
 @pytest.mark.parametrize("page", GUIDES, ids=name_of)

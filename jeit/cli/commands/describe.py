@@ -61,7 +61,7 @@ def describe(
 
     Lists the explanations with the evidence for each, writes a commented description.toml, and images the first frame
     that differs from REFERENCE, or from the array --reference-key. In Python:
-    `jeit.imaging.describe.find_description`.
+    `jeit.imaging.find_description`.
     """
     from jeit.arguments import check_name
     from jeit.cli.commands.reconstruct import show

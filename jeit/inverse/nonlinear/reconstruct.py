@@ -132,7 +132,7 @@ def reconstruct(
     voltages, background, noise, λ, the prior's settings and all fields of the model. Derivatives are those of the
     minimum by the implicit function theorem with the full Hessian, even if the solver stopped early. With bounds, they
     are derivatives at fixed active bounds, so they are one-sided where a bound is just reached. See
-    docs/differentiable-images.md.
+    docs/explanation/derivatives.md.
 
     Tarantola, Inverse Problem Theory (SIAM 2005), ch. 3; Nocedal and Wright, Numerical Optimization (2006), ch. 10.
 
