@@ -1,4 +1,4 @@
-"""`jeit touch health`: damage told of recordings, on frames alone and with a skin described."""
+"""`jeit touch health`: damage detected in recordings, from frames alone and with a described skin."""
 
 import csv
 import json
@@ -31,7 +31,7 @@ SECONDS = np.arange(0, 30, 0.2)
 
 
 def touched(rng, number, rest, noise=1e-3):
-    """Frames of a made-up skin with a touch of eight frames in every thirty."""
+    """Frames of a synthetic skin with a touch of eight frames in every thirty."""
     frames = rest + noise * rng.normal(size=(number, len(rest)))
     for start in range(10, number - 20, 30):
         frames[start : start + 8] += 0.1 * np.exp(-((np.arange(len(rest)) - rng.uniform(0, len(rest))) ** 2) / 20)
@@ -59,7 +59,7 @@ def events(folder):
     return list(csv.DictReader((folder / "events.csv").read_text("utf-8").splitlines()))
 
 
-def test_frames_alone_are_enough(files, run, tmp_path):
+def test_damage_is_detected_from_frames_alone(files, run, tmp_path):
     status, output, error = run(
         "touch", "health", files / "hurt.csv", "--healthy", files / "healthy.csv", "--output", tmp_path
     )
@@ -93,7 +93,8 @@ def cut(tmp_path_factory):
     torn, centres = np.asarray(cut.conductivity(mesh, whole)), np.asarray(centroids(mesh))
 
     def seen(conductivity):
-        """Voltages at rest, and under touches at eight places, from one second to two of every four."""
+        """Voltages at rest and under touches at eight places; each touch lasts from second 1 to 2 of every four
+        seconds."""
         angle = 2.0 * np.arange(8)
         places = 0.03 * np.array([np.cos(angle), np.sin(angle)]).T
         spots = 1 + 0.5 * np.exp(-np.sum((centres - places[:, None]) ** 2, axis=-1) / 0.012**2)
@@ -113,8 +114,8 @@ def cut(tmp_path_factory):
     return folder
 
 
-def test_a_cut_is_drawn_on_a_described_skin(cut, run, tmp_path, monkeypatch):
-    """On a mesh whose edges are twice as long as usual, from fewer starts: its place to a centimetre."""
+def test_a_cut_is_located_on_a_described_skin(cut, run, tmp_path, monkeypatch):
+    """On a mesh with edges twice as long as usual, from fewer starting paths: the cut is located to a centimetre."""
     for name, value in (("_EDGE", 0.025), ("_FOLLOWED", 1), ("_DIRECTIONS", 4)):
         monkeypatch.setattr(f"jeit.touch.health.cut_path.{name}", value)
     status, output, error = run(
@@ -132,7 +133,7 @@ def test_a_cut_is_drawn_on_a_described_skin(cut, run, tmp_path, monkeypatch):
     assert report["with_a_model"]
 
 
-def test_what_speaks_against_it_is_said(files, run, tmp_path):
+def test_limitations_of_the_recordings_are_noted(files, run, tmp_path):
     hurt, healthy = (np.loadtxt(files / name, delimiter=",") for name in ("hurt.csv", "healthy.csv"))
     still = hurt.copy()
     still[:, 3], still[:, 5] = still[0, 3], np.nan
@@ -176,7 +177,7 @@ def test_what_speaks_against_it_is_said(files, run, tmp_path):
         ("hurt.csv", "healthy.csv", ("--skin", "nowhere.toml"), "there is no such file"),
     ],
 )
-def test_what_cannot_be_is_said(files, run, tmp_path, recording, healthy, options, said):
+def test_invalid_input_is_reported(files, run, tmp_path, recording, healthy, options, said):
     status, _, error = run(
         *("touch", "health", files / recording, "--healthy", files / healthy, "--output", tmp_path / "out", *options)
     )

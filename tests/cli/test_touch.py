@@ -1,4 +1,4 @@
-"""`jeit touch`: presses to a learnt skin, frames to touches, and what is said of files that cannot be."""
+"""`jeit touch`: presses to a learnt skin, frames to touches, and the errors for invalid files."""
 
 import csv
 import json
@@ -77,7 +77,7 @@ current = 1e-3
 
 
 def test_a_described_skin_is_imaged(tmp_path, run):
-    """The description is the one that measured tables have."""
+    """The description is of the kind that measured tables have."""
     skin = tmp_path / "skin.toml"
     skin.write_text(DISK)
     model = load_description(skin).model(skin, num_points=200)
@@ -115,7 +115,7 @@ def test_a_described_skin_is_imaged(tmp_path, run):
         (("predict", "skin", "fewer.npz"), "frames have 9 channels, and the skin that was learnt has 40"),
     ],
 )
-def test_what_cannot_be_is_said(files, run, tmp_path, words, said):
+def test_invalid_input_is_reported(files, run, tmp_path, words, said):
     folder, _ = files
     if words[1] == "skin" and not (folder / "skin").exists():
         run("touch", "fit", folder / "places.npz", "--output", folder / "skin", "--method", "ridge", "--quiet")
