@@ -1,4 +1,4 @@
-"""What may come of a file: it is taken, or one clear error says why not; soon, in little memory, and nothing else."""
+"""Permitted outcomes for a file: it is accepted, or one clear error says why not, within limits of time and memory."""
 
 import resource
 import signal
@@ -10,17 +10,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 LONGEST, SECONDS, MEMORY = 400, 60, 2 * 10**9
-# Errors that say what is wrong with a file, and what is not installed.
+# Errors that describe what is wrong with a file, or what is not installed.
 CLEAR = (ValueError, FileNotFoundError, ImportError)
 
 
 class Hung(BaseException):
-    """It took too long; no `except Exception` holds it up."""
+    """The time limit was exceeded. This is no `Exception`, so that no handler catches it."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one file: "accepted", "refused", or the fault, and what was said."""
+    """The outcome for one file: "accepted", "refused", or the kind of fault, with the message."""
 
     kind: str
     said: str
@@ -32,7 +32,7 @@ class Outcome:
 
 
 def outcome(use: Callable[[], object], seconds: float = SECONDS) -> Outcome:
-    """Of using a file, within limits of time and address space."""
+    """Use a file within limits of time and address space, and return the outcome."""
     start = time.perf_counter()
     try:
         with _limits(seconds), warnings.catch_warnings():
@@ -67,7 +67,7 @@ def _limits(seconds: float):
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     with open("/proc/self/statm") as file:
         taken = int(file.read().split()[0]) * resource.getpagesize()
-    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # again, where it was raised where nothing can be
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # repeat it, in case the first is raised where it is ignored
     resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, hard))
     try:
         yield

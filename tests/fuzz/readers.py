@@ -1,4 +1,4 @@
-"""Every kind of file that jeit reads: a small sound one, and what reads it."""
+"""Every kind of file that jeit reads: a small valid file, and the function that reads it."""
 
 import sys
 from collections.abc import Callable
@@ -53,7 +53,7 @@ from jeit.touch.networks.unrolled import Unrolled
 
 @dataclass(frozen=True)
 class Reader:
-    """What one kind of file is made by and read by; `main`, its file in the folder that `make` fills."""
+    """How one kind of file is written and read; `main` is its file in the folder that `make` fills."""
 
     name: str
     main: str
@@ -62,7 +62,7 @@ class Reader:
 
     @property
     def files(self) -> dict[str, bytes]:
-        """A sound file of the kind and what lies beside it, by their names in a folder."""
+        """A valid file of the kind and the files beside it, by their names in a folder."""
         return _files(self.name)
 
 
@@ -355,7 +355,7 @@ def _curved_study(folder):
 
 @_reader("store of a study", "a.zarr", lambda path: study_progress(read_study(path.parent / "a.toml"), path))
 def _store(folder):
-    # One point, as each file of it is spoilt in turn.
+    # One point, because each of its files is changed in turn.
     (folder / "a.toml").write_text(SMALL.replace(', "perimeter-8"', ""))
     run_study(read_study(folder / "a.toml"), folder / "a.zarr")
 
