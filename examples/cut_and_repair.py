@@ -56,7 +56,7 @@ def main() -> float:
     figure, axes = plt.subplots(1, 4, figsize=(18, 4.6), layout="constrained")
     finder, errors = CellFinder(coarse.mesh, sign=-1), []
     states = ((health, whole, "whole"), (before, torn, "cut: its new reference"), (after, glued, "mended"))
-    for ax, (known, skin, said) in zip(axes, states, strict=False):
+    for ax, (known, skin, state) in zip(axes, states, strict=False):
         place = np.array([-0.05, -0.03])
         touched = skin.touched_in_time(MovingPress(ball(0.02), np.array([5.0]), place), np.zeros(1))
         conductivity = np.array(np.broadcast_to(skin.conductivity, fine.mesh.num_cells))
@@ -65,7 +65,7 @@ def main() -> float:
         (image,) = known.images((known.reference + skin.gain * (pressed - rest))[None])
         contact = find_contacts(finder, image)[0]
         errors.append(float(np.linalg.norm(contact.centroid - place)))
-        plot_health(known, image, title=f"{said}; a touch, {1e3 * errors[-1]:.1f} mm off", ax=ax)
+        plot_health(known, image, title=f"{state}; a touch, {1e3 * errors[-1]:.1f} mm off", ax=ax)
         ax.plot(*cut.path.T, color="black", linewidth=0.8, linestyle=":", zorder=8)
     strongest = np.argsort(-np.abs(before.events[0].change))[:4]
     axes[3].plot(seconds, 1e3 * (frames - frames[0])[:, strongest], linewidth=0.9)

@@ -21,12 +21,12 @@ def faults(name: str, path: Path) -> list[str]:
     package = importlib.import_module(name)
     entrance = "jeit.start."  # called by jeit itself; not a public name
     taken = {one.rpartition(".")[2] for one in offered(path) if one.startswith(f"{name}.") and entrance not in one}
-    said = set(getattr(package, "__all__", ()))
-    found = [f"{one} is not in __all__" for one in sorted(taken - said)]
-    found += [f"{one} is not there" for one in sorted(said) if not hasattr(package, one)]
+    listed = set(getattr(package, "__all__", ()))
+    found = [f"{one} is not in __all__" for one in sorted(taken - listed)]
+    found += [f"{one} is not there" for one in sorted(listed) if not hasattr(package, one)]
     rooms = name == "jeit"  # its contents are its subpackages too
     return found + [
-        f"{one} is a module" for one in said if isinstance(getattr(package, one, None), ModuleType) and not rooms
+        f"{one} is a module" for one in listed if isinstance(getattr(package, one, None), ModuleType) and not rooms
     ]
 
 

@@ -81,13 +81,13 @@ if __name__ == "__main__":
     if before == "imported":
         model = made()
         expected, reconstruction = np.asarray(model.voltages(1.0)), one_step(model, 1.0)
-    refused = {name for name, said in results.items() if isinstance(said, str) and "forked" in said}
+    refused = {name for name, outcome in results.items() if isinstance(outcome, str) and "forked" in outcome}
     in_numpy = {"compiled": WORK["voltages"], "slope": lambda model: np.sum(model.jacobian(1.0))}
-    for name, said in results.items():
+    for name, outcome in results.items():
         if name not in refused and name in in_numpy:
-            np.testing.assert_allclose(np.frombuffer(said), np.ravel(in_numpy[name](model)), rtol=1e-9)
+            np.testing.assert_allclose(np.frombuffer(outcome), np.ravel(in_numpy[name](model)), rtol=1e-9)
         elif name not in refused:
-            assert said == asked(WORK[name])(model), name
+            assert outcome == asked(WORK[name])(model), name
     print(*sorted(refused))
 """
 

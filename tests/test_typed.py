@@ -61,7 +61,7 @@ def offered() -> dict[str, Callable]:
         for name in getattr(package, "__all__", ()):
             thing = getattr(package, name)
             if inspect.isclass(thing):
-                found |= {f"{room}.{said}": one for said, one in (*makers(thing), *methods(thing))}
+                found |= {f"{room}.{member}": one for member, one in (*makers(thing), *methods(thing))}
             elif inspect.isfunction(inspect.unwrap(thing)):
                 found[f"{room}.{name}"] = inspect.unwrap(thing)
     return found

@@ -22,7 +22,7 @@ from jeit.mesh import Disk
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         ("laplace", "'laplace'"),
         ("a" * 100, f"'{'a' * 58}…"),
@@ -40,8 +40,8 @@ from jeit.mesh import Disk
         (jax.random.key(0), "an array of key<fry> of shape ()"),
     ],
 )
-def test_describe_value(given, said):
-    assert describe(given) == said
+def test_describe_value(given, message):
+    assert describe(given) == message
 
 
 @pytest.mark.parametrize("given", [0, -1.5, np.float32(2), np.asarray(1), jnp.asarray(0.5)])
@@ -94,7 +94,7 @@ def test_check_key_accepts_traced_keys():
 
 
 @pytest.mark.parametrize(
-    ("key", "said"),
+    ("key", "message"),
     [
         (None, r"such as jax.random.key\(0\); it is None"),
         (7, r"such as jax.random.key\(7\); it is 7"),
@@ -104,8 +104,8 @@ def test_check_key_accepts_traced_keys():
         (jax.random.split(jax.random.key(0)), r"an array of key<fry> of shape \(2,\)"),
     ],
 )
-def test_check_key_rejects_other_values(key, said):
-    with pytest.raises(ValueError, match=f"^seed must be one random key, .*{said}"):
+def test_check_key_rejects_other_values(key, message):
+    with pytest.raises(ValueError, match=f"^seed must be one random key, .*{message}"):
         check_key(key, "seed")
 
 
@@ -133,8 +133,8 @@ def test_check_name():
     ],
 )
 def test_did_you_mean_suggests_similar_names(given, meant):
-    said = did_you_mean(given, ["gcv", "l-curve", "gauss-newton"])
-    assert said == (f" (did you mean '{meant}'?)" if meant else "")
+    message = did_you_mean(given, ["gcv", "l-curve", "gauss-newton"])
+    assert message == (f" (did you mean '{meant}'?)" if meant else "")
 
 
 def test_check_metres():

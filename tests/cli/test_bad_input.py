@@ -121,7 +121,7 @@ COMPUTING = {
     "rule without data": (lambda m: one_step(m, 1.0, hyperparameter="gcv"), "give difference"),
     "negative hyperparameter": (lambda m: one_step(m, 1.0, hyperparameter=-1.0), "must be positive"),
     "noise of zero": (lambda m: one_step(m, 1.0, noise=0.0), "noise must be positive"),
-    "prior of no length": (lambda m: Gaussian(0.0), "length must be positive"),
+    "prior of zero length": (lambda m: Gaussian(0.0), "length must be positive"),
     "back-projection of waves": (
         lambda m: back_projection(m.with_protocol(pr.trigonometric(8, measurement="mean")), 1.0),
         "two electrodes each",
@@ -140,7 +140,7 @@ COMPUTING = {
     "prior of a number": (lambda m: ImagingSettings(prior=3), "tikhonov, laplace"),  # pyright: ignore[reportArgumentType]
     "hyperparameter of truth": (lambda m: ImagingSettings(hyperparameter=True), "positive number"),
     "press beyond the edge": (lambda m: simulate_press(RoundSkin(), None, (20.0, 0.0)), "beyond the skin"),  # pyright: ignore[reportArgumentType]
-    "press of no size": (lambda m: simulate_press(RoundSkin(), None, (0, 0), radius=0), "positive size"),  # pyright: ignore[reportArgumentType]
+    "press of zero size": (lambda m: simulate_press(RoundSkin(), None, (0, 0), radius=0), "positive size"),  # pyright: ignore[reportArgumentType]
     "unknown method": (lambda m: ImagingSettings(method="two-step"), "one-step, back-projection"),
     "nearly a format": (lambda m: read(__file__, "kit"), "format must be one of .* \\(did you mean 'kit4'"),
     "nearly a choice": (lambda m: pr.opposite(8, drives="distnct"), "got 'distnct' \\(did you mean 'distinct'"),
@@ -162,7 +162,7 @@ COMPUTING = {
     "a path for a reference": (lambda m: prepare_imager("a.csv"), "^reference must be a Measurement.* 'a.csv'"),  # pyright: ignore[reportArgumentType]
     "settings of an image": (lambda m: prepare_imager(m, ImagingSettings()), "StreamSettings.* is an ImagingSettings"),  # pyright: ignore[reportArgumentType]
     "memory in words": (lambda m: StreamSettings(memory="long"), "number of frames.* it is 'long'"),  # pyright: ignore[reportArgumentType]
-    "what prepare_imager gives": (lambda m: stream((m, m), []), r"imager must be an Imager, .*\[0\]; it is a tuple"),  # pyright: ignore[reportArgumentType]
+    "result of prepare_imager": (lambda m: stream((m, m), []), r"imager must be an Imager, .*\[0\]; it is a tuple"),  # pyright: ignore[reportArgumentType]
     "a model by name": (lambda m: one_step("tank", 1.0), "model must be a ForwardModel.* it is 'tank'"),  # pyright: ignore[reportArgumentType]
     "a mesh to calibrate": (lambda m: calibrate(m.mesh, np.ones(40)), "model must be a ForwardModel.* it is a Mesh"),  # pyright: ignore[reportArgumentType]
     "prior as a class": (lambda m: one_step(m, 1.0, prior=Noser), "prior must be .* it is the class Noser itself"),  # pyright: ignore[reportArgumentType]
@@ -343,7 +343,7 @@ COMMANDS = {
         lambda t: ["layout", "compare", "park", "park-inner", "--output", t.folder],
         "layout: there is no",
     ),
-    "no file of a layout": (
+    "not a layout file": (
         lambda t: ["layout", "optimise", "a.csv", "--output", t.folder],
         "layout: there is no file",
     ),
@@ -430,8 +430,8 @@ def test_module_prints_one_line_and_returns_a_status(tmp_path, monkeypatch, caps
     with pytest.raises(SystemExit) as left:
         runpy.run_module("jeit", run_name="__main__")
     assert left.value.code == 1
-    said = "jeit: DATA: there is no file absent.mat. Check the name and the working directory.\n"
-    assert capsys.readouterr().err == said
+    expected = "jeit: DATA: there is no file absent.mat. Check the name and the working directory.\n"
+    assert capsys.readouterr().err == expected
 
 
 @pytest.mark.slow

@@ -149,7 +149,7 @@ def test_results_are_written_after_a_signal(files, model, run, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("stream", "options", "said"),
+    ("stream", "options", "message"),
     [
         ("empty.csv", {}, "holds no numbers"),
         ("none.npz", {}, "frames: there is none"),
@@ -173,7 +173,7 @@ def test_results_are_written_after_a_signal(files, model, run, tmp_path, monkeyp
         ("stream.npz", {"--untouched": "0.01"}, "--untouched: the first 0.01 s"),
     ],
 )
-def test_invalid_input_is_reported(files, model, run, tmp_path, stream, options, said):
+def test_invalid_input_is_reported(files, model, run, tmp_path, stream, options, message):
     folder, _ = files
     given = {"--skin": "skin.toml", "--gestures": "model", "--output": tmp_path / "out"} | options
     words = [
@@ -183,7 +183,7 @@ def test_invalid_input_is_reported(files, model, run, tmp_path, stream, options,
     ]
     status, _, error = run("touch", "watch", folder / stream, *words)
     assert status == 1
-    assert said in error
+    assert message in error
     assert len(error) < 400
     assert not (tmp_path / "out" / "events.csv").exists()
 

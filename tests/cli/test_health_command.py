@@ -102,10 +102,10 @@ def cut(tmp_path_factory):
         return np.stack([model.voltages((one * conductivity.T).T) for one in scales])
 
     number = np.where((SECONDS % 4 > 1) & (SECONDS % 4 < 2), 1 + SECONDS // 4, 0).astype(int)
-    sound, hurt = seen(whole), seen(torn)
+    intact, damaged = seen(whole), seen(torn)
 
     def recorded(at):
-        frames = np.where((at > SECONDS)[:, None], sound[number], hurt[number])
+        frames = np.where((at > SECONDS)[:, None], intact[number], damaged[number])
         return frames + 1e-4 * np.abs(frames).mean() * rng.normal(size=frames.shape)
 
     np.savez(folder / "healthy.npz", frames=recorded(np.inf), seconds=SECONDS)
@@ -150,9 +150,9 @@ def test_limitations_of_the_recordings_are_noted(files, run, tmp_path):
         )
         assert status == 0, name
         report = json.loads((tmp_path / name / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
-        for said in notes:
-            assert said in " ".join(output.split())
-            assert any(said in one for one in report["notes"])
+        for message in notes:
+            assert message in " ".join(output.split())
+            assert any(message in one for one in report["notes"])
     np.save(tmp_path / "few.npy", healthy[:60])
     _, output, _ = run("touch", "health", files / "hurt.csv", "--healthy", tmp_path / "few.npy", "-o", tmp_path / "few")
     assert "few beside the length of touches" in " ".join(output.split())
@@ -164,7 +164,7 @@ def test_limitations_of_the_recordings_are_noted(files, run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("recording", "healthy", "options", "said"),
+    ("recording", "healthy", "options", "message"),
     [
         ("hurt.csv", "fewer.csv", (), "has 40 channels, and"),
         ("hurt.csv", "short.csv", (), "5 frames are too few"),
@@ -177,10 +177,10 @@ def test_limitations_of_the_recordings_are_noted(files, run, tmp_path):
         ("hurt.csv", "healthy.csv", ("--skin", "nowhere.toml"), "there is no such file"),
     ],
 )
-def test_invalid_input_is_reported(files, run, tmp_path, recording, healthy, options, said):
+def test_invalid_input_is_reported(files, run, tmp_path, recording, healthy, options, message):
     status, _, error = run(
         *("touch", "health", files / recording, "--healthy", files / healthy, "--output", tmp_path / "out", *options)
     )
     assert status == 1
-    assert said in error
+    assert message in error
     assert not (tmp_path / "out" / "events.csv").exists()

@@ -57,7 +57,7 @@ def test_the_second_layout_is_checked_before_the_first_is_simulated(layouts, run
     monkeypatch.setattr(Skin, "voltage_changes", lambda skin, cells: touched.append(skin.layout.name))
     write_layout(Layout(grid(0.04, 0.03, 3, 2), 3e-3, outline=SKIN), tmp_path / "small.svg")
     write_layout(Layout(grid(0.04, 0.0, 3, 1), 8e-3, outline=SKIN), tmp_path / "three.svg")
-    for second, said in (
+    for second, message in (
         ("none.svg", "none.svg"),
         ("small.svg", "--cell-mm is 5 mm; give no more than 4.5 mm, as electrodes of 'small' are 3 mm across"),
         ("three.svg", "--pairs is 6; 'three' has 3 electrodes, and they make 3 pairs"),
@@ -65,7 +65,7 @@ def test_the_second_layout_is_checked_before_the_first_is_simulated(layouts, run
         command = ["layout", "compare", layouts[0], tmp_path / second, "--output", tmp_path / "out", *OPTIONS]
         status, _, error = run(*command)
         assert status == 1
-        assert said in error
+        assert message in error
         assert "metres" not in error
     assert touched == []
 
@@ -97,7 +97,7 @@ def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (["park-iner"], "park-inner"),
         (["missing.svg"], "missing.svg"),
@@ -121,9 +121,9 @@ def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
         (["grid-2x1"], "'grid-2x1' has 2 electrodes; give a layout of three or more"),
     ],
 )
-def test_bad_input_is_explained(change, said, layouts, run, tmp_path):
+def test_bad_input_is_explained(change, message, layouts, run, tmp_path):
     first = change[0] or layouts[0]
     status, _, error = run("layout", "compare", first, layouts[0], "--output", tmp_path / "out", *OPTIONS, *change[1:])
     assert status == 1
-    assert said in error
+    assert message in error
     assert len(error.strip().splitlines()) == 1

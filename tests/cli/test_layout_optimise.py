@@ -38,16 +38,16 @@ def test_the_optimised_layout_is_written_and_scores_higher(tmp_path):
 
 
 def test_progress_shows_the_step_and_the_best_score(monkeypatch):
-    said = []
+    messages = []
     step = Steps(Console(file=io.StringIO(), force_terminal=True), quiet=False)
     with step:
         step.report("nothing is under way yet")
         step("optimise")
-        monkeypatch.setattr(step._status, "update", said.append)
+        monkeypatch.setattr(step._status, "update", messages.append)
         step.report("step 3 of at most 60, best score 1.234")
         monkeypatch.setattr(step, "_start", step._start - 7.2)
         step.report("step 40 of at most 60")
-    assert [str(one.__rich__()) for one in said] == [
+    assert [str(one.__rich__()) for one in messages] == [
         "optimise … step 3 of at most 60, best score 1.234",
         "optimise … step 40 of at most 60  7 s",
     ]
@@ -76,7 +76,7 @@ def test_bad_input_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (["--thickness-mm", 0.01], "--thickness-mm must be more than the 2.5 mm"),
         (["--thickness-mm", 500], "--thickness-mm is 500 mm, more than the skin is wide, "),
@@ -97,6 +97,6 @@ def test_bad_input_is_refused(tmp_path):
         (["--keep-out", "0,0,5", "--keep-out", "500,0,10"], "500,0,10 lies off the skin, which spans -100 to 100 mm"),
     ],
 )
-def test_error_messages_name_the_options(options, said, tmp_path):
-    with pytest.raises(ValueError, match=re.escape(said)):
+def test_error_messages_name_the_options(options, message, tmp_path):
+    with pytest.raises(ValueError, match=re.escape(message)):
         run("park-inner", "--output", tmp_path, *options)

@@ -19,7 +19,7 @@ from jeit.touch.simulate.contact.indent_sets import image_places
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[electrodes]\nlayout = 'grid-4x4'\n[skin]\nthick = 3", "skin.thick is no key of a skin"),
         ("[skin]\nwidth_mm = 100", "electrodes.layout is missing"),
@@ -28,11 +28,11 @@ from jeit.touch.simulate.contact.indent_sets import image_places
         ("not toml", "is no TOML file"),
     ],
 )
-def test_invalid_descriptions(run, tmp_path, text, said):
+def test_invalid_descriptions(run, tmp_path, text, message):
     (tmp_path / "skin.toml").write_text(text)
     status, _, error = run("learn", "image", tmp_path / "skin.toml", "--output", tmp_path / "model")
     assert status == 1
-    assert said in error
+    assert message in error
 
 
 def test_a_described_skin(tmp_path):

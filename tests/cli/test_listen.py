@@ -73,19 +73,19 @@ def test_probabilities_are_limited_by_the_number_of_clips(folder):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--output", "CLIPS/model"), "lies in the folder of clips"),
         (("--output", "model", "--method", "linear", "--batches", "10"), "--batches applies to networks"),
     ],
 )
-def test_refused_options_leave_no_files(folder, tmp_path, capsys, options, said):
+def test_refused_options_leave_no_files(folder, tmp_path, capsys, options, message):
     """The error comes before any computation."""
     clips = folder / "clips"
     options = [one.replace("CLIPS", str(clips)).replace("model", str(tmp_path / "model")) for one in options]
     options = [str(clips / "model") if one.startswith(str(clips)) else one for one in options]
     assert main(["listen", "fit", str(clips), *options]) == 1
-    assert said in " ".join(capsys.readouterr().err.split())
+    assert message in " ".join(capsys.readouterr().err.split())
     assert not (clips / "model").exists()
     assert not (tmp_path / "model").exists()
 
@@ -114,8 +114,8 @@ def test_a_recording_is_classified(folder, tmp_path, capsys):
     """Options may come before the recording, and the model may be given as its file."""
     model = folder / "model" / "listener.jeit"
     assert main(["listen", "--model", str(model), "--output", str(tmp_path), str(folder / "one.wav")]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "as a whole low" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "as a whole low" in printed
     with open(tmp_path / "events.csv", encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["time_s", "heard", "probability", "p_high", "p_low", "microphone"]
@@ -174,9 +174,9 @@ def test_sounds_are_located_with_a_calibration(tmp_path):
 def test_help_shows_the_usage(capsys):
     for command in (["listen"], ["listen", "--help"]):
         assert main(command) == 0
-        said = capsys.readouterr().out
-        assert "Usage: jeit listen [OPTIONS]" in said
-        assert "jeit listen fit" in " ".join(said.split())
+        printed = capsys.readouterr().out
+        assert "Usage: jeit listen [OPTIONS]" in printed
+        assert "jeit listen fit" in " ".join(printed.split())
     assert main(["listen", "fit", "--help"]) == 0
     assert "Usage: jeit listen fit [OPTIONS]" in capsys.readouterr().out
 
@@ -200,11 +200,11 @@ def _bad(folder) -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "message"),
     [
         *(
-            (["listen", name, "-m", "model", "-o", "out"], said)
-            for name, said in (
+            (["listen", name, "-m", "model", "-o", "out"], message)
+            for name, message in (
                 ("empty.wav", "empty"),
                 ("stereo_sample.wav", "looks transposed"),
                 ("eight.wav", "has 8000 samples a second"),
@@ -228,20 +228,20 @@ def _bad(folder) -> None:
         (["listen", "fit", "clips", "-o", "new", "--loudness", "loud"], "--loudness must be one of auto, counts"),
     ],
 )
-def test_bad_input_is_explained(command, said, folder, monkeypatch, capsys):
+def test_bad_input_is_explained(command, message, folder, monkeypatch, capsys):
     """Exit status 1 and one line on standard error, without a traceback."""
     monkeypatch.chdir(folder)
     if not (folder / "text.wav").exists():
         _bad(folder)
     assert main(command) == 1
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert error.count("\n") == 1
     assert "should not have happened" not in error
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "message"),
     [
         (["listen", "one.wav"], "Missing option '--model' / '-m'. See 'jeit listen --help'"),
         (["listen", "fit"], "Missing argument 'FOLDER-BY-CLASS'. See 'jeit listen fit --help'"),
@@ -249,9 +249,9 @@ def test_bad_input_is_explained(command, said, folder, monkeypatch, capsys):
         (["listen", "one.wav", "--modle", "model"], "--modle"),
     ],
 )
-def test_usage_errors_are_explained(command, said, capsys):
+def test_usage_errors_are_explained(command, message, capsys):
     assert main(command) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_unusual_recordings_are_classified(folder, tmp_path, capsys):

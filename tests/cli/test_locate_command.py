@@ -147,10 +147,10 @@ def test_locate_from_intensities(folder, tmp_path, capsys):
     assert len(report["touches"]) == 1
     assert report["touches"][0]["offset_s"] == pytest.approx(1.2)
     assert (tmp_path / "track.png").stat().st_size > 10_000
-    said = " ".join(capsys.readouterr().out.split())
-    assert "25 touch, 15 no touch" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "25 touch, 15 no touch" in printed
     # A stroke: from (70, 0) mm to the position 1.2 s later.
-    assert f"1 0.000 1.200 70.0 → {70 * np.cos(3.6):.1f} 0.0 → {60 * np.sin(3.6):.1f}" in said
+    assert f"1 0.000 1.200 70.0 → {70 * np.cos(3.6):.1f} 0.0 → {60 * np.sin(3.6):.1f}" in printed
 
 
 @pytest.mark.parametrize("name", ["touch.npz", "touch.wav"])
@@ -312,7 +312,7 @@ def instead(command, **changes):
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "expected"),
     [
         (instead(LOCATE, cal_json="version.json"), "version 7"),
         (instead(LOCATE, cal_json="unit.json"), "mm"),
@@ -346,14 +346,14 @@ def instead(command, **changes):
         (instead(CALIBRATE, new_json="."), "folder"),
     ],
 )
-def test_bad_input_is_explained(command, said, sounded, monkeypatch, capsys):
+def test_bad_input_is_explained(command, expected, sounded, monkeypatch, capsys):
     """Exit status 1 and one line on standard error, without a traceback."""
     monkeypatch.chdir(sounded)
     if not (sounded / "version.json").exists():
         _bad_files(sounded)
     assert main(command) == 1
     error = capsys.readouterr().err
-    assert said in error
+    assert expected in error
     assert error.count("\n") == 1
     assert "Traceback" not in error
     assert "should not have happened" not in error

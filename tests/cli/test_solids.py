@@ -111,9 +111,9 @@ def test_number_of_nodes_is_refused_for_a_given_mesh(command, run, tmp_path):
 
 def test_number_of_nodes_of_the_model(tmp_path):
     write(Disk(0.05).mesh(num_points=250), tmp_path / "tank.vtu")
-    for body, number, said in (("mesh", 250, "num_points has no effect"), ("solid", None, "num_points is missing")):
+    for body, number, message in (("mesh", 250, "num_points has no effect"), ("solid", None, "num_points is missing")):
         (tmp_path / "tank.toml").write_text(BODIES[body] + PROTOCOL)
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             load_description(tmp_path / "tank.toml").model("full.csv", num_points=number)
 
 

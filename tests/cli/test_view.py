@@ -95,7 +95,7 @@ def test_a_skin_in_space(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--plane-mm", "w=3"), "--plane-mm must be such as z=20"),
         (("--plane-mm", "1,2/3"), "--plane-mm must be such as z=20"),
@@ -110,20 +110,20 @@ def test_a_skin_in_space(run, tmp_path):
         (("--axis", "w"), "--axis must be"),
     ],
 )
-def test_invalid_options(run, solid, tmp_path, arguments, said):
+def test_invalid_options(run, solid, tmp_path, arguments, message):
     status, _, error = run("view", solid, "-o", tmp_path / "out", *arguments)
     assert status == 1
-    assert said in error
+    assert message in error
     assert len(error.splitlines()) == 1
     assert not (tmp_path / "out").exists()
 
 
 def test_invalid_files(run, tmp_path):
     (tmp_path / "image.png").write_bytes(b"\x89PNG")
-    for name, said in (("image.png", "not an image that jeit wrote"), ("none.npz", "No such file"), (".", "folder")):
+    for name, message in (("image.png", "not an image that jeit wrote"), ("none.npz", "No such file"), (".", "folder")):
         status, _, error = run("view", tmp_path / name)
         assert status == 1
-        assert said in error
+        assert message in error
     others = {
         "frames.csv": "a table of data, which is to be imaged first",
         "image.vtu": "a file for ParaView",
@@ -132,8 +132,10 @@ def test_invalid_files(run, tmp_path):
     }
     for name, kind in others.items():
         (tmp_path / name).write_text("1, 2, 3")
-        said = f"{name}: not an image that jeit wrote, but {kind}; give the image.npz that jeit reconstruct writes.\n"
-        assert run("view", tmp_path / name)[2].endswith(said)
+        message = (
+            f"{name}: not an image that jeit wrote, but {kind}; give the image.npz that jeit reconstruct writes.\n"
+        )
+        assert run("view", tmp_path / name)[2].endswith(message)
     np.savez(tmp_path / "frames.npz", voltages=np.ones((3, 4)))
     assert "it holds voltages, and no image" in run("view", tmp_path / "frames.npz")[2]
     np.savez(tmp_path / "series.npz", changes=np.ones((3, 4)), functional=np.ones(4), points=1, cells=1)

@@ -238,8 +238,8 @@ def test_patches_on_a_mesh_in_another_unit(folder):
     """With the wrong unit, no facet of the mesh is near a patch."""
     patches = PATCH | {"positions": [[0.05, 0, 0.02], [0, 0.05, 0.02]], "contact_impedance": 1e-3}
     described({"mesh": "plates.msh", "scale": 1e-2}, patches | {"width": 0.03, "height": 0.03}, folder)
-    said = r"lies 20 mm off the body's surface; is the mesh in millimetres\? Read it with scale = 1e-3\.$"
-    with pytest.warns(UserWarning, match="is large"), pytest.raises(ValueError, match=said):
+    expected = r"lies 20 mm off the body's surface; is the mesh in millimetres\? Read it with scale = 1e-3\.$"
+    with pytest.warns(UserWarning, match="is large"), pytest.raises(ValueError, match=expected):
         described({"mesh": "plates.msh", "scale": 10}, patches, folder)
     placed = FacePatches([[50, 0, 20], [0, 50, 20]], 0.01, 0.01, 1e-3)
     body = described({"mesh": "plates.msh", "scale": 1e-2}, None, folder).domain
@@ -283,8 +283,8 @@ def test_a_mesh_is_accepted_as_a_domain_but_a_path_is_not():
 
 
 def test_a_radius_in_millimetres_is_reported_in_metres():
-    said = r"^d\.toml: geometry\.radius: 150 m is large .* If the lengths are millimetres, give 0\.15, "
-    with pytest.warns(UserWarning, match=said):
+    expected = r"^d\.toml: geometry\.radius: 150 m is large .* If the lengths are millimetres, give 0\.15, "
+    with pytest.warns(UserWarning, match=expected):
         described({"shape": "disk", "radius": 150}, {"kind": "point", "positions": [[0, 150]]})
 
 
@@ -316,7 +316,7 @@ def test_an_uncertainty_in_degrees_and_percent_is_kept_by_measurements(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "expected"),
     [
         ({"position": 1e-3, "position_degrees": 1}, "the same"),
         ({"position": -1}, "from 0"),
@@ -324,8 +324,8 @@ def test_an_uncertainty_in_degrees_and_percent_is_kept_by_measurements(tmp_path)
         ({"other_percent": 101}, r"101, and must be from 0 to 100 %\.$"),
     ],
 )
-def test_a_faulty_uncertainty_is_named(given, said):
-    with pytest.raises(ValueError, match=said):
+def test_a_faulty_uncertainty_is_named(given, expected):
+    with pytest.raises(ValueError, match=expected):
         parse_description({**SHEET, "uncertainty": given}, "d.toml")
 
 

@@ -17,11 +17,11 @@ MANY = {
         {"kind": "bipolar", "number": 4, "drive_pairs": [[0, 1]] * 20_000, "measurement_pairs": [[2, 3]] * 20_000},
         r"protocol would take 51\.2 GB",
     ),
-    "an electrode that is not there": (
+    "an electrode that does not exist": (
         {"kind": "bipolar", "number": 4, "drive_pairs": [[0, 1]], "measurement_pairs": [[2, 4]] * 20_000},
         r"protocol\.measurement_pairs has electrode 4, and there are 4, numbered from 0 to 3",
     ),
-    "no protocol's options": ({"kind": "adjacent", "number": 8, "colour": 1}, r"protocol\.colour is no key"),
+    "an unknown option": ({"kind": "adjacent", "number": 8, "colour": 1}, r"protocol\.colour is no key"),
 }
 MATRICES = {
     "patterns": (

@@ -59,7 +59,7 @@ def test_values_that_are_not_finite_are_missing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         ({"other": FRAMES}, "there is no array 'frames'; the file holds other"),
         ({"frames": FRAMES[:, :3]}, r"frames have shape \(5, 3\)"),
@@ -73,9 +73,9 @@ def test_values_that_are_not_finite_are_missing(tmp_path):
         ({"frames": np.array([None])}, "plain arrays"),
     ],
 )
-def test_invalid_recordings_are_reported(tmp_path, arrays, said):
+def test_invalid_recordings_are_reported(tmp_path, arrays, message):
     np.savez(tmp_path / "stream.npz", **arrays)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         read_frame_recording(tmp_path / "stream.npz", described())
 
 

@@ -46,7 +46,7 @@ def test_other_files_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"start": np.array([0, 2, 4])}, "start goes from 0 to 4; give 0 first"),
         ({"voltages": np.ones(5)}, r"voltages \(F, M\)"),
@@ -61,6 +61,6 @@ def test_other_files_are_refused(tmp_path):
         ({"voltages": np.ones((5, 3), complex)}, "voltages is complex128; give real numbers"),
     ],
 )
-def test_arrays_that_do_not_match_are_reported(change, said):
-    with pytest.raises(ValueError, match=said):
+def test_arrays_that_do_not_match_are_reported(change, message):
+    with pytest.raises(ValueError, match=message):
         GestureSet(**(ARRAYS | change))

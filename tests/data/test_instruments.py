@@ -341,7 +341,7 @@ FAULTS = {
     "sciospec, no number": (text("1000\n", "fast\n"), "must be a number; it is 'fast'"),
     "sciospec, a million frequencies": (text("0\n1\n", "0\n1000000\n"), "frequencies"),
     "sciospec, ragged": (text("1 4\n", "1 4\n1.0\t2.0\t3.0\t4.0\n"), "two electrodes"),
-    "sciospec, an electrode that is none": (text("1 4\n", "1 9\n"), "electrode 9"),
+    "sciospec, an electrode that does not exist": (text("1 4\n", "1 9\n"), "electrode 9"),
     "sciospec, words": (text("1 4\n", "one four\n"), "is not numbers"),
     "sciospec, no current": (text("0.001\n", "0\n"), "positive"),
     "sciospec, a pair of one": (text("1 4\n", "1 1\n"), "line 19: current enters and leaves at electrode 1;"),
@@ -428,9 +428,9 @@ DAMAGED = {
 
 @pytest.mark.parametrize("name", DAMAGED)
 def test_a_damaged_file_is_reported_with_its_probable_format(name, tmp_path):
-    make, change, said = DAMAGED[name]
+    make, change, reason = DAMAGED[name]
     path = make(tmp_path) if change is None else make(tmp_path, change)
-    with pytest.raises(ValueError, match=said) as caught:
+    with pytest.raises(ValueError, match=reason) as caught:
         data.read(path)
     assert len(str(caught.value)) < 500
 

@@ -36,9 +36,9 @@ LARGE = {
 
 @pytest.mark.parametrize("name", LARGE)
 def test_one_warning_with_the_keys(name, tmp_path):
-    geometry, said = LARGE[name]
+    geometry, message = LARGE[name]
     write(Disk(4.0).mesh(num_points=100), tmp_path / "disk.vtu")
-    with pytest.warns(UserWarning, match=rf"^tank\.toml: {said}") as found:
+    with pytest.warns(UserWarning, match=rf"^tank\.toml: {message}") as found:
         meshed_twice({"geometry": geometry}, tmp_path)
     assert len(found) == 1
 

@@ -85,9 +85,13 @@ def test_part_of_complex_voltages_is_noted(published, tmp_path, suffix):
 
 def test_other_axes_names_and_units(published, tank, tmp_path):
     turned = {"i": 1e3 * published["current_patterns"].T, "u": np.transpose(published["frame_voltage"], (2, 0, 1))}
-    said = DESCRIBED.replace("frame_voltage", "u") + 'axes = ["frames", "electrodes", "patterns"]\nframe_rate = 20.0\n'
-    said = said.replace('"measured"\n', '"measured"\ndrive_key = "i"\npatterns_in = "rows"\ncurrent_unit = "mA"\n')
-    found = read(tmp_path, turned, said)
+    described = (
+        DESCRIBED.replace("frame_voltage", "u") + 'axes = ["frames", "electrodes", "patterns"]\nframe_rate = 20.0\n'
+    )
+    described = described.replace(
+        '"measured"\n', '"measured"\ndrive_key = "i"\npatterns_in = "rows"\ncurrent_unit = "mA"\n'
+    )
+    found = read(tmp_path, turned, described)
     np.testing.assert_allclose(found.voltages[0], tank(found.protocol), rtol=1e-12)
     np.testing.assert_allclose(found.times, np.arange(FRAMES) / 20)
     assert found.frame_rate == pytest.approx(20)
@@ -106,7 +110,7 @@ def test_one_frame_of_two_axes(published, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said", "message"),
+    ("change", "replaced", "message"),
     [
         ({"current_patterns": np.ones((8, 7))}, None, "sums to 8"),
         ({"current_patterns": np.eye(8)[None]}, None, "must be a matrix"),
@@ -121,14 +125,14 @@ def test_one_frame_of_two_axes(published, tmp_path):
         ({}, ("kind =", "reference = 1\nkind ="), "no use"),
     ],
 )
-def test_arrays_that_do_not_match(published, tmp_path, change, said, message):
-    description = DESCRIBED if said is None else DESCRIBED.replace(*said, 1)
+def test_arrays_that_do_not_match(published, tmp_path, change, replaced, message):
+    description = DESCRIBED if replaced is None else DESCRIBED.replace(*replaced, 1)
     with pytest.raises(ValueError, match=message):
         read(tmp_path, {**published, **change}, description)
 
 
 @pytest.mark.parametrize(
-    ("said", "message"),
+    ("options", "message"),
     [
         ('kind = "optimal"\ntransfer = [[1, -1], [-1, 1]]', "give one of them"),
         ('kind = "optimal"\ntransfer = [[1, -1], [-1, 1]]\npower = 1e-6', "power needs other"),
@@ -136,8 +140,8 @@ def test_arrays_that_do_not_match(published, tmp_path, change, said, message):
         ('kind = "haar"\nnumber = 8', "current"),
     ],
 )
-def test_impossible_protocols(tmp_path, said, message):
-    (tmp_path / "p.toml").write_text(f"[protocol]\n{said}\n", "utf-8")
+def test_impossible_protocols(tmp_path, options, message):
+    (tmp_path / "p.toml").write_text(f"[protocol]\n{options}\n", "utf-8")
     with pytest.raises(ValueError, match=re.escape(message)):
         data.load_description(tmp_path / "p.toml").protocol(tmp_path / "p.csv")
 

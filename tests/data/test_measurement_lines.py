@@ -55,9 +55,9 @@ def test_other_distances_of_a_cn0565_are_described(tank, tmp_path):
     path.with_suffix(".toml").write_text(table + "0\n")
     with pytest.raises(ValueError, match=r"has 40 channels, and a frame of a\.txt 32: with force and sense distance"):
         data.read(path)
-    for text, said in (("!V 1,2,3,4,5,6,7,8,9\n", "9 numbers"), ("V 1\n", "no line begins with '!V'")):
+    for text, message in (("!V 1,2,3,4,5,6,7,8,9\n", "9 numbers"), ("V 1\n", "no line begins with '!V'")):
         path.write_text(text)
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             data.read(path, "cn0565")
 
 
@@ -148,12 +148,12 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_what_is_wrong_in_a_line_is_named(tank, name, tmp_path):
-    old, new, said = FAULTS[name]
+def test_faulty_lines_are_reported(tank, name, tmp_path):
+    old, new, message = FAULTS[name]
     text = unified(tank(FIXED))
     assert old in text
     (tmp_path / "a.ohm").write_text(text.replace(old, new, 1))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         data.read(tmp_path / "a.ohm", "quadrupoles")
 
 

@@ -282,9 +282,9 @@ def test_spikes_in_single_channels_are_masked_and_named(driven, size, tank, setu
     chosen, rng = protocol.adjacent(16, driven_electrodes=driven), np.random.default_rng(0)
     empty = data.screen(tank(chosen), chosen, **setup(16))
     noise = 1e-4 * np.abs(tank(chosen)) * rng.normal(size=(3, chosen.num_measurements))
-    sound = data.screen(tank(chosen, 0.05) + noise, chosen, **setup(16))
-    assert mask_spikes(sound, empty) is sound
-    disturbed, each = np.array(sound.voltages), np.asarray(relative_noise(np.abs(tank(chosen))))
+    valid = data.screen(tank(chosen, 0.05) + noise, chosen, **setup(16))
+    assert mask_spikes(valid, empty) is valid
+    disturbed, each = np.array(valid.voltages), np.asarray(relative_noise(np.abs(tank(chosen))))
     largest = np.abs((tank(chosen, 0.05) - tank(chosen)) / each).max()
     disturbed[1, [17, 100]] += size * largest * each[[17, 100]] * [1, -1]
     spiky = data.screen(disturbed, chosen, **setup(16))
@@ -295,7 +295,7 @@ def test_spikes_in_single_channels_are_masked_and_named(driven, size, tank, setu
     if size > 1:
         filled = mask_spikes(spiky, empty, fill=True)
         assert np.asarray(filled.mask).all()
-        np.testing.assert_allclose(filled.voltages[1, [17, 100]], sound.voltages[1, [17, 100]], rtol=2e-3)
+        np.testing.assert_allclose(filled.voltages[1, [17, 100]], valid.voltages[1, [17, 100]], rtol=2e-3)
         assert filled.notes[-1].startswith("2 voltages replaced by what others determine")
 
 

@@ -67,7 +67,7 @@ def main() -> int:
             counts["faulty" if came.faulty else came.kind] += 1
             slowest = max(slowest, came.seconds)
             if came.faulty:
-                faults.append(f"{reader.name} {number}: {came.kind}: {came.said}")
+                faults.append(f"{reader.name} {number}: {came.kind}: {came.message}")
         row = [each, counts["refused"], counts["accepted"], counts["faulty"]]
         print(f"{reader.name:26}" + "".join(f"{one:>{8 + (place in (1, 2))}}" for place, one in enumerate(row)), end="")
         print(f"{slowest:>7.1f} s", flush=True)

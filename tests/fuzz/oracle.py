@@ -23,7 +23,7 @@ class Outcome:
     """The outcome for one file: "accepted", "refused", or the kind of fault, with the message."""
 
     kind: str
-    said: str
+    message: str
     seconds: float
 
     @property
@@ -38,19 +38,19 @@ def outcome(use: Callable[[], object], seconds: float = SECONDS) -> Outcome:
         with _limits(seconds), warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)
             use()
-        kind, said = "accepted", ""
+        kind, message = "accepted", ""
     except Hung:
-        kind, said = "hung", "".join(traceback.format_exc(limit=-3))
+        kind, message = "hung", "".join(traceback.format_exc(limit=-3))
     except CLEAR as error:
-        said = str(error)
+        message = str(error)
         foreign = type(error) not in (ValueError, FileNotFoundError, ImportError, UnicodeError)
         foreign &= not type(error).__module__.startswith("jeit")
-        kind = "refused" if said and len(said) <= LONGEST and not foreign else "unclear"
-        said = f"{type(error).__name__} ({len(said)}): {said[:LONGEST]}"
+        kind = "refused" if message and len(message) <= LONGEST and not foreign else "unclear"
+        message = f"{type(error).__name__} ({len(message)}): {message[:LONGEST]}"
     except (Exception, RecursionError) as error:
         kind = type(error).__name__
-        said = f"{str(error)[:200]} | {_where(error)}"
-    return Outcome(kind, said, time.perf_counter() - start)
+        message = f"{str(error)[:200]} | {_where(error)}"
+    return Outcome(kind, message, time.perf_counter() - start)
 
 
 def _where(error: BaseException) -> str:

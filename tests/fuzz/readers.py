@@ -214,8 +214,8 @@ def _patterns(folder):
     held = {"current_patterns": current, "frame_voltage": voltages - voltages.mean(axis=0)}
     scipy.io.savemat(folder / "a.mat", held, do_compression=True)
     driven = BODY.replace('kind = "adjacent"\ncurrent = 1e-3', 'kind = "measured"')
-    said = driven.replace('frame_names = ["a", "b"]', 'keys = ["frame_voltage"]\nframe_rate = 5.0')
-    (folder / "a.toml").write_text(said)
+    description = driven.replace('frame_names = ["a", "b"]', 'keys = ["frame_voltage"]\nframe_rate = 5.0')
+    (folder / "a.toml").write_text(description)
 
 
 def _instrument(name, suffix, number, make):

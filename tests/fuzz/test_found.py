@@ -60,7 +60,7 @@ def npy_head(shape: str, dtype: str = "<f8") -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode()
 
 
-def sound_members(name: str) -> dict[str, bytes]:
+def valid_members(name: str) -> dict[str, bytes]:
     with zipfile.ZipFile(io.BytesIO(READERS[name].files["a.npz"])) as archive:
         return {one: archive.read(one) for one in archive.namelist()}
 
@@ -80,14 +80,14 @@ def element(name: str, shape: tuple[int, ...], stored: bytes, size: int) -> byte
 
 
 def mat_with(extra: bytes) -> bytes:
-    sound = READERS["eidors"].files["a.mat"]
-    return sound + struct.pack("<II", 15, len(extra)) + extra
+    valid = READERS["eidors"].files["a.mat"]
+    return valid + struct.pack("<II", 15, len(extra)) + extra
 
 
 def svg(old: str, new: str) -> bytes:
-    sound = READERS["layout, svg"].files["a.svg"].decode()
-    assert old in sound
-    return sound.replace(old, new, 1).encode()
+    valid = READERS["layout, svg"].files["a.svg"].decode()
+    assert old in valid
+    return valid.replace(old, new, 1).encode()
 
 
 def outlined(path: str) -> bytes:
@@ -101,16 +101,16 @@ def circles(number: int) -> bytes:
 
 
 def dxf(old: str, new: str) -> bytes:
-    sound = READERS["layout, dxf"].files["a.dxf"].decode()
-    assert old in sound
-    return sound.replace(old, new).encode()
+    valid = READERS["layout, dxf"].files["a.dxf"].decode()
+    assert old in valid
+    return valid.replace(old, new).encode()
 
 
 def flac_of_hours() -> bytes:
     """STREAMINFO states 2³⁵ samples."""
-    sound = bytearray(READERS["sound, flac"].files["a.flac"])
-    sound[21] |= 0x08
-    return bytes(sound)
+    valid = bytearray(READERS["sound, flac"].files["a.flac"])
+    valid[21] |= 0x08
+    return bytes(valid)
 
 
 def network_with(**head) -> bytes:
@@ -123,23 +123,23 @@ FOUND = {
     "a bomb in an array of an NPZ file": (
         "taps",
         lambda: zipped(
-            {name: one for name, one in sound_members("taps").items() if name != "intensity.npy"},
+            {name: one for name, one in valid_members("taps").items() if name != "intensity.npy"},
             {"intensity.npy": npy_head("(9, 43690666)")},
         ),
         "JEIT_FILE_GB=7",
     ),
-    "a bomb in a member that nobody needs": (
-        "taps", lambda: zipped(sound_members("taps"), {"other.npy": npy_head("(393216000,)")}), None,
+    "a bomb in an unused member": (
+        "taps", lambda: zipped(valid_members("taps"), {"other.npy": npy_head("(393216000,)")}), None,
     ),
-    "a header that says more than there is": (
+    "a header that states more data than there are": (
         "sound, npz",
-        lambda: zipped({**sound_members("sound, npz"), "samples.npy": npy_head("(2, 99)")}, {}),
+        lambda: zipped({**valid_members("sound, npz"), "samples.npy": npy_head("(2, 99)")}, {}),
         "says 1584 bytes of numbers, and has 128",
     ),
     "bytes that become numbers of eight": (
         "sound, npz",
         lambda: zipped(
-            {name: one for name, one in sound_members("sound, npz").items() if name != "samples.npy"},
+            {name: one for name, one in valid_members("sound, npz").items() if name != "samples.npy"},
             {"samples.npy": npy_head("(2, 100000000)", "|i1")},
         ),
         "GB in memory",
@@ -149,7 +149,7 @@ FOUND = {
     ),
     "letters beyond all scripts": (
         "table, npz",
-        lambda: zipped({**sound_members("table, npz"), "notes.npy": npy_head("(1,)", "<U1") + b"\xff" * 4}, {}),
+        lambda: zipped({**valid_members("table, npz"), "notes.npy": npy_head("(1,)", "<U1") + b"\xff" * 4}, {}),
         "no letter",
     ),
     "a bomb in a MATLAB variable": (
@@ -174,7 +174,7 @@ FOUND = {
     "a field of two hundred thousand letters": (
         "layout, csv", lambda: READERS["layout, csv"].files["a.csv"] + b"1," * 3 + b"x" * 200_000, "no row of a table",
     ),
-    "an encoding that there is not": (
+    "an unknown encoding": (
         "layout, svg", lambda: svg("encoding='utf-8'", "encoding='klingon'"), "not an SVG drawing",
     ),
     "a drawing cut short": ("layout, dxf", lambda: READERS["layout, dxf"].files["a.dxf"][:700], "not a DXF drawing"),
@@ -186,15 +186,15 @@ FOUND = {
 
 @pytest.mark.parametrize("name", FOUND)
 def test_past_faults(name, tmp_path):
-    kind, make, said = FOUND[name]
+    kind, make, message = FOUND[name]
     reader = READERS[kind]
     for other, content in reader.files.items():
         (tmp_path / other).write_bytes(content)
     (tmp_path / reader.main).write_bytes(make())
     start = time.process_time()
     came = outcome(lambda: reader.use(tmp_path), seconds=20)
-    assert came.kind == ("accepted" if said is None else "refused"), came.said
-    assert said is None or said in came.said
+    assert came.kind == ("accepted" if message is None else "refused"), came.message
+    assert message is None or message in came.message
     assert time.process_time() - start < 10
 
 
@@ -203,10 +203,10 @@ def test_indices_beyond_a_sparse_matrix(tmp_path):
     import scipy.sparse
 
     scipy.io.savemat(tmp_path / "a.mat", {"a": scipy.sparse.csc_matrix(np.diag([1.0, 2.0, 3.0]))}, do_compression=False)
-    sound = (tmp_path / "a.mat").read_bytes()
+    valid = (tmp_path / "a.mat").read_bytes()
     rows = struct.pack("<3i", 0, 1, 2)
-    assert rows in sound
-    (tmp_path / "a.mat").write_bytes(sound.replace(rows, struct.pack("<3i", 0, 1, 10**9), 1))
+    assert rows in valid
+    (tmp_path / "a.mat").write_bytes(valid.replace(rows, struct.pack("<3i", 0, 1, 10**9), 1))
     with pytest.raises(ValueError, match="readable"):
         matlab.load(tmp_path / "a.mat", "a")
 
@@ -224,10 +224,10 @@ def test_text_of_files_is_printed_without_markup(text, tmp_path, capsys):
 def test_a_long_error_is_one_short_line(tmp_path, capsys):
     (tmp_path / "a.csv").write_text("x" * 100_000)
     assert main(["info", str(tmp_path / f"{'a' * 200}.csv"), "--description", "\x1b" + "b" * 3000]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert len(said) <= 400
-    assert "\x1b" not in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert len(message) <= 400
+    assert "\x1b" not in message
 
 
 def test_a_link_is_replaced_and_not_followed(tmp_path):
@@ -291,7 +291,7 @@ def test_a_chunk_that_unpacks_to_gigabytes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         (
             "a.vtk",
@@ -301,9 +301,9 @@ def test_a_chunk_that_unpacks_to_gigabytes(tmp_path):
         ("a.inp", b"*NODE\n1,0,0,0\n*NSET,NSET=a,GENERATE\n1,2000000000,1\n", "GENERATE"),
     ],
 )
-def test_small_mesh_files_of_huge_meshes(tmp_path, name, content, said):
+def test_small_mesh_files_of_huge_meshes(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         read_mesh(tmp_path / name)
 
 

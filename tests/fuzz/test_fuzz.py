@@ -23,7 +23,7 @@ def test_valid_files_are_accepted(name, tmp_path):
 
 def faults(name: str, numbers: range) -> list[str]:
     """The faults among these inputs."""
-    return [f"{at}: {one.kind}: {one.said}" for at, one in tried(READERS[name], numbers) if one.faulty]
+    return [f"{at}: {one.kind}: {one.message}" for at, one in tried(READERS[name], numbers) if one.faulty]
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -85,10 +85,10 @@ def test_an_npy_of_objects(tmp_path, ran):
 
 def test_entities_and_scripts_in_a_drawing(tmp_path):
     (tmp_path / "secret").write_text("12")
-    sound = READERS["layout, svg"].files["a.svg"].decode()
+    valid = READERS["layout, svg"].files["a.svg"].decode()
     entity = f'<!DOCTYPE svg [<!ENTITY e SYSTEM "{(tmp_path / "secret").as_uri()}">]>'
-    declared = sound.replace("?>", f"?>{entity}", 1).replace('id="LABELS"', 'id="LABELS" class="&e;"')
+    declared = valid.replace("?>", f"?>{entity}", 1).replace('id="LABELS"', 'id="LABELS" class="&e;"')
     with pytest.raises(ValueError, match="DOCTYPE"):
         use(READERS["layout, svg"], {"a.svg": declared.encode()}, tmp_path / "entity")
-    script = sound.replace("</svg>", "<script>alert(1)</script></svg>")
+    script = valid.replace("</svg>", "<script>alert(1)</script></svg>")
     assert use(READERS["layout, svg"], {"a.svg": script.encode()}, tmp_path / "script").num_electrodes == 8

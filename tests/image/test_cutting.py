@@ -83,7 +83,7 @@ def test_pages_of_any_plane_are_orthonormal():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: Plane.at("w", 0.1), "axis must be"),
         (lambda: Plane.at("z", np.nan), "value must be"),
@@ -95,8 +95,8 @@ def test_pages_of_any_plane_are_orthonormal():
         (lambda: cut_by_plane(box(0.1, 0.1, 0.1, num_points=100), "z"), "plane must be a Plane"),
     ],
 )
-def test_invalid_planes(make, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_planes(make, message):
+    with pytest.raises(ValueError, match=message):
         make()
 
 
@@ -156,12 +156,12 @@ def test_cells_are_averaged_by_their_volume(tank):
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "message"),
     [(np.zeros(3), "values has shape"), (None, "complex"), ("nan", "finite")],
 )
-def test_invalid_values(tank, values, said):
+def test_invalid_values(tank, values, message):
     made = {None: np.zeros(tank.num_cells, complex), "nan": np.full(tank.num_cells, np.nan)}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         node_values(tank, made[values] if values is None or isinstance(values, str) else values)
     with pytest.raises(ValueError, match="level must be"):
         isosurface_of(tank, np.zeros(tank.num_cells), 0.0)

@@ -77,7 +77,7 @@ def test_named_layouts_for_any_skin_and_diameter(name, outline, number):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("park-inner", "its skin spans -100 to 100 mm by -100 to 100 mm; on another take inner-32"),
         ("perimeter-8", "'perimeter-8' is of rectangles and disks"),
@@ -85,6 +85,6 @@ def test_named_layouts_for_any_skin_and_diameter(name, outline, number):
         ("park-iner", "did you mean 'park-inner'"),
     ],
 )
-def test_names_unsuitable_for_a_skin(name, said):
-    with pytest.raises(ValueError, match=said):
+def test_names_unsuitable_for_a_skin(name, message):
+    with pytest.raises(ValueError, match=message):
         named_layout(name, Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0, 0.05]]))

@@ -136,10 +136,12 @@ def test_places_off_the_surface_are_refused():
     ways, on = Geodesics.create(tube(RADIUS, 0.1, num_points=300)), [[RADIUS, 0, 0.05]]
     assert np.isfinite(ways.distances([[1.04 * RADIUS, 0, 0.05]], on)).all()
     assert np.isfinite(ways.distances([[1.3 * RADIUS, 0, 0.05]], on)).all()  # across a thick skin
-    said = r": 1 of 1 lie off the surface, the first, at \[5\.0, 0\.0, 0\.0\] m, by 4\.9\d+e\+03 mm; give places on it"
-    with pytest.raises(ValueError, match="^sources" + said):
+    message = (
+        r": 1 of 1 lie off the surface, the first, at \[5\.0, 0\.0, 0\.0\] m, by 4\.9\d+e\+03 mm; give places on it"
+    )
+    with pytest.raises(ValueError, match="^sources" + message):
         ways.distances([[5.0, 0, 0]], on)
-    with pytest.raises(ValueError, match="^targets" + said):
+    with pytest.raises(ValueError, match="^targets" + message):
         ways.distances(on, [[5.0, 0, 0]])
 
 

@@ -253,23 +253,23 @@ def test_slice_of_a_solid(ax):
         plot_image(solid, lower, height=1.0)
 
 
-@pytest.mark.parametrize(("number", "titles"), [(4, 2), (5, 2), (6, 3)])
-def test_too_few_frames_have_no_spectrum(mesh, number, titles):
+@pytest.mark.parametrize(("number", "further"), [(4, 2), (5, 2), (6, 3)])
+def test_too_few_frames_have_no_spectrum(mesh, number, further):
     """Five frames have a single frequency, which is no line."""
     swing = np.cos(np.arange(number))[:, None] * np.ones(mesh.num_cells)
     drawn = plot_series(ImageSeries(mesh, swing, 0.1 * np.arange(number)), {"all": np.ones(mesh.num_cells, bool)})
-    said = [ax.get_title() for ax in drawn.axes if ax.get_title()]
-    assert said[:number] == [f"{one:.2f} s" for one in 0.1 * np.arange(number)]
-    assert said[number:] == ["functional image", "regions over time", "their spectra"][:titles]
-    assert all(len(ax.lines[0].get_xdata()) > 1 for ax in drawn.axes if ax.get_title() in said[number + 1 :])
+    titles = [ax.get_title() for ax in drawn.axes if ax.get_title()]
+    assert titles[:number] == [f"{one:.2f} s" for one in 0.1 * np.arange(number)]
+    assert titles[number:] == ["functional image", "regions over time", "their spectra"][:further]
+    assert all(len(ax.lines[0].get_xdata()) > 1 for ax in drawn.axes if ax.get_title() in titles[number + 1 :])
 
 
 def test_a_functional_image_of_a_solid_states_the_plane():
     tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=600)
     series = ImageSeries(tank, np.ones((2, tank.num_cells)), np.arange(2.0))
-    for height, said in ((None, "20.0"), (0.03, "30.0")):
+    for height, place in ((None, "20.0"), (0.03, "30.0")):
         titles = [ax.get_title() for ax in plot_series(series, {}, height=height).axes]
-        assert f"functional image, slice at z = {said} mm" in titles
+        assert f"functional image, slice at z = {place} mm" in titles
 
 
 def test_sensitivity_is_lowest_in_the_middle(mesh, electrodes, ax):

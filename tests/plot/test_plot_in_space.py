@@ -95,7 +95,7 @@ def test_a_surface_without_values_has_no_colour_bar(ax):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ((np.zeros((3, 2)), [[0, 1, 2]]), "points has shape"),
         ((np.full((3, 3), np.nan), [[0, 1, 2]]), "points must be finite"),
@@ -106,8 +106,8 @@ def test_a_surface_without_values_has_no_colour_bar(ax):
         ((np.eye(3), [[0, 1, 2]], [np.inf]), "finite"),
     ],
 )
-def test_invalid_surfaces(arguments, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_surfaces(arguments, message):
+    with pytest.raises(ValueError, match=message):
         plot_surface(*arguments)
 
 
@@ -323,7 +323,7 @@ def test_a_constant_image_is_drawn(tank):
 
 
 @pytest.mark.parametrize(
-    ("draw", "said"),
+    ("draw", "message"),
     [
         (lambda tank: plot_isosurfaces(tank, np.zeros(tank.num_cells), levels=(1.5,)), "levels must be shares"),
         (lambda tank: plot_isosurfaces(tank, np.zeros(tank.num_cells), levels=()), "levels must be shares"),
@@ -338,8 +338,8 @@ def test_a_constant_image_is_drawn(tank):
         (lambda tank: plot_solid(disk(0.1, num_points=50), np.zeros(70)), "plane mesh"),
     ],
 )
-def test_invalid_solids(tank, draw, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_solids(tank, draw, message):
+    with pytest.raises(ValueError, match=message):
         draw(tank)
 
 

@@ -48,9 +48,9 @@ def test_round_trip_of_fitted_bodies(tmp_path):
     np.savez(tmp_path / "image.npz", **arrays)
     assert read_image(tmp_path / "image.npz").inclusions == found
     bad = {"inclusion_axes": np.full((2, 3, 3), np.nan)}, {"inclusion_columns": np.array([True])}
-    for changed, said in zip(bad, ("not finite", "not of every inclusion"), strict=True):
+    for changed, message in zip(bad, ("not finite", "not of every inclusion"), strict=True):
         np.savez(tmp_path / "image.npz", **arrays | changed)
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             read_image(tmp_path / "image.npz")
 
 
@@ -73,7 +73,7 @@ def test_files_of_earlier_versions_have_neither_electrodes_nor_inclusions(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"conductivity": None}, "no array 'conductivity'"),
         ({"conductivity": np.zeros(3)}, "there are .* cells"),
@@ -94,9 +94,9 @@ def test_files_of_earlier_versions_have_neither_electrodes_nor_inclusions(tmp_pa
         ({"images": np.zeros(2), "conductivity": None}, "many frames"),
     ],
 )
-def test_inconsistent_content_is_reported(changed, said, tmp_path):
+def test_inconsistent_content_is_reported(changed, message, tmp_path):
     np.savez(tmp_path / "image.npz", **content(**changed))
-    with pytest.raises(ValueError, match=rf"^image\.npz: .*{said}"):
+    with pytest.raises(ValueError, match=rf"^image\.npz: .*{message}"):
         read_image(tmp_path / "image.npz")
 
 

@@ -45,8 +45,8 @@ def test_a_contact_sheet_has_one_scale_times_and_refusals():
     assert {ax.images[1].get_clim() for ax in shown} == {shown[0].images[1].get_clim()}
     assert shown[0].images[1].get_clim()[1] == pytest.approx(2, rel=0.1)  # mS: of all frames, the last is strongest
     assert [ax.images[1].get_visible() for ax in shown] == [False] + 11 * [True]
-    said = [[text.get_visible() for text in ax.texts if text.get_text() == "refused"] for ax in shown]
-    assert said == [[True], *11 * [[False]]]
+    marked = [[text.get_visible() for text in ax.texts if text.get_text() == "refused"] for ax in shown]
+    assert marked == [[True], *11 * [[False]]]
     assert figure.get_supxlabel() == "12 of 30 frames; 2 of 30 refused: 0.0 s, 0.4 s"
     assert any("mS" in ax.get_ylabel() for ax in figure.axes)  # the colour bar
     bars = [text.get_text() for text in shown[0].texts]

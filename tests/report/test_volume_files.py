@@ -104,7 +104,7 @@ def test_inconsistent_input_is_reported_and_leaves_no_file(tank, frames, tmp_pat
         "cell_data is empty": lambda: write_xdmf(tmp_path / "a.xdmf", tank, TIMES, {}),
         "must end in .xdmf": lambda: write_xdmf(tmp_path / "a.h5", tank, TIMES, {"change": frames}),
     }
-    for said, write in wrong.items():
-        with pytest.raises(ValueError, match=said):
+    for message, write in wrong.items():
+        with pytest.raises(ValueError, match=message):
             write()
     assert list(tmp_path.iterdir()) == []
