@@ -1,6 +1,8 @@
-"""The licence of every package that jeit needs, or that an extra asks for; 1 where one does not go with Apache-2.0.
+"""Print the licence of every package that jeit or one of its extras needs, and exit with 1 if one is incompatible with
+Apache-2.0.
 
-`python .ci/licences.py`, in an environment where jeit and its extras are installed; what is not is named.
+Run `python .ci/licences.py` in an environment where jeit and its extras are installed. Packages that are not installed
+are listed as such.
 """
 
 import re
@@ -9,10 +11,11 @@ from importlib import metadata
 
 from packaging.requirements import Requirement
 
-# Such as may be used by what is under Apache-2.0; of weaker copyleft, that ask nothing of a program that imports them.
+# Licences compatible with Apache-2.0, and weak copyleft licences, which do not affect programs that only import a
+# package.
 FREE = ("Apache", "BSD", "MIT", "Python", "PSF", "ISC", "HPND", "MPL", "Mozilla", "Zlib", "Unlicense", "CC0", "0BSD")
 WEAK = ("LGPL", "Lesser General Public")
-# Tools that write no part of jeit, and extras that a user asks for: named, with the reason why they may be used.
+# Exceptions, each with the reason why it is permitted: tools that contribute no code to jeit, and optional extras.
 KNOWN = {
     "gmsh": "GPL-2.0-or-later: the extra 'mesh' alone imports it; what is given away with it is under the GPL.",
     **dict.fromkeys(
@@ -23,7 +26,8 @@ KNOWN = {
 
 
 def licence_of(name: str) -> str:
-    """As its metadata say: the expression, else the classifiers, else the first words of the text."""
+    """Return the licence according to a package's metadata: the expression, else the classifiers, else the start of the
+    text."""
     about = metadata.metadata(name)
     own = [one.rpartition(" :: ")[2] for one in about.get_all("Classifier", []) if one.startswith("License ::")]
     own = [one for one in own if one != "OSI Approved"]
@@ -33,7 +37,7 @@ def licence_of(name: str) -> str:
 
 
 def needed(name: str, extras: set[str], seen: set[tuple[str, str]]) -> None:
-    """All packages beneath one that are asked for on this machine, with the extras of each."""
+    """Add to `seen` all dependencies of a package on this machine, recursively, with the extras of each."""
     for extra in {"", *extras}:
         if (name, extra) in seen:
             continue
@@ -48,7 +52,7 @@ def needed(name: str, extras: set[str], seen: set[tuple[str, str]]) -> None:
 
 
 def main() -> int:
-    """Print them, and what is wrong."""
+    """Print all packages with their licences and return 1 if a licence is incompatible."""
     seen: set[tuple[str, str]] = set()
     needed("jeit", set(metadata.metadata("jeit").get_all("Provides-Extra", [])), seen)
     faults = 0

@@ -1,12 +1,12 @@
-"""Install jeit on every Python at hand, newest packages and least, run its main command and tests, and print a table.
+"""Install jeit on every available Python, with the newest and the lowest versions of packages, and test it.
 
-    python .ci/pythons.py                         # every Python, and the oldest with the least versions: what CI runs
-    python .ci/pythons.py --whole 3.13 least-3.11 # the README's tests, whole, on some of them
+    python .ci/pythons.py                         # every Python, and the oldest with the lowest versions, as CI does
+    python .ci/pythons.py --whole 3.13 least-3.11 # the whole test suite on some of them
 
-Each row is a virtual environment of its own, into which the built wheel goes: bare, where the main command runs and
-every module is imported, then with all extras at once, where tests run; on the newest Python, each extra alone, too.
-Versions of `least` are those that uv finds for the lower bounds of pyproject.toml. A Python is looked for on the PATH
-and under pyenv; one that is missing is a row that says so.
+Each row is a virtual environment of its own with the built wheel. First the main command runs and every module is
+imported without extras. Then all extras are installed at once and the tests run. On the newest Python, each extra is
+also installed alone. The versions of `least` are those that uv finds for the lower bounds of pyproject.toml. A Python
+is looked up on the PATH and under pyenv; the row of a missing one says so.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PYTHONS = [one.rpartition(" ")[2] for one in PROJECT["classifiers"] if re.search
 EXTRAS = list(PROJECT["optional-dependencies"])
 SELECTION = (ROOT / "tests" / "selection.txt").read_text("utf-8").split()
 
-# Every module of both packages, with no extra installed; whichever says that it needs one is not counted as a fault.
+# Import every module of both packages without any extra; an ImportError of an optional package is not an error here.
 IMPORT_ALL = """
 import importlib, pkgutil, jeit, jeit_solvers
 from jeit.arguments.extras import EXTRAS
@@ -53,7 +53,7 @@ COUNTS = r"\d+ (?:passed|failed|errors?|skipped)"
 
 
 def interpreter(version: str) -> str | None:
-    """The path of a Python of this version, such as "3.12", that runs; None where there is none."""
+    """Return the path of a working Python of this version, such as "3.12"; None if there is none."""
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
     under_pyenv = sorted(pyenv.glob(f"{version}.*/bin/python"), key=lambda path: int(path.parts[-3].split(".")[2]))
     for one in (shutil.which(f"python{version}"), *reversed(under_pyenv)):
@@ -64,12 +64,12 @@ def interpreter(version: str) -> str | None:
 
 
 def first(versions: list[str]) -> str | None:
-    """The path of the first of these that is at hand."""
+    """Return the path of the first of these versions that is available."""
     return next(filter(None, map(interpreter, versions)), None)
 
 
 class Row:
-    """One environment: what is done in it, and the seconds that each step took, as cells of a table."""
+    """One environment: the steps run in it, and the seconds that each step took, as cells of a table."""
 
     def __init__(self, name: str, folder: Path, uv: Path):
         self.name, self.folder, self.python = name, folder, folder / ".venv" / "bin" / "python"
@@ -77,7 +77,7 @@ class Row:
         self.cells: list[str] = []
 
     def step(self, title: str, *commands: tuple, found: str = "", where: Path | None = None) -> None:
-        """Run commands, and add a cell: the seconds, and what of the output's lines `found` finds."""
+        """Run commands and add a cell: the seconds, and the matches of the pattern `found` in the output."""
         print(f"== {self.name}: {title}", flush=True)
         start, lines = time.monotonic(), ""
         for command in commands:
@@ -93,14 +93,16 @@ class Row:
         self.cells.append(", ".join([*(re.findall(found, lines) if found else ()), seconds]))
 
     def installing(self, *what: str | Path) -> tuple:
-        """The command that installs something here: by uv, which takes what pip takes, in a fifth of the time."""
+        """Return the command that installs packages here. It uses uv, which accepts pip's arguments and is about five
+        times as fast."""
         return (self.uv, "pip", "install", "--quiet", "--python", self.python, *what)
 
 
 def least(uv: Path, python: str, folder: Path) -> Path:
-    """A file of constraints: every package that pyproject.toml names, at the least version that has a wheel."""
+    """Write a file of constraints: every package named in pyproject.toml, at its lowest permitted version that has a
+    wheel."""
     made = folder / "least.txt"
-    # MiniSom has no wheels, and needs none.
+    # MiniSom has no wheels and does not need them.
     wheels = ("--only-binary", ":all:", "--no-binary", "minisom")
     resolve = ("pip", "compile", "--quiet", "--resolution", "lowest-direct", "--all-extras", "--python", python)
     subprocess.run([uv, *resolve, *wheels, ROOT / "pyproject.toml", "-o", made], check=True, stdout=subprocess.DEVNULL)
@@ -108,7 +110,7 @@ def least(uv: Path, python: str, folder: Path) -> Path:
 
 
 def fill(made: Row, wheel: Path, uv: Path, *, whole: bool, tested: bool) -> None:
-    """Do everything in one environment, "3.12" or "least-3.11"; where it is `tested` elsewhere, all but the tests."""
+    """Run all steps in one environment, "3.12" or "least-3.11"; without the tests if they are `tested` elsewhere."""
     name, folder = made.name, made.folder
     version = name.removeprefix("least-")
     python = interpreter(version)
@@ -121,9 +123,9 @@ def fill(made: Row, wheel: Path, uv: Path, *, whole: bool, tested: bool) -> None
     if not (folder / "out" / "image.png").stat().st_size:
         raise SystemExit(f"{name}: the main command made no picture")
     made.step("import every module", (made.python, "-c", IMPORT_ALL), found=r"\d+ modules")
-    # The linters and the documentation's tools are no part of what old versions are tried with.
+    # Linters and documentation tools are not tested with the lowest versions.
     together = ",".join(one for one in EXTRAS if not constraints or one not in ("docs", "dev"))
-    # The wheel is tested; but all tests need the sources, as the README's command has them: some import the benchmarks.
+    # The wheel is tested. The whole suite needs the sources, because some tests import the benchmarks.
     sources = [made.installing(*constraints, "-e", f"{ROOT}[test]")] if whole else []
     made.step("install all extras", made.installing(*constraints, f"{wheel}[{together}]"), *sources)
     command = (made.python, "-m", "pytest") if whole else (made.python.with_name("pytest"), *SELECTION)
@@ -137,7 +139,7 @@ def fill(made: Row, wheel: Path, uv: Path, *, whole: bool, tested: bool) -> None
 
 
 def alone(extra: str, wheel: Path, uv: Path, python: str) -> list[tuple]:
-    """The commands that install one extra into an environment of its own, and look whether its packages are there."""
+    """Return the commands that install one extra into its own environment and check that its packages are there."""
     its_own = Path("alone") / "bin" / "python"
     return [
         (uv, "venv", "--quiet", "--clear", "--python", python, "alone"),
@@ -148,7 +150,7 @@ def alone(extra: str, wheel: Path, uv: Path, python: str) -> list[tuple]:
 
 
 def from_sources(archive: Path, uv: Path, python: str, folder: Path) -> None:
-    """Install the source distribution as pip does from an index, and call the command that it brings."""
+    """Install the source distribution as pip does from an index, and run its command."""
     its_own = folder / "sources" / "bin" / "python"
     for command in (
         (uv, "venv", "--quiet", "--python", python, its_own.parents[1]),
@@ -159,7 +161,7 @@ def from_sources(archive: Path, uv: Path, python: str, folder: Path) -> None:
 
 
 def main() -> int:
-    """Build and check a source distribution and a wheel made of it, make the rows, print the table."""
+    """Build and check a source distribution and a wheel, fill the rows and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     every = [*PYTHONS, f"least-{PYTHONS[0]}"]
     parser.add_argument("names", nargs="*", default=every, help="such as 3.12, or least-3.11")

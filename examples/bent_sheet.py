@@ -1,7 +1,8 @@
-"""A square of skin with 14 places to press, after Russo et al. 2017, flat and bent to a radius of 3 cm.
+"""A square skin with 14 places to press, after Russo et al. 2017, flat and bent to a radius of 3 cm.
 
-Bending a sheet without thickness changes no voltage; of a layer 5 mm thick it stretches the touched side by a sixth.
-The same presses are told on the bent skin by what was learnt bent, and by what was learnt flat. See `bent_sheet.png`.
+Bending a sheet without thickness changes no voltage. In a layer 5 mm thick it stretches the touched side by a sixth.
+The presses on the bent skin are classified by a model trained on the bent skin and by one trained on the flat skin. See
+`bent_sheet.png`.
 """
 
 import matplotlib.pyplot as plt
@@ -19,18 +20,18 @@ JITTER, NOISE = 1e-3, 1e-5  # metres, volts
 
 
 def rolled(places, above: float = 0.0) -> np.ndarray:
-    """Where places (n, 2) of the flat sheet come to be on the bent one, or so far above it, metres."""
+    """Positions on the bent sheet, or at a height above it, of places (n, 2) of the flat sheet, metres."""
     radius, angle = RADIUS + above, places[:, 0] / RADIUS
     return np.column_stack([radius * np.sin(angle), places[:, 1], radius * np.cos(angle) - RADIUS])
 
 
 def flat(places, above: float = 0.0) -> np.ndarray:
-    """The same while it lies flat."""
+    """Positions on the flat sheet, or at a height above it, of places (n, 2), metres."""
     return np.column_stack([places, np.full(len(places), above)])
 
 
 def features(skin: Skin, lay, places, rng) -> np.ndarray:
-    """Changes of voltages by a press at each of some places, 1 mm off at random and 1.5 or 2.5 mm deep, relative to the
+    """Voltage changes by a press at each place, displaced at random by 1 mm and 1.5 or 2.5 mm deep, relative to the
     voltages' root mean square."""
     pressed = lay(places + JITTER * rng.normal(size=places.shape), THICKNESS)
     deeper = rng.permutation(np.arange(len(places)) % 2 == 0)
@@ -53,7 +54,7 @@ def main() -> float:
         layout = SurfaceLayout(lay(centres), 9e-3, mesh, contact_impedance=1e-4, name=name)
         options = {"thickness": THICKNESS, "num_layers": 3, "protocol": opposite(16)}
         skins[name] = Skin.create(layout, **options), lay
-    learnt = {
+    models = {
         name: LinearDiscriminantAnalysis(solver="lsqr", shrinkage="auto").fit(
             features(skin, lay, places[label], rng), label
         )
@@ -62,20 +63,20 @@ def main() -> float:
     asked = np.repeat(np.arange(len(places)), 6)
     tested = {name: features(skin, lay, places[asked], rng) for name, (skin, lay) in skins.items()}
     right = {
-        f"learnt {a}, tested {b}": float(np.mean(learnt[a].predict(tested[b]) == asked))
+        f"trained {a}, tested {b}": float(np.mean(models[a].predict(tested[b]) == asked))
         for a, b in (("flat", "flat"), ("bent", "bent"), ("flat", "bent"))
     }
     figure, (space, bars) = plt.subplots(1, 2, figsize=(11, 4.6), layout="constrained", width_ratios=(3, 2))
     layout = skins["bent"][0].layout
     plot_curved_skin(layout, marks={"pressed": rolled(places)}, title="Bent to 3 cm", scale=ColourScale(), ax=space)
     bars.barh(list(right), [100 * share for share in right.values()], color="#1f6fb4")
-    bars.set_xlabel("presses told right (%)")
+    bars.set_xlabel("presses classified correctly (%)")
     bars.set_xlim(0, 100)
     bars.spines[["top", "right"]].set_visible(False)
     figure.savefig("bent_sheet.png", dpi=120)
-    for told, share in right.items():
-        print(f"{told}: {100 * share:.0f} %")
-    return 1 - right["learnt bent, tested bent"]
+    for condition, share in right.items():
+        print(f"{condition}: {100 * share:.0f} %")
+    return 1 - right["trained bent, tested bent"]
 
 
 if __name__ == "__main__":

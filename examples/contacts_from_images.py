@@ -1,4 +1,5 @@
-"""Contacts in images of a pressed skin, after Chen et al. 2022: every step, two weights, error, load curve, strokes.
+"""Contacts in images of a pressed skin, after Chen et al. 2022: processing steps, two weights, errors, load curve and
+strokes.
 
 See `contacts_from_images.png`.
 """
@@ -76,17 +77,17 @@ def main() -> float:
         assert (np.diff(parts[1]) > 0).all()
         assert np.abs(parts[2] / parts[2].mean() - 1).max() < 0.1
         assert [len(one) for one in contacts[-2:]] == [2, 2]
-        assert contacts[-1][0].centroid[0] > 0  # the heavier is the stronger
+        assert contacts[-1][0].centroid[0] > 0  # the heavier weight gives the stronger contact
         if name == "one-step":
             worst = float(off.max())
             plot_contacts(coarse.mesh, images[-1], contacts[-1], title="100 g and 200 g", ax=two)
             raster = RasterFinder(coarse.mesh).stages(images[-2], noise[name])
             plot_contact_stages(raster, axes=stages.subplots(1, 6))
 
-    # No contact where nothing touches.
+    # No contact is detected on the untouched skin.
     assert not any(found("one-step", skin.frames(jax.random.key(3), [()] * 1000))[1])
 
-    # Two fingers at once, on paths of their own.
+    # Two fingers at once, each on its own path.
     seconds = np.arange(30) / 30
     along = np.linspace(-0.025, 0.025, 30)
     strokes = [

@@ -1,4 +1,5 @@
-"""Two layouts of 32 electrodes on a 200 × 200 × 10 mm skin, touched all over; see `design_a_skin.png`."""
+"""Compare two layouts of 32 electrodes on a 200 × 200 × 10 mm skin, with touches everywhere; see
+`design_a_skin.png`."""
 
 from matplotlib.figure import Figure
 
@@ -16,9 +17,9 @@ def main() -> float:
         plot_taxels(response.taxels, electrodes=layout.centres, title="virtual taxels", ax=row[1])
     figure.savefig("design_a_skin.png", dpi=120)
     inner, boundary = result.figures
-    for told in (inner, boundary):
-        area = told["taxel_area_cm2"]
-        print(f"{told['layout']}: taxels of {area['mean']:.1f} ± {area['std']:.1f} cm²")
+    for figures in (inner, boundary):
+        area = figures["taxel_area_cm2"]
+        print(f"{figures['layout']}: taxels of {area['mean']:.1f} ± {area['std']:.1f} cm²")
     print(f"blind spot of the boundary layout: {100 * boundary['blind_spot_fraction']:.0f} % of the area")
     return inner["taxel_area_cm2"]["mean"] / boundary["taxel_area_cm2"]["mean"]
 

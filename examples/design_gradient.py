@@ -1,4 +1,5 @@
-"""The gradient of a voltage in where electrodes are, checked by moving one of them; see `design_gradient.png`."""
+"""The gradient of a voltage with respect to electrode positions, checked by moving an electrode; see
+`design_gradient.png`."""
 
 import equinox as eqx
 import jax
@@ -22,7 +23,7 @@ def main() -> float:
     difference = (first_voltage(position + step) - first_voltage(position - step)) / 2e-6
 
     ax = plot_mesh(mesh, model.electrodes, title="Where to move electrodes for a greater first voltage")
-    arrows = 0.012 * gradient / jnp.linalg.norm(gradient, axis=1).max()  # metres, the longest 12 mm
+    arrows = 0.012 * gradient / jnp.linalg.norm(gradient, axis=1).max()  # metres; the longest arrow is 12 mm
     ax.quiver(*position.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color="#157f3b", width=0.008, zorder=5)
     ax.figure.savefig("design_gradient.png")
     return float(abs(gradient[0, 0] / difference - 1))

@@ -1,4 +1,4 @@
-"""A pat, a tickle and a stroke on a simulated skin, followed by 25 microphones; see `hear_a_stroke.png`."""
+"""A pat, a tickle and a stroke on a simulated skin, tracked by 25 microphones; see `hear_a_stroke.png`."""
 
 import jax
 import numpy as np
@@ -26,7 +26,7 @@ from jeit.layout import grid
 
 OUTLINE = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]  # metres
 KEYS = jax.random.split(jax.random.key(1), 4)
-LASTS = 1.5  # seconds, each touch
+LASTS = 1.5  # duration of each touch in seconds
 
 
 def main() -> float:
@@ -43,15 +43,15 @@ def main() -> float:
         ),
     }
     samples = np.concatenate([touch.samples for touch in touches.values()], axis=1)
-    heard = intensities(Recording(samples, skin.rate))
-    found = locate(heard, calibration)
+    levels = intensities(Recording(samples, skin.rate))
+    found = locate(levels, calibration)
     localiser = Localiser.create(calibration.microphone_array, method="consistency", map_shape=(100, 100))
-    images = map_brightness(localiser.maps(heard.power), method="consistency") * found.has_position[:, None, None]
+    images = map_brightness(localiser.maps(levels.power), method="consistency") * found.has_position[:, None, None]
 
     figure = Figure(figsize=(13.5, 4.8), layout="compressed")
     paths = {}
     for number, (ax, name) in enumerate(zip(figure.subplots(1, 3), touches, strict=True)):
-        during = heard.times // LASTS == number
+        during = levels.times // LASTS == number
         places = jax.tree.map(lambda values, during=during: values[during], found)
         path = paths[name] = follow(places)
         seen = overlay_images(images[during], path.times, time_constant=0.7)[path.touches[-1].last]

@@ -1,4 +1,4 @@
-"""A light tap on a simulated skin, found by 25 microphones in two ways; see `hear_a_touch.png`."""
+"""A light tap on a simulated skin, located by 25 microphones with two methods; see `hear_a_touch.png`."""
 
 import jax
 import numpy as np
@@ -31,8 +31,8 @@ def main() -> float:
 
     truth = np.array([0.031, -0.022])
     light = simulate_tap(skin, jax.random.key(2), truth, burst=Burst(0.7), duration=0.5)
-    heard = intensities(Recording(light.samples, light.rate))
-    loudest = heard.power[[heard.power.sum(axis=1).argmax()]]
+    levels = intensities(Recording(light.samples, light.rate))
+    loudest = levels.power[[levels.power.sum(axis=1).argmax()]]
 
     figure = Figure(figsize=(11.2, 5.2), layout="compressed")
     error = {}

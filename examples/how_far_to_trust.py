@@ -1,5 +1,5 @@
-"""Why contrast and area of a body are so hard to separate, and how good their intervals are in tanks that are not as
-they are described; see `trust_mechanism.png` and `how_far_to_trust.png`."""
+"""Why the contrast and the area of a body are hard to separate, and how reliable their intervals are in tanks that
+differ from their description; see `trust_mechanism.png` and `how_far_to_trust.png`."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,7 +17,8 @@ INK, BLUE, RED = "#26282b", "#3b7fb5", "#c4473a"
 
 
 def tank(rng) -> ForwardModel:
-    """A tank whose electrodes are 1.5° from where they are described, and whose contacts differ by a factor of two."""
+    """A tank whose electrodes are 1.5° from their described positions and whose contact impedances differ by a factor
+    of two."""
     turned = np.arctan2(*np.asarray(DESCRIBED.position).T[::-1]) + np.deg2rad(1.5) * rng.normal(size=16)
     place = RADIUS * np.stack([np.cos(turned), np.sin(turned)], axis=1)
     electrodes = BoundaryElectrodes(place, 0.02, 0.005 * np.exp(0.7 * rng.normal(size=16)))
@@ -31,7 +32,8 @@ def voltages(model: ForwardModel, change: float = 0.0, area: float = 1e-3) -> np
 
 
 def mechanism() -> Figure:
-    """Two bodies of one strength in the described tank, and what each error of the tank does to the same voltages."""
+    """Two bodies of equal strength in the described tank, and the effect of each error of the tank on the same
+    voltages."""
     model = ForwardModel(body_mesh(Disk(RADIUS), DESCRIBED, 5000), DESCRIBED, PROTOCOL)
     weak, strong = (0.5, 2.35e-3), (1.0, 2.35e-3 * (0.5 / 2.5) / (1 / 3))
     rest, of_weak, of_strong = voltages(model), voltages(model, *weak), voltages(model, *strong)
@@ -53,7 +55,7 @@ def mechanism() -> Figure:
 
 
 def intervals() -> tuple[Figure, int]:
-    """Five tanks, each with a body, and the 68 % intervals of its change and its area; and how many hold the truth."""
+    """Five tanks, each with a body: the 68 % intervals of its change and its area, and how many contain the truth."""
     figure = Figure(figsize=(8, 3.2), layout="constrained")
     change_ax, area_ax = figure.subplots(1, 2)
     held = 0
@@ -82,7 +84,7 @@ def intervals() -> tuple[Figure, int]:
 
 
 def main() -> float:
-    """The share of intervals that do not hold the truth."""
+    """Return the fraction of intervals that do not contain the truth."""
     mechanism().savefig("trust_mechanism.png", dpi=110)
     picture, held = intervals()
     picture.savefig("how_far_to_trust.png", dpi=110)

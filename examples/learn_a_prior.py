@@ -1,4 +1,4 @@
-"""The weight and the correlation length of a prior learnt from examples, by the gradient of the images' error; see
+"""Learn the weight and the correlation length of a prior from examples, by the gradient of the image error; see
 `learn_a_prior.png`."""
 
 from typing import Any
@@ -20,7 +20,8 @@ RANDOM = np.random.default_rng(0)
 
 
 def bodies(number: int) -> np.ndarray:
-    """Two discs each (number, 2, 4): x, y and radius in metres, conductivity in backgrounds, half or one and a half."""
+    """Two discs per body (number, 2, 4): x, y and radius in metres, and conductivity relative to the background, 0.5 or
+    1.5."""
     place = RADIUS * (RANDOM.random((number, 2, 1)) * 0.75) ** 0.5 * 0.9
     angle = 2 * np.pi * RANDOM.random((number, 2, 1))
     radius = RADIUS * (0.12 + 0.13 * RANDOM.random((number, 2, 1)))
@@ -29,7 +30,7 @@ def bodies(number: int) -> np.ndarray:
 
 
 def conductivities(mesh, discs: np.ndarray) -> np.ndarray:
-    """(number, m) siemens."""
+    """Conductivities (number, m) in siemens."""
     centre, values = np.asarray(centroids(mesh)), np.full((len(discs), mesh.num_cells), BACKGROUND)
     for body, value in zip(discs, values, strict=True):
         for x, y, radius, factor in body:
@@ -55,7 +56,7 @@ def main() -> float:
         return linear.image(changes[which])
 
     def error(logarithms, which):
-        """Root mean square of image - truth over that of the truth."""
+        """Root mean square of the image error, relative to that of the truth."""
         missed = (images(logarithms, which) - truth[which]) ** 2 @ area
         return jnp.sqrt(missed.sum() / (truth[which] ** 2 @ area).sum())
 

@@ -1,6 +1,6 @@
-"""Gestures of a touched skin, named while it is touched: learnt from simulated recordings, then in a program's loop.
+"""Classify gestures on a skin while it is touched: train on simulated recordings, then classify in a program's loop.
 
-The stream is played from a file; `jeit.live.prepare("serial:/dev/ttyACM0@115200", ...)` takes it from a device. See
+The stream is read from a file; `jeit.live.prepare("serial:/dev/ttyACM0@115200", ...)` reads it from a device. See
 `live_gestures.png`.
 """
 
@@ -62,7 +62,7 @@ def main() -> float:
         ax.text(second, 1e3 * max(strength) * (1.02 + 0.09 * (number % 3)), event.split(" at ")[0], fontsize=8)
     ax.set(xlabel="time (s)", ylabel="largest change (mS)", ylim=(0, 1.3e3 * max(strength)))
     figure.savefig("live_gestures.png", dpi=110)
-    # A touch is named as soon as it has ended; one that goes on is named anew.
+    # A touch is classified as soon as it ends. A touch that resumes is classified again.
     return max(min(abs(second - end) for second, _ in named) for end in stream.offset.tolist())
 
 

@@ -1,4 +1,4 @@
-"""A robot's loop over live frames: where a rod in a tank is, sixty times a second, without a browser.
+"""A robot's loop over live frames: locate a rod in a tank sixty times a second, without a browser.
 
 The tank is simulated; `jeit.live.prepare("serial:/dev/ttyACM0@115200", "empty.csv", description="tank.toml")` opens a
 measured one. See `live_places.png`.
@@ -15,14 +15,14 @@ SECONDS = 4.0
 
 
 def avoid(frame: LiveFrame, picture: Picture) -> tuple[float, float] | None:
-    """What a robot does with a picture: here, say where the strongest contact is, if there is one."""
+    """What a robot does with an image: here, print the position of the strongest contact, if there is one."""
     return (picture.markers[0].x, picture.markers[0].y) if picture.markers else None
 
 
 def main() -> float:
     source = simulated_tank(rate=60.0, limit=int(60 * SECONDS))
     images = ConductivityView.prepare(source.reference, StreamSettings(solver="one-step"))
-    view = ContactsView(images, np.asarray(source.reference.voltages), sign=-1)  # a rod conducts worse
+    view = ContactsView(images, np.asarray(source.reference.voltages), sign=-1)  # the rod is less conductive
 
     seconds, found, true, latency = [], [], [], []
     for result in jeit.live.frames(source, view):

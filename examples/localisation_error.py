@@ -1,4 +1,4 @@
-"""A vibrator at 169 places of a simulated skin, each found in two ways; see `localisation_error.png`."""
+"""A vibrator at 169 places of a simulated skin, located by two methods; see `localisation_error.png`."""
 
 import jax
 import numpy as np
@@ -22,7 +22,7 @@ BURSTS = 10  # a second at 10 Hz
 
 
 def tapped(skin: SoundingSkin, key, places, repeats: int) -> Taps:
-    """What is heard of so many taps at each place."""
+    """Intensities recorded from several taps at each place."""
     taps = simulate_calibration_taps(skin, key, places, repeats=repeats)
     return Taps(skin.microphones, OUTLINE, taps.positions, samples=taps.samples, rate=taps.rate)
 
@@ -33,10 +33,10 @@ def main() -> float:
 
     truth = grid(0.15, 0.15, 13, 13)
     rows = zip(jax.random.split(jax.random.key(2), 13), np.split(truth, 13), strict=True)
-    heard = [tap_intensities(tapped(skin, key, row, BURSTS)) for key, row in rows]
-    power = np.concatenate([row.power for row in heard]).reshape(len(truth), BURSTS, -1).mean(axis=1)
-    floor = np.mean([row.floor for row in heard], axis=0)
-    freedom = BURSTS * float(np.median([row.freedom for row in heard]))
+    levels = [tap_intensities(tapped(skin, key, row, BURSTS)) for key, row in rows]
+    power = np.concatenate([row.power for row in levels]).reshape(len(truth), BURSTS, -1).mean(axis=1)
+    floor = np.mean([row.floor for row in levels], axis=0)
+    freedom = BURSTS * float(np.median([row.freedom for row in levels]))
     vibrations = Intensities(np.arange(len(truth), dtype=float), power, floor=floor, freedom=freedom)
 
     figure = Figure(figsize=(11, 6.2), layout="compressed")
@@ -44,8 +44,8 @@ def main() -> float:
     for ax, (method, title) in zip(figure.subplots(1, 2), TITLES.items(), strict=True):
         found = locate(vibrations, calibration, method=method).position
         error[method] = np.linalg.norm(found - truth, axis=1)
-        told = f"{1e3 * np.nanmean(error[method]):.1f} ± {1e3 * np.nanstd(error[method]):.1f} mm"
-        plot_position_errors(truth, found, skin.microphones, OUTLINE, title=f"{title}: {told}", ax=ax)
+        summary = f"{1e3 * np.nanmean(error[method]):.1f} ± {1e3 * np.nanstd(error[method]):.1f} mm"
+        plot_position_errors(truth, found, skin.microphones, OUTLINE, title=f"{title}: {summary}", ax=ax)
     figure.savefig("localisation_error.png", dpi=120)
     return float(np.nanmean(error["likelihood"]))
 
@@ -53,4 +53,4 @@ def main() -> float:
 if __name__ == "__main__":
     error = main()
     print(f"mean error {1e3 * error:.1f} mm")
-    assert error < 0.0025  # metres; the real skin, with the paper's loss: 6.6 mm
+    assert error < 0.0025  # metres; the real skin with the paper's loss function: 6.6 mm

@@ -1,4 +1,4 @@
-"""A load in newtons on a skin: indenter, pressure, conductivity and a frame in time; see `press_with_a_load.png`."""
+"""A load in newtons on a skin: indenter, pressure, conductivity and a frame over time; see `press_with_a_load.png`."""
 
 import jax
 import matplotlib.pyplot as plt
@@ -20,7 +20,7 @@ def main() -> float:
         PlacedIndenter(ball_indenter(0.016), (0.012, 0.0)), PlacedIndenter(BarIndenter(0.016, 0.005), (-0.01, 0.0), 0.6)
     )
 
-    # Pressed for four seconds, held, lifted; read 20 times a second.
+    # Press for four seconds, hold and release; sample 20 times a second.
     seconds = np.arange(0, 12, 0.05)
     load = np.interp(seconds, [0, 1, 5, 7, 8], [0, 0, 20, 20, 0])
     position, angle = (0.008, 0.01), 0.4
@@ -29,7 +29,7 @@ def main() -> float:
     touched = skin.touched_in_time(press, seconds)
 
     figure, (shape, under, changed, read) = plt.subplots(1, 4, figsize=(15, 3.6), layout="constrained")
-    # All three where they are on the skin: the tool's own frame is moved and turned there.
+    # Show all three in the coordinates of the skin; the indenter's own frame is translated and rotated.
     x, y = np.meshgrid(np.linspace(-0.02, 0.036, 281), np.linspace(-0.018, 0.038, 281))
     cos, sin = np.cos(angle), np.sin(angle)
     places = (np.stack([x, y], axis=-1) - position) @ np.array([[cos, -sin], [sin, cos]])
@@ -57,7 +57,7 @@ def main() -> float:
         ax.set(title=f"{title}, on the skin", xlabel="mm")
     figure.savefig("press_with_a_load.png")
 
-    # As exact as solving the model anew.
+    # This is as exact as solving the model again.
     anew = model.voltages(skin.conductivity * (1 + change)) - model.voltages(skin.conductivity)
     found = skin.voltages_under(touched)[held] - np.asarray(model.voltages(skin.conductivity))
     return float(np.abs(found - anew).max() / np.abs(anew).max())

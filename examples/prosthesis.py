@@ -1,7 +1,7 @@
 """The forearm of a prosthesis, after Park et al. 2022: a tapered layer 10 mm thick on a core with 32 electrodes.
 
-94 pairs of electrodes that are nearest to each other along the core are measured; a ball is pressed in at places all
-over the layer, and each is found in an image of the skin. See `prosthesis.png`.
+The protocol measures the 94 pairs of electrodes that are nearest to each other along the core. A ball is pressed in at
+places all over the layer, and each press is located in an image of the skin. See `prosthesis.png`.
 """
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jeit.mesh import Geodesics, forearm, unroll
 from jeit.plot import Camera, ColourScale, plot_curved_skin
 from jeit.touch import CellFinder, find_contacts
 
-NOISE = 2e-5  # volts, 80 dB below what is measured
+NOISE = 2e-5  # volts, 80 dB below the measured voltages
 
 
 def main() -> float:
@@ -28,13 +28,13 @@ def main() -> float:
     exact = np.asarray(skin.voltage_changes(pressed))
     changes = exact + NOISE * np.random.default_rng(0).normal(size=exact.shape)
 
-    # Imaged on a sheet as wide as the core, on triangles of its own.
+    # Image on a sheet as wide as the core, with its own triangles.
     coarse = SurfaceLayout(layout.centres, 6e-3, forearm(**size, cell_size=6e-3))
     sheet = Skin.create(coarse, num_layers=0)
     imaged = np.asarray(one_step(sheet.model, sheet.model_conductivity, noise=NOISE).image(jnp.asarray(changes)))
     finder = CellFinder(sheet.model.mesh, sign=-1)
     found = np.array([find_contacts(finder, image)[0].centroid for image in imaged])
-    # Touches are on the outside of the layer, images on its core: what lies under a touch is nearest to it.
+    # Touches are on the outer face of the layer and images on its core: compare with the nearest point of the core.
     ways = Geodesics.create(sheet.model.mesh)
     error = np.array([ways.distances(one[None], other[None])[0, 0] for one, other in zip(places, found, strict=True)])
 
@@ -44,8 +44,8 @@ def main() -> float:
     figure, (space, flat) = plt.subplots(1, 2, figsize=(13, 5.6), layout="constrained", width_ratios=(1, 2))
     bare = ColourScale(bar=False)
     plot_curved_skin(coarse, imaged[shown], marks=marks, camera=camera, scale=bare, ax=space, title="The core")
-    told = f"Unrolled; {len(places)} touches found to {1e3 * error.mean():.1f} mm on average"
-    plot_unrolled(unroll(sheet.model.mesh), imaged[shown], coarse, marks=marks, ax=flat, title=told)
+    title = f"Unrolled; {len(places)} touches found to {1e3 * error.mean():.1f} mm on average"
+    plot_unrolled(unroll(sheet.model.mesh), imaged[shown], coarse, marks=marks, ax=flat, title=title)
     figure.savefig("prosthesis.png", dpi=120)
     return float(error.mean())
 

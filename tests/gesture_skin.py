@@ -1,6 +1,6 @@
-"""A small simulated sheet that two people touch: a set of their gestures, a stream of six touches, its description.
+"""A small simulated sheet touched by two people: a set of their gestures, a stream of six touches, and its description.
 
-Of a skin as it is pressed, and of a linear one, which takes a tenth of the time.
+One version simulates a pressed skin; the other is linear and takes a tenth of the time.
 """
 
 import functools
@@ -32,13 +32,13 @@ kind = "reference_electrode"
 current = 1.8e-3
 """
 
-# Seconds, strength and metres that each gesture goes.
+# Seconds, strength, and metres travelled of each gesture.
 GESTURES = {"tap": (0.15, 0.4, 0.0), "push": (1.0, 0.8, 0.0), "stroke": (0.7, 0.6, 0.14)}
 
 
 @functools.cache
 def gestures_and_stream():
-    """Three of each gesture by each, as a `GestureSet`; and a `GestureStream`."""
+    """Return three recordings of each gesture by each person as a `GestureSet`, and a `GestureStream`."""
     model = ForwardModel(SHEET.mesh(num_points=300), PointElectrodes(PLACES), reference_electrode(8, current=1.8e-3))
     skin = PressedSkin(jax.random.key(0), model, material("conductive fabric"))
     people = [Person.draw(key) for key in jax.random.split(jax.random.key(1), 2)]
@@ -48,14 +48,16 @@ def gestures_and_stream():
 
 @functools.cache
 def linear_gestures_and_stream():
-    """Of a linear skin, whose touches are spots of higher conductivity: four of each gesture by each of two people; and
-    six gestures in a stream, with when each begins and ends."""
+    """Return recordings of a linear skin, whose touches are spots of higher conductivity.
+
+    Four recordings of each gesture by each of two people, and a stream of six gestures with their onsets and ends.
+    """
     model = ForwardModel(SHEET.mesh(num_points=150), PointElectrodes(PLACES), reference_electrode(8, current=1.8e-3))
     rest, jacobian = np.asarray(model.voltages(0.1)), np.asarray(model.jacobian(0.1))
     cells, rng = np.asarray(centroids(model.mesh)), np.random.default_rng(0)
 
     def touch(gesture):
-        """Changes of the voltages (T, 48) while a gesture lasts, somewhere."""
+        """Voltage changes (T, 48) during a gesture at a random place."""
         lasts, strength, way = GESTURES[gesture]
         share = np.linspace(0, 1, round(lasts * rng.uniform(0.9, 1.1) * RATE))[:, None]
         place = rng.uniform([-0.06, -0.05], [0.06, 0.05]) + way * (share - 0.5) * [1.0, 0.0]

@@ -1,4 +1,4 @@
-"""A skin made up for learning: voltages that bend with place and force, drift, and are noisy."""
+"""Synthetic presses for learnt skins: voltages that depend nonlinearly on place and force, with drift and noise."""
 
 import numpy as np
 
@@ -6,9 +6,10 @@ CHANNELS = 40
 
 
 def record(number=160, *, seed=0, noise=0.01, drift=0.0, untouched=0, places=None):
-    """Frames, references, places (m) and forces (N) of presses on a square of 0.1 m; the last are `untouched`."""
+    """Return frames, references, places (m) and forces (N) of presses on a square of 0.1 m; the last are
+    `untouched`."""
     rng = np.random.default_rng(seed)
-    skin = np.random.default_rng(99)  # the same skin whatever the presses
+    skin = np.random.default_rng(99)  # the same skin for every set of presses
     centres, depth = skin.uniform(-0.06, 0.06, (CHANNELS, 2)), skin.uniform(0.5, 2.0, CHANNELS)
     random, force = rng.uniform(-0.05, 0.05, (number, 2)), rng.uniform(0.5, 4.0, number)
     places = random if places is None else np.array(places)
@@ -23,5 +24,5 @@ def record(number=160, *, seed=0, noise=0.01, drift=0.0, untouched=0, places=Non
 
 
 def off(touches, places):
-    """How far off places are, metres."""
+    """Localisation error in metres."""
     return np.linalg.norm(touches.position - places, axis=1)

@@ -1,13 +1,14 @@
-"""Change the code in one place at a time, at random, and count the changes at which a quick test fails.
+"""Mutation testing: change the code in one place at a time, at random, and count the changes that a quick test detects.
 
     python -m pytest -n 2 -m 'not slow' --junitxml=tests.xml \\
         --cov=jeit --cov=jeit_solvers --cov-branch --cov-context=test --cov-report=
     python tests/mutants.py .coverage tests.xml --number 160 --output mutants.jsonl
 
-needs pytest-cov. Each mutant differs from the code in one operator, number or condition. It runs those tests that reach
-its line, quickest first and as many as fit into `--budget` seconds, until one fails: then it is killed. One that hangs
-is killed, too. As many are drawn in each room; equal seeds draw equal mutants of equal code. Results are appended to
-the output as they come, and those that it holds are not run again: runs can be interrupted. A table by room ends it.
+This needs pytest-cov. Each mutant differs from the code in one operator, number or condition. The tests that reach its
+line are run, quickest first and as many as fit into `--budget` seconds, until one fails or hangs: then the mutant is
+killed. Equal numbers of mutants are drawn in each subpackage, and equal seeds draw equal mutants of equal code. Results
+are appended to the output as they come, and mutants that it already holds are not run again, so that a run can be
+interrupted. A table by subpackage is printed at the end.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ NAMES = {"min": "max", "max": "min", "any": "all", "all": "any", "minimum": "max
 
 
 def mutants_of(path: Path):
-    """Every mutant of a file: the line of its statement, where characters are replaced, and by what."""
+    """Yield every mutant of a file: the line of its statement, the range of characters to replace, and the
+    replacement."""
     text = path.read_text("utf-8")
     starts = [0]
     for line in text.encode().splitlines(keepends=True):
@@ -49,7 +51,7 @@ def mutants_of(path: Path):
         return starts[(node.end_lineno if end else node.lineno) - 1] + (node.end_col_offset if end else node.col_offset)
 
     def between(left, right, kind):
-        """The place of an operator between two expressions."""
+        """Return the position of an operator between two expressions."""
         old, new = OTHER[kind]
         at = text.encode().find(old.encode(), span(left, end=True), span(right))
         return [(at, at + len(old.encode()), new)] if at >= 0 else []
@@ -85,7 +87,7 @@ def mutants_of(path: Path):
         for at, end, new in changes(node):
             yield line, at, end, new
         for field, value in ast.iter_fields(node):
-            if field not in ("annotation", "returns"):  # hints and shapes are not executed
+            if field not in ("annotation", "returns"):  # annotations are not executed
                 for child in value if isinstance(value, list) else [value]:
                     if isinstance(child, ast.AST):
                         yield from walk(child, line)
@@ -94,7 +96,7 @@ def mutants_of(path: Path):
 
 
 def drawn(number: int, seed: int):
-    """That many mutants at least, as many in each room, in random order."""
+    """Draw at least this many mutants, equally many in each subpackage, in random order."""
     rooms = defaultdict(list)
     for package in PACKAGES:
         for path in sorted(package.rglob("*.py")):
@@ -109,7 +111,8 @@ def drawn(number: int, seed: int):
 
 
 def tests_of(data: CoverageData, path: str, line: int) -> set[str]:
-    """Tests that reach a line; where it runs on import only, those that reach any of its file."""
+    """Return the tests that reach a line; for a line that runs only on import, the tests that reach any line of its
+    file."""
     (measured,) = [one for one in data.measured_files() if one.endswith(path)] or [None]
     if measured is None:
         return set()
@@ -119,7 +122,7 @@ def tests_of(data: CoverageData, path: str, line: int) -> set[str]:
 
 
 def run(copy: Path, mutant, tests, budget: float) -> str:
-    """Killed, hangs, survived or not reached."""
+    """Return "killed", "hangs", "survived" or "not reached"."""
     _, name, _, at, end, new = mutant
     if not tests:
         return "not reached"

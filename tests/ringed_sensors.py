@@ -1,13 +1,13 @@
-"""Frames of a round skin that need no mesh: what a small touch changes between point electrodes on its edge.
+"""Frames of a round skin without a mesh: the voltage changes by a small touch between point electrodes on its edge.
 
-In a disk, current that enters at e and leaves at e′ has the field ∇u ∝ (p − e)/|p − e|² − (p − e′)/|p − e′|²; a small
+In a disk, current that enters at e and leaves at e′ has the field ∇u ∝ (p − e)/|p − e|² − (p − e′)/|p − e′|². A small
 change at p changes the voltage of drive d and measurement m by −∇u_d·∇u_m.
 """
 
 import numpy as np
 
 RADIUS = 0.1
-# Of a channel: touches in the middle change channels by five times that, touches near the edge by fifty.
+# Noise of a channel. Touches in the middle change channels by five times this, touches near the edge by fifty times.
 NOISE = 4e-6
 
 
@@ -26,7 +26,7 @@ REST = np.linspace(0.2, 0.4, CHANNELS)
 
 
 def changes(places):
-    """What a touch at each of places (n, 2) adds to the untouched frame (n, 208)."""
+    """Voltage changes (n, 208) by a touch at each of the places (n, 2), relative to the untouched frame."""
     fields = _fields(places)
     return -3e-6 * np.sum(fields[:, _DRIVE] * fields[:, _MEASURE], axis=-1)
 
@@ -37,7 +37,7 @@ def frames_at(places):
 
 
 def drawn_places(seed, number, radius=0.085):
-    """Places (n, 2) all over the disk."""
+    """Draw places (n, 2) uniformly in the disk."""
     random = np.random.default_rng(seed)
     r, angle = radius * np.sqrt(random.uniform(size=number)), random.uniform(0, 2 * np.pi, number)
     return np.stack([r * np.cos(angle), r * np.sin(angle)], axis=1)

@@ -1,4 +1,4 @@
-"""A small skin and little to learn, for networks that image, and the bits of what was learnt."""
+"""Shared by tests of image networks: a small skin with a short training, and the bits of the trained parameters."""
 
 from contextlib import contextmanager
 
@@ -26,7 +26,8 @@ SHAPE = (24, 24)
 
 @contextmanager
 def small_maps():
-    """Of half as many rows and columns as else; one body of one kind, of few sizes that JAX compiles for."""
+    """Maps with half the usual numbers of rows and columns, and bodies of one kind in few sizes, to limit
+    compilation."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(learn, "SHAPE", SHAPE)
         patch.setattr(learn, "_PLACES", 5)

@@ -1,4 +1,4 @@
-"""Small studies, and what is looked at when they run."""
+"""Small design studies, and helpers to inspect their stores."""
 
 import os
 import subprocess
@@ -29,7 +29,7 @@ rows = 5
 [mesh]
 cell_mm = 8
 """
-# Six points, and every score.
+# Six points with every score.
 SWEEP = """
 chunk_points = 2
 [skin]
@@ -56,12 +56,12 @@ wanted = ["minimum", "mean", "uniformity", "blind_spot", "taxels", "information"
 num_taxels = 5
 correlation_mm = 20
 """
-# Chunks of the sweep, all of one shape, and arrays of each.
+# Chunks of the sweep, all of one shape, and the arrays of each.
 CHUNKS, ARRAYS = 3, 15
 
 
 def changed(**lines: str) -> str:
-    """The sweep with two of its layouts and no scores, and with other lines at the beginnings of sections."""
+    """The sweep with two of its layouts and no scores, and with other lines at the beginning of sections."""
     text = SWEEP.replace('"grid-4x2", "perimeter-8", "inner-8"', '"grid-4x2", "perimeter-8"')
     text = text[: text.index("[scores]")].replace("noise_V = 1e-3\n", "")
     if "protocol" in lines.get("measurement", ""):
@@ -72,19 +72,19 @@ def changed(**lines: str) -> str:
 
 
 def linear_changes(model: ForwardModel, conductivity: float, touched: TouchedCells) -> np.ndarray:
-    """Changes (n, M) of the voltages by n touches to first order, the Jacobian times theirs, in NumPy."""
+    """First-order voltage changes (n, M) by n touches: the Jacobian times their conductivity changes, in NumPy."""
     jacobian = np.asarray(model.jacobian(conductivity)).T
     change = conductivity * np.asarray(touched.change)
     return np.array([row @ jacobian[cells] for row, cells in zip(change, np.asarray(touched.cells), strict=True)])
 
 
 def contents(store: Path) -> dict[str, bytes]:
-    """Every file of a store, by its name in it."""
+    """The content of every file of a store, by its relative path."""
     return {str(file.relative_to(store)): file.read_bytes() for file in store.rglob("*") if file.is_file()}
 
 
 def in_another_process(code: str, *arguments, **environment: str) -> subprocess.CompletedProcess:
-    """Run Python `code` with these arguments and variables of the environment, until it ends."""
+    """Run Python `code` with these arguments and environment variables in another process, and wait for its end."""
     variables = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)} | environment
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, arguments)], env=variables, capture_output=True, text=True, timeout=120

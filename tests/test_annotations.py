@@ -1,8 +1,9 @@
-"""Annotations: every module imports, and every hint of every function and class can be evaluated, on each Python.
+"""Annotations: every module can be imported, and every annotation of a function or class can be evaluated, on each
+Python.
 
-They are text until somebody asks for them (`from __future__ import annotations`, which ruff demands), so that no
-release of another package breaks an import. Whoever asks, as documentation tools and type checkers at run time do, must
-get an answer all the same.
+Annotations are strings until they are evaluated (`from __future__ import annotations`, which ruff demands), so that no
+release of another package breaks an import. Documentation tools and run-time type checkers evaluate them and must
+succeed all the same.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from test_layers import ROOT, modules
 
 MODULES = {name: path for top in ("jeit", "solvers/jeit_solvers") for name, path in modules(ROOT / top).items()}
 ROOMS = sorted({".".join(name.split(".")[:2]) for name in MODULES})
-# Not needed to run jeit, and named in hints: without the extra, what it would give is not known.
+# Packages that jeit can run without but that occur in annotations: without the extra, their types are unknown.
 OPTIONAL = ("pyvista",)
 
 
 class Absent:
-    """A package that is not installed: whatever a hint takes from it is any type."""
+    """A package that is not installed: any attribute of it is accepted as a type."""
 
     def __getattr__(self, name: str):
         return typing.Any
@@ -48,7 +49,7 @@ def own_functions(module) -> Iterator[tuple[str, object]]:
 
 
 def named_for_checkers(source: str) -> dict[str, object]:
-    """What a module imports under `if TYPE_CHECKING`, by the name it has there."""
+    """Names that a module imports under `if TYPE_CHECKING`."""
     names: dict[str, object] = {}
     for block in ast.parse(source).body:
         for line in block.body if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING" else ():
@@ -60,7 +61,7 @@ def named_for_checkers(source: str) -> dict[str, object]:
 
 
 def faults(name: str, source: str) -> list[str]:
-    """Hints of a module that cannot be evaluated, and abstract fields that equinox would overlook."""
+    """Annotations of a module that cannot be evaluated, and abstract fields that equinox would miss."""
     module = importlib.import_module(name)
     if "AbstractVar[" in source and "from __future__ import annotations" in source:
         return [f"{name}: equinox overlooks AbstractVar in annotations that are text"]
@@ -74,7 +75,7 @@ def faults(name: str, source: str) -> list[str]:
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_every_hint_can_be_evaluated(room):
+def test_every_annotation_can_be_evaluated(room):
     within = [name for name in MODULES if name == room or (name.startswith(f"{room}.") and room != "jeit")]
     assert [one for name in within for one in faults(name, MODULES[name].read_text("utf-8"))] == []
 
@@ -87,7 +88,7 @@ def test_every_hint_can_be_evaluated(room):
         ("import equinox as eqx\nclass C(eqx.Module):\n    one: eqx.AbstractVar[int]", "equinox overlooks"),
     ],
 )
-def test_a_fault_is_found(tmp_path, monkeypatch, source, fault):
+def test_faulty_annotations_are_detected(tmp_path, monkeypatch, source, fault):
     text = f"from __future__ import annotations\n{source}\n"
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "faulty_hints.py").write_text(text, "utf-8")

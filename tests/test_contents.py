@@ -1,4 +1,4 @@
-"""Contents pages: what an `__init__` takes from its own modules is in its `__all__`, and no module is."""
+"""`__init__` files: names imported from a package's own modules are in its `__all__`, and no module is."""
 
 import importlib
 import sys
@@ -17,21 +17,21 @@ PACKAGES = {
 
 
 def faults(name: str, path: Path) -> list[str]:
-    """What is wrong with the contents of a package."""
+    """List the errors in the `__all__` of a package."""
     package = importlib.import_module(name)
-    entrance = "jeit.start."  # jeit itself calls it, and offers it to nobody
+    entrance = "jeit.start."  # called by jeit itself; not a public name
     taken = {one.rpartition(".")[2] for one in offered(path) if one.startswith(f"{name}.") and entrance not in one}
-    said = set(getattr(package, "__all__", ()))
-    found = [f"{one} is not in __all__" for one in sorted(taken - said)]
-    found += [f"{one} is not there" for one in sorted(said) if not hasattr(package, one)]
-    rooms = name == "jeit"  # whose contents are its rooms, too
+    listed = set(getattr(package, "__all__", ()))
+    found = [f"{one} is not in __all__" for one in sorted(taken - listed)]
+    found += [f"{one} is not there" for one in sorted(listed) if not hasattr(package, one)]
+    rooms = name == "jeit"  # its contents are its subpackages too
     return found + [
-        f"{one} is a module" for one in said if isinstance(getattr(package, one, None), ModuleType) and not rooms
+        f"{one} is a module" for one in listed if isinstance(getattr(package, one, None), ModuleType) and not rooms
     ]
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_contents(name):
+def test_all_lists_the_public_names(name):
     assert faults(name, PACKAGES[name]) == []
 
 
@@ -43,7 +43,7 @@ def test_contents(name):
         ("from {package} import own\n__all__ = ['own']", "own is a module"),
     ],
 )
-def test_a_fault_is_found(tmp_path, monkeypatch, text, fault):
+def test_faulty_contents_are_detected(tmp_path, monkeypatch, text, fault):
     package = "faulty_contents"
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / package).mkdir()
@@ -56,8 +56,8 @@ def test_a_fault_is_found(tmp_path, monkeypatch, text, fault):
             sys.modules.pop(name, None)
 
 
-def test_a_star_leaves_what_was_there_before():
-    """Without `__all__` it took the module of that name with it."""
+def test_star_import_keeps_names_that_exist():
+    """Without `__all__`, the star import replaced `reconstruct` by the module of that name."""
     names: dict = {}
     exec("from jeit.inverse import *\nfrom jeit.inverse.nonlinear import *", names)
     assert callable(names["reconstruct"])

@@ -1,4 +1,5 @@
-"""Processes forked once jeit has computed: what NumPy answers is answered, the rest refused, and nothing hangs."""
+"""Forked processes after jeit has computed: NumPy results are available, compiled programs are refused, nothing
+hangs."""
 
 import os
 import subprocess
@@ -29,12 +30,12 @@ def slope(model):
     return jax.grad(lambda s: model.voltages(s).sum())(1.0)
 
 def asked(work):
-    def told(model):
+    def result(model):
         try:
             return np.asarray(work(model)).tobytes()
         except RuntimeError as error:
             return str(error)
-    return told
+    return result
 
 WORK = {
     "voltages": lambda model: model.voltages(1.0),
@@ -63,7 +64,7 @@ if __name__ == "__main__":
         sys.exit()
     here, there = context.Pipe()
     if before == "imported":
-        # What one compiled program is allowed, another is.
+        # One compiled program stands for all.
         WORK.pop("slope")
 
         def answer_anew(pipe):
@@ -75,24 +76,25 @@ if __name__ == "__main__":
         child = context.Process(target=answer, args=(model, there))
     child.start()
     assert here.poll(90), "the child hangs"
-    told = here.recv()
+    results = here.recv()
     child.join()
     if before == "imported":
         model = made()
         expected, reconstruction = np.asarray(model.voltages(1.0)), one_step(model, 1.0)
-    refused = {name for name, said in told.items() if isinstance(said, str) and "forked" in said}
+    refused = {name for name, outcome in results.items() if isinstance(outcome, str) and "forked" in outcome}
     in_numpy = {"compiled": WORK["voltages"], "slope": lambda model: np.sum(model.jacobian(1.0))}
-    for name, said in told.items():
+    for name, outcome in results.items():
         if name not in refused and name in in_numpy:
-            np.testing.assert_allclose(np.frombuffer(said), np.ravel(in_numpy[name](model)), rtol=1e-9)
+            np.testing.assert_allclose(np.frombuffer(outcome), np.ravel(in_numpy[name](model)), rtol=1e-9)
         elif name not in refused:
-            assert said == asked(WORK[name])(model), name
+            assert outcome == asked(WORK[name])(model), name
     print(*sorted(refused))
 """
 
 
 def refused(tmp_path: Path, *how: str) -> list[str]:
-    """What a forked process is refused; all else is what its parent finds, bit for bit where NumPy answers."""
+    """Names of the results refused in a forked process; all other results equal those of the parent, bit for bit where
+    NumPy computes them."""
     path = tmp_path / "program.py"
     path.write_text(PROGRAM)
     environment = {**os.environ, "JEIT_COMPILATION_CACHE": "off"}
@@ -104,15 +106,15 @@ def refused(tmp_path: Path, *how: str) -> list[str]:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no os.fork here")
-def test_once_jax_has_started_compiled_code_is_refused_in_forks(tmp_path):
+def test_compiled_code_is_refused_in_forks_after_jax_has_started(tmp_path):
     assert refused(tmp_path, "fork", "used") == ["compiled", "slope"]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no os.fork here")
-def test_forks_of_a_process_that_has_only_imported_do_everything(tmp_path):
+def test_forks_of_a_process_that_only_imported_jeit_compute_everything(tmp_path):
     assert refused(tmp_path, "fork", "imported") == []
 
 
 @pytest.mark.slow
-def test_spawned_processes_do_everything(tmp_path):
+def test_spawned_processes_compute_everything(tmp_path):
     assert refused(tmp_path, "spawn", "used") == []

@@ -1,4 +1,5 @@
-"""The house: every module in a room, rooms that look down only, no circles, and nobody in another's private rooms."""
+"""The structure of the packages: subpackages import downwards only, without cycles and without private modules of
+others."""
 
 import ast
 from collections import Counter
@@ -10,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = (ROOT / "solvers", ROOT)
 
-# The rooms of the core, each with those beneath it that it may import. All may import jeit_solvers, which knows none.
+# The subpackages of the core, each with those that it may import. All may import jeit_solvers, which imports none.
 ROOMS: dict[str, set[str]] = {}
 ROOMS["start"] = set()
 ROOMS["arguments"] = set()
@@ -27,7 +28,7 @@ ROOMS["imaging"] = {*ROOMS["data"], "data", "image"}
 ROOMS["plot"] = {*ROOMS["imaging"], "imaging"}
 ROOMS["report"] = {*ROOMS["plot"], "plot"}
 ROOMS["cli"] = {*ROOMS["report"], "report", "start"}
-# The applications: each may import the core, and what it is built upon. The core imports none of them.
+# The applications: each may import the core and the listed applications. The core imports none of them.
 CORE = {*ROOMS["cli"], "cli"}
 ROOMS["acoustic"] = CORE
 ROOMS["design"] = CORE
@@ -36,7 +37,7 @@ ROOMS["live"] = {*CORE, "acoustic", "touch"}
 
 
 def modules(top: Path) -> dict[str, Path]:
-    """Every module under `top`, by its dotted name; a room's `__init__` has the room's name."""
+    """Every module under `top` by its dotted name; an `__init__` file has its package's name."""
     named = {}
     for path in top.rglob("*.py"):
         parts = path.relative_to(top.parent).with_suffix("").parts
@@ -45,7 +46,7 @@ def modules(top: Path) -> dict[str, Path]:
 
 
 def imported(path: Path) -> set[str]:
-    """Dotted names that a file imports, wherever in it: modules, and what is taken from them."""
+    """Dotted names that a file imports anywhere: modules, and names taken from them."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
@@ -57,7 +58,7 @@ def imported(path: Path) -> set[str]:
 
 
 def offered(page: Path) -> set[str]:
-    """Full names of what a contents page offers: its stub imports them from modules beneath it."""
+    """Full names of what a package's stub file imports from the modules beneath it."""
     stub = page.with_suffix(".pyi")
     if not stub.exists():
         return on_import(page)
@@ -67,7 +68,7 @@ def offered(page: Path) -> set[str]:
 
 
 def on_import(path: Path) -> set[str]:
-    """The same of what is imported when the file is, or for type checkers: not within functions."""
+    """Dotted names that are imported when the file is imported, or for type checkers; not those within functions."""
     names, left = set(), list(ast.parse(path.read_text("utf-8")).body)
     while left:
         node = left.pop()
@@ -79,11 +80,11 @@ def on_import(path: Path) -> set[str]:
 
 
 def rooms_of(house: dict[str, Path]) -> list[str]:
-    """What is wrong with where modules stand and what they import of other rooms."""
+    """List modules outside of any subpackage and imports that are not permitted."""
     faults = []
     for name, path in house.items():
         parts = name.split(".")
-        if name in ("jeit", "jeit.__main__", "jeit.simulate"):  # the last has old names only
+        if name in ("jeit", "jeit.__main__", "jeit.simulate"):  # `jeit.simulate` holds only deprecated names
             continue
         if parts[1] not in ROOMS or path.parent.name == "jeit":
             faults.append(f"{name} is in no room")
@@ -100,7 +101,8 @@ def rooms_of(house: dict[str, Path]) -> list[str]:
 
 
 def circle(house: dict[str, Path]) -> list[str]:
-    """Modules that import each other round in a circle, if any do; rooms' contents pages are not counted."""
+    """Return modules that import each other in a cycle, if there are any; packages' `__init__` files are not
+    counted."""
     graph = {}
     for name, path in house.items():
         if path.name == "__init__.py":
@@ -114,16 +116,16 @@ def circle(house: dict[str, Path]) -> list[str]:
     return []
 
 
-def test_every_module_is_in_a_room_and_looks_down():
+def test_imports_point_downwards():
     assert rooms_of(modules(ROOT / "jeit")) == []
 
 
 @pytest.mark.parametrize("top", ["jeit", "solvers/jeit_solvers"])
-def test_no_circles(top):
+def test_no_import_cycles(top):
     assert circle(modules(ROOT / top)) == []
 
 
-def test_solvers_know_no_physics():
+def test_solvers_do_not_import_jeit():
     for path in (ROOT / "solvers" / "jeit_solvers").rglob("*.py"):
         assert not {name for name in imported(path) if name.split(".")[0] == "jeit"}, path
 
@@ -139,14 +141,14 @@ def test_solvers_know_no_physics():
         ({"forward/sly.py": "from jeit.mesh import _surface"}, "is private"),
     ],
 )
-def test_a_fault_is_found(tmp_path, files, fault):
+def test_faulty_imports_are_detected(tmp_path, files, fault):
     for name, text in files.items():
         (tmp_path / "jeit" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "jeit" / name).write_text(text, "utf-8")
     assert [fault in one for one in rooms_of(modules(tmp_path / "jeit"))] == [True]
 
 
-def test_a_circle_is_found(tmp_path):
+def test_an_import_cycle_is_detected(tmp_path):
     (tmp_path / "jeit" / "mesh").mkdir(parents=True)
     (tmp_path / "jeit" / "mesh" / "hen.py").write_text("from jeit.mesh.egg import shell", "utf-8")
     (tmp_path / "jeit" / "mesh" / "egg.py").write_text("from jeit.mesh import hen", "utf-8")
@@ -154,8 +156,8 @@ def test_a_circle_is_found(tmp_path):
 
 
 @pytest.mark.parametrize("top", ["jeit", "solvers/jeit_solvers"])
-def test_no_name_for_everybody_hides_a_module(top):
-    """`import jeit.mesh.quality` would give the function `quality`, if a module had its name."""
+def test_no_public_name_hides_a_module(top):
+    """`import jeit.mesh.quality` would give the function `quality` if a module had its name."""
     house = modules(ROOT / top)
     pages = {name: path for name, path in house.items() if path.name == "__init__.py"}
     given = {f"{name}.{full.rpartition('.')[2]}" for name, path in pages.items() for full in offered(path)}
@@ -164,7 +166,7 @@ def test_no_name_for_everybody_hides_a_module(top):
 
 @pytest.mark.parametrize("top", ["jeit", "solvers/jeit_solvers"])
 def test_no_module_assigns_a_constant_twice(top):
-    """The second would be read by functions written for the first."""
+    """The second value would be read by functions written for the first."""
     twice = []
     for name, path in modules(ROOT / top).items():
         statements = [one for one in ast.parse(path.read_text("utf-8")).body if isinstance(one, ast.Assign)]
@@ -175,14 +177,14 @@ def test_no_module_assigns_a_constant_twice(top):
     assert twice == []
 
 
-def test_no_two_test_files_have_one_name():
-    """pytest imports them by name, and can collect only one of the two."""
+def test_names_of_test_files_are_unique():
+    """pytest imports test files by name and can collect only one of two with the same name."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
     assert len(names) == len(set(names))
 
 
-def test_the_house_is_small_enough_to_enter():
-    """No more modules than a person can know of, and no room with more than fit a screen."""
+def test_numbers_of_modules_are_limited():
+    """The number of modules stays small enough to learn, and no subpackage has more than fit on a screen."""
     house = [path for top in ("jeit", "solvers/jeit_solvers") for path in modules(ROOT / top).values()]
     assert len(house) <= 460
     assert {str(room): number for room, number in Counter(one.parent for one in house).items() if number > 15} == {}

@@ -1,4 +1,4 @@
-"""What consoles and notebooks show of objects: two lines, and a picture."""
+"""Representation of objects in consoles and notebooks: two lines of text, and a picture."""
 
 import html
 
@@ -18,7 +18,7 @@ from jeit.mesh import Disk, Rectangle, Solid, centroids, surface_of
 
 @pytest.fixture(scope="module")
 def shown():
-    """Objects of all kinds that have a text or a picture of their own, by name."""
+    """Objects of every class with a text or picture representation, by name."""
     pressed, rest = simulate_press(RoundSkin(), jax.random.key(0), (0.02, 0.01), noise=1e-4)
     imaged = image_difference(pressed, rest, ImagingSettings(num_points=300))
     model = imaged.calibration.model
@@ -48,7 +48,7 @@ def shown():
 PICTURES = ("measurement", "merit", "imaged", "mesh", "series", "layout", "skin", "surface")
 
 
-def test_texts_are_short(shown):
+def test_reprs_are_short(shown):
     for name, one in shown.items():
         text = repr(one)
         assert type(one).__name__ in text, name
@@ -60,14 +60,14 @@ def test_texts_are_short(shown):
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_pictures(shown, name):
+def test_pictures_are_drawn(shown, name):
     drawn = shown[name]._repr_png_()
     assert drawn.startswith(b"\x89PNG")
     assert len(drawn) > 5_000
 
 
-def test_pages(shown):
-    """The text and the picture, in HTML without scripts."""
+def test_html_representations(shown):
+    """The text and the picture as HTML without scripts."""
     for name in PICTURES:
         page = shown[name]._repr_html_()
         assert page.startswith(f"<pre>{html.escape(repr(shown[name]))}</pre><img"), name
@@ -75,7 +75,7 @@ def test_pages(shown):
         assert "<script" not in page
 
 
-def test_what_is_traced_has_neither(shown):
+def test_traced_objects_have_neither_values_nor_pictures(shown):
     mesh = shown["mesh"]
 
     @jax.jit

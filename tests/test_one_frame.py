@@ -1,4 +1,4 @@
-"""What the image of one measured frame imports: no application, and few modules of the core."""
+"""Imports when one measured frame is imaged: no application, and few modules of the core."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ MOST = 130
 
 
 def test_reconstruct_imports_no_application_and_few_modules(tmp_path):
-    """Of a file as the KIT4 archive has them, the method that needs the fewest steps."""
+    """A file in the format of the KIT4 archive, with the method that needs the fewest steps."""
     protocol = adjacent(16)
     model = ForwardModel(Disk(0.14).mesh(num_points=400), BoundaryElectrodes(ring(0.14, 16), 0.025, 0.01), protocol)
     drives, measurements = np.asarray(protocol.drive), np.asarray(protocol.measurement)

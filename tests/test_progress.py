@@ -1,4 +1,4 @@
-"""What takes long says how far it is: `progress=` of the public functions, called with texts."""
+"""Long computations report their progress: `progress=` of the public functions is called with texts."""
 
 import inspect
 
@@ -39,7 +39,7 @@ LONG = [
 
 
 @pytest.mark.parametrize("function", LONG, ids=lambda function: function.__qualname__)
-def test_progress_can_be_asked_for(function):
+def test_functions_accept_progress(function):
     assert "progress" in inspect.signature(function).parameters
 
 
@@ -48,29 +48,29 @@ def model():
     return ForwardModel(Disk(0.05).mesh(num_points=100), BoundaryElectrodes(ring(0.05, 8), 0.008, 0.2), adjacent(8))
 
 
-def test_rules_are_named(model):
-    told, difference = [], 1e-3 * np.asarray(model.voltages(1.0)) * np.random.default_rng(0).normal(size=40)
-    found = compare_rules(model, 1.0, difference=difference, progress=told.append)
-    assert told == ["linearise", *found]
+def test_rules_are_reported(model):
+    reported, difference = [], 1e-3 * np.asarray(model.voltages(1.0)) * np.random.default_rng(0).normal(size=40)
+    found = compare_rules(model, 1.0, difference=difference, progress=reported.append)
+    assert reported == ["linearise", *found]
 
 
 def test_presses_are_counted(model):
-    skin, told = PressedSkin(KEY, model, material("velostat")), []
+    skin, reported = PressedSkin(KEY, model, material("velostat")), []
     presses = [Press(ball_indenter(0.02), 1.0, (0.001 * k, 0.0)) for k in range(5)]
-    frames = skin.frames(KEY, presses, progress=told.append)
-    assert told[-1] == "voltages: 5 of 5"
-    assert "pressure: 5 of 5" in told
+    frames = skin.frames(KEY, presses, progress=reported.append)
+    assert reported[-1] == "voltages: 5 of 5"
+    assert "pressure: 5 of 5" in reported
     np.testing.assert_array_equal(frames, skin.frames(KEY, presses))
-    told.clear()
-    skin.record(KEY, MovingPress(ball_indenter(0.02), np.ones(5)), np.arange(5.0), progress=told.append)
-    assert told[-1] == "voltages: 5 of 5"
+    reported.clear()
+    skin.record(KEY, MovingPress(ball_indenter(0.02), np.ones(5)), np.arange(5.0), progress=reported.append)
+    assert reported[-1] == "voltages: 5 of 5"
 
 
 @pytest.mark.slow
-def test_taps_and_their_calibration_tell_their_steps():
-    skin, told, steps = SoundingSkin(KEY), [], []
-    taps = simulate_calibration_taps(skin, KEY, microphone_grid(5), repeats=1, duration=0.08, progress=told.append)
-    assert told[-1] == "25 of 25 places"
+def test_taps_and_their_calibration_report_their_steps():
+    skin, reported, steps = SoundingSkin(KEY), [], []
+    taps = simulate_calibration_taps(skin, KEY, microphone_grid(5), repeats=1, duration=0.08, progress=reported.append)
+    assert reported[-1] == "25 of 25 places"
     corners = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
     given = Taps(skin.microphones, corners, taps.positions, samples=taps.samples, rate=taps.rate)
     calibrate_microphones(given, decay="exponential", progress=steps.append)

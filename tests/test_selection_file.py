@@ -1,5 +1,5 @@
-"""The tests that run on every Python, some of every room, and those that run as users' programs are compiled: lists of
-files that are there."""
+"""selection.txt (tests that run on every Python, at least one file per subpackage) and compiled.txt (tests that run
+with the users' compilation settings) list existing files."""
 
 import pytest
 from test_layers import ROOMS, ROOT
@@ -9,13 +9,13 @@ COMPILED = (ROOT / "tests" / "compiled.txt").read_text("utf-8").split()
 
 
 @pytest.mark.parametrize("listed", [LISTED, COMPILED], ids=["selection", "compiled"])
-def test_files_are_there_once(listed):
+def test_listed_files_exist_once(listed):
     assert [one for one in listed if not (ROOT / one).exists()] == []
     assert len(set(listed)) == len(listed)
 
 
-def test_every_room_is_in_it():
+def test_every_subpackage_is_listed():
     rooms = {path.name for path in (ROOT / "tests").iterdir() if any(path.rglob("test_*.py"))}
-    beside_the_wheel = {"benchmarks"}  # tests run on what is installed
+    beside_the_wheel = {"benchmarks"}  # the tests run on the installed package
     assert {one.split("/")[1] for one in LISTED} >= rooms - beside_the_wheel
     assert rooms >= set(ROOMS) - {"start"}

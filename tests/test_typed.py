@@ -1,4 +1,5 @@
-"""What a type checker of a user's sees: the markers of both packages, and types of all that the rooms offer."""
+"""Types as seen by a user's type checker: both packages have markers, and every parameter of a public function has a
+type."""
 
 import importlib
 import inspect
@@ -15,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def rooms() -> list[str]:
-    """Packages that offer names to everybody."""
+    """Packages with public names."""
     found = ["jeit", "jeit_solvers"]
     for top in (jeit, jeit_solvers):
         inside = pkgutil.walk_packages(top.__path__, f"{top.__name__}.")
@@ -24,26 +25,26 @@ def rooms() -> list[str]:
 
 
 def makers(given: type) -> Iterator[tuple[str, Callable]]:
-    """What makes an object of a class: its constructor, and its class methods."""
+    """Constructors of a class: its `__init__` and its class methods."""
     for name, member in vars(given).items():
-        if name == "__init__" and inspect.unwrap(member).__module__ != "typing":  # protocols have one of their own
+        if name == "__init__" and inspect.unwrap(member).__module__ != "typing":  # protocols have their own `__init__`
             yield f"{given.__name__}()", inspect.unwrap(member)
         elif isinstance(member, classmethod) and not name.startswith("_"):
             yield f"{given.__name__}.{name}", inspect.unwrap(member.__func__)
 
 
 def methods(given: type) -> Iterator[tuple[str, Callable]]:
-    """Public methods that a class is the first to have; those that it takes over are typed where they come from."""
+    """Public methods that a class defines first; inherited methods are checked where they are defined."""
     for name, member in vars(given).items():
         first = not any(name in vars(base) for base in given.__mro__[1:])
         method = inspect.unwrap(getattr(member, "__func__", member)) if callable(member) else member
-        method = getattr(method, "method", method)  # equinox wraps what is jitted
+        method = getattr(method, "method", method)  # equinox wraps compiled methods
         if first and not name.startswith("_") and inspect.isfunction(method):
             yield f"{given.__name__}.{name}", method
 
 
 def untyped(function: Callable) -> list[str]:
-    """Parameters without a type; the object itself needs none."""
+    """Parameters without a type, except the object itself."""
     parameters = list(inspect.signature(function).parameters.values())
     return [
         one.name
@@ -53,14 +54,14 @@ def untyped(function: Callable) -> list[str]:
 
 
 def offered() -> dict[str, Callable]:
-    """Every function that the rooms offer, and what makes and works objects of their classes, by room and name."""
+    """Every public function, constructor and method, by package and name."""
     found = {}
     for room in rooms():
         package = importlib.import_module(room)
         for name in getattr(package, "__all__", ()):
             thing = getattr(package, name)
             if inspect.isclass(thing):
-                found |= {f"{room}.{said}": one for said, one in (*makers(thing), *methods(thing))}
+                found |= {f"{room}.{member}": one for member, one in (*makers(thing), *methods(thing))}
             elif inspect.isfunction(inspect.unwrap(thing)):
                 found[f"{room}.{name}"] = inspect.unwrap(thing)
     return found
@@ -73,13 +74,13 @@ def test_every_parameter_has_a_type(room):
     assert {name: missing for name, one in within.items() if (missing := untyped(one))} == {}
 
 
-def test_something_is_looked_at():
+def test_public_functions_are_collected():
     found = offered()
     assert len(found) > 400
     assert {"jeit.reconstruct", "jeit.layout.Layout()", "jeit.inverse.Imager.create"} <= set(found)
 
 
-def test_a_missing_type_is_found():
+def test_a_missing_type_is_detected():
     class Made:
         def __init__(self, place, *, size: float = 1.0):
             pass
@@ -92,8 +93,8 @@ def test_a_missing_type_is_found():
 
 
 @pytest.mark.parametrize("package", [jeit, jeit_solvers])
-def test_markers_are_in_the_packages(package):
-    """In the folders that the wheel takes whole: `packages` of pyproject.toml."""
+def test_type_markers_are_in_the_packages(package):
+    """The wheel takes these folders whole: `packages` of pyproject.toml."""
     import tomllib
 
     folder = Path(package.__file__).parent

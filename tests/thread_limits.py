@@ -1,4 +1,4 @@
-"""Learning skins and gestures quickly among many other tests."""
+"""A fixture that speeds up many small trainings of skins and gestures."""
 
 from contextlib import contextmanager
 
@@ -10,9 +10,9 @@ from jeit.touch.learnt import extras, learnt_skin
 
 @contextmanager
 def libraries_found_once():
-    """Libraries that keep to one thread are looked for once, and not anew at each fold.
+    """Search once for libraries whose threads are limited, and not at each fold.
 
-    They are looked for among all that a process has mapped, and compiled code maps tens of thousands of pieces.
+    The search reads all memory maps of the process, and compiled code makes tens of thousands of them.
     """
     with extras.one_thread(), pytest.MonkeyPatch.context() as patch:
         controller = ThreadpoolController()

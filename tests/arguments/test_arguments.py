@@ -1,4 +1,4 @@
-"""What is said of arguments that cannot be right, and that those which can be pass."""
+"""Checks of arguments: valid values pass, and each invalid value is described in the error message."""
 
 import math
 from pathlib import Path
@@ -22,7 +22,7 @@ from jeit.mesh import Disk
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "message"),
     [
         ("laplace", "'laplace'"),
         ("a" * 100, f"'{'a' * 58}…"),
@@ -40,36 +40,36 @@ from jeit.mesh import Disk
         (jax.random.key(0), "an array of key<fry> of shape ()"),
     ],
 )
-def test_what_was_given(given, said):
-    assert describe(given) == said
+def test_describe_value(given, message):
+    assert describe(given) == message
 
 
 @pytest.mark.parametrize("given", [0, -1.5, np.float32(2), np.asarray(1), jnp.asarray(0.5)])
-def test_numbers(given):
+def test_is_number_accepts_finite_scalars(given):
     assert is_number(given)
 
 
 @pytest.mark.parametrize(
     "given", [True, "1", None, [1.0], np.ones(1), 1j, math.nan, math.inf, {}, jax.random.key(0), jnp.ones(2)]
 )
-def test_no_numbers(given):
+def test_is_number_rejects_other_values(given):
     assert not is_number(given)
 
 
 @pytest.mark.parametrize("given", [[1, 2], np.arange(2.0), jnp.ones(2), 3, [[1.0], [2.0]], []])
-def test_arrays_of_numbers(given):
+def test_real_array_accepts_arrays_of_numbers(given):
     values = real_array("load", given, "newtons")
     assert values.dtype == float
     np.testing.assert_array_equal(values, np.asarray(given))
 
 
 @pytest.mark.parametrize("given", ["1", ["1", "2"], None, [[1.0], [2.0, 3.0]], np.ones(2) * 1j, [True], {}])
-def test_no_arrays_of_numbers(given):
+def test_real_array_rejects_other_values(given):
     with pytest.raises(ValueError, match=r"^load must be newtons"):
         real_array("load", given, "newtons")
 
 
-def test_kinds():
+def test_check_kind():
     check_kind("outline", Disk(0.05), Disk, "a Disk")
     check_kind("path", "a", (str, Path), "a path")
     with pytest.raises(ValueError, match=r"^outline must be a Disk, such as Disk\(0\.05\); it is 'disk'\.$"):
@@ -79,12 +79,12 @@ def test_kinds():
 @pytest.mark.parametrize(
     "key", [jax.random.key(0), jax.random.PRNGKey(0), np.asarray(jax.random.PRNGKey(1)), jax.random.key(0, impl="rbg")]
 )
-def test_keys_pass(key):
+def test_check_key_accepts_random_keys(key):
     check_key(key)
     jax.random.normal(key)
 
 
-def test_keys_that_are_traced_pass():
+def test_check_key_accepts_traced_keys():
     def draw(key):
         check_key(key)
         return jax.random.normal(key)
@@ -94,7 +94,7 @@ def test_keys_that_are_traced_pass():
 
 
 @pytest.mark.parametrize(
-    ("key", "said"),
+    ("key", "message"),
     [
         (None, r"such as jax.random.key\(0\); it is None"),
         (7, r"such as jax.random.key\(7\); it is 7"),
@@ -104,12 +104,12 @@ def test_keys_that_are_traced_pass():
         (jax.random.split(jax.random.key(0)), r"an array of key<fry> of shape \(2,\)"),
     ],
 )
-def test_no_keys(key, said):
-    with pytest.raises(ValueError, match=f"^seed must be one random key, .*{said}"):
+def test_check_key_rejects_other_values(key, message):
+    with pytest.raises(ValueError, match=f"^seed must be one random key, .*{message}"):
         check_key(key, "seed")
 
 
-def test_names():
+def test_check_name():
     names = {"gcv": 1, "l-curve": 2}
     check_name("rule", "gcv", names)
     with pytest.raises(ValueError, match=r"^rule must be one of gcv, l-curve; it is 'gvc' \(did you mean 'gcv'\?\)\.$"):
@@ -132,12 +132,12 @@ def test_names():
         (["gcv"], ""),
     ],
 )
-def test_what_was_meant(given, meant):
-    said = did_you_mean(given, ["gcv", "l-curve", "gauss-newton"])
-    assert said == (f" (did you mean '{meant}'?)" if meant else "")
+def test_did_you_mean_suggests_similar_names(given, meant):
+    message = did_you_mean(given, ["gcv", "l-curve", "gauss-newton"])
+    assert message == (f" (did you mean '{meant}'?)" if meant else "")
 
 
-def test_metres():
+def test_check_metres():
     check_metres("thickness", 0.2, 0.2, "the skin is wide")
     check_metres("thickness", jnp.asarray(0.01))
     with pytest.raises(
@@ -148,6 +148,6 @@ def test_metres():
 
 
 @pytest.mark.parametrize("value", [0, -0.01, math.nan, math.inf, "0.01", None, [0.01], True, np.zeros(2)])
-def test_no_lengths(value):
+def test_check_metres_rejects_values_that_are_no_lengths(value):
     with pytest.raises(ValueError, match=r"^thickness must be a positive length in metres; it is "):
         check_metres("thickness", value)

@@ -1,4 +1,4 @@
-"""Names that have moved since version 0.2: each is found at its old place, with a warning that names the new one."""
+"""Names that moved since version 0.2: the old path still works and warns with the new name."""
 
 import importlib
 import re
@@ -11,7 +11,7 @@ from jeit.arguments.moved import MOVED
 
 
 @pytest.mark.parametrize("old", MOVED)
-def test_an_old_name_is_found_and_warned_of(old):
+def test_old_name_resolves_with_a_warning(old):
     page, _, name = old.rpartition(".")
     home, _, new = MOVED[old].rpartition(".")
     with pytest.warns(DeprecationWarning, match=f"^{re.escape(old)} is now {re.escape(MOVED[old])}; the old"):
@@ -30,12 +30,12 @@ def test_an_old_name_is_found_and_warned_of(old):
         ("jeit.report.study import write_study_report", "jeit.design.reports.write_study_report"),
     ],
 )
-def test_pages_that_have_moved_can_be_imported(old, new):
+def test_moved_modules_can_be_imported(old, new):
     with pytest.warns(DeprecationWarning, match=f" is now {re.escape(new)};"):
         exec(f"from {old}")
 
 
-def test_other_names_are_not_there():
+def test_unknown_names_raise_attribute_and_import_errors():
     mesh = importlib.import_module("jeit.mesh")
     with pytest.raises(AttributeError, match=r"disc"):
         mesh.disc  # noqa: B018
@@ -45,7 +45,7 @@ def test_other_names_are_not_there():
             exec(f"from {page} import Mash")
 
 
-def test_a_page_with_moved_names_imports_no_application():
+def test_modules_with_moved_names_import_no_application():
     code = "import sys, jeit.plot, jeit.report, jeit.imaging, jeit.simulate\nprint(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not [one for one in loaded if one.startswith(("jeit.touch", "jeit.acoustic", "jeit.design"))]

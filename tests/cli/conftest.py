@@ -1,4 +1,4 @@
-"""A small tank as a CSV file with its description, to be spoilt in every way."""
+"""Fixtures of the command-line tests: a small tank as a CSV file with its description, in which tests insert faults."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,8 @@ unit = "V"
 
 
 def _voltages(bump: float) -> np.ndarray:
-    """A disk of 1 mS with small electrodes (a logarithm), and a symmetric term more: a change that is not noise."""
+    """Voltages of a disk of 1 mS with small electrodes (a logarithm), plus a symmetric term: a change that is not
+    noise."""
     protocol, position = adjacent(8), ring(0.1, 8, clockwise=True)
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
     np.fill_diagonal(distance, 1e-4)
@@ -38,7 +39,7 @@ def _voltages(bump: float) -> np.ndarray:
 
 @pytest.fixture
 def tank(tmp_path):
-    """A folder with `rest.csv` and `touched.csv`, their descriptions, and functions to write others."""
+    """A folder with `rest.csv`, `touched.csv` and their descriptions, and functions to write other files."""
 
     class Tank:
         folder = tmp_path
@@ -62,7 +63,7 @@ def tank(tmp_path):
 
 @pytest.fixture
 def run(capsys):
-    """Run the command in this process: (exit status, standard output, standard error)."""
+    """Run the command in this process and return its exit status, standard output and standard error."""
 
     def call(*arguments):
         status = main([str(argument) for argument in arguments])

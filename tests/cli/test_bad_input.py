@@ -1,4 +1,4 @@
-"""Bad input, over the whole library and on the command line: each refused with an error that says what to do."""
+"""Invalid input to the library and to the command line: each error message says what is wrong and what to do."""
 
 import os
 import runpy
@@ -121,7 +121,7 @@ COMPUTING = {
     "rule without data": (lambda m: one_step(m, 1.0, hyperparameter="gcv"), "give difference"),
     "negative hyperparameter": (lambda m: one_step(m, 1.0, hyperparameter=-1.0), "must be positive"),
     "noise of zero": (lambda m: one_step(m, 1.0, noise=0.0), "noise must be positive"),
-    "prior of no length": (lambda m: Gaussian(0.0), "length must be positive"),
+    "prior of zero length": (lambda m: Gaussian(0.0), "length must be positive"),
     "back-projection of waves": (
         lambda m: back_projection(m.with_protocol(pr.trigonometric(8, measurement="mean")), 1.0),
         "two electrodes each",
@@ -140,7 +140,7 @@ COMPUTING = {
     "prior of a number": (lambda m: ImagingSettings(prior=3), "tikhonov, laplace"),  # pyright: ignore[reportArgumentType]
     "hyperparameter of truth": (lambda m: ImagingSettings(hyperparameter=True), "positive number"),
     "press beyond the edge": (lambda m: simulate_press(RoundSkin(), None, (20.0, 0.0)), "beyond the skin"),  # pyright: ignore[reportArgumentType]
-    "press of no size": (lambda m: simulate_press(RoundSkin(), None, (0, 0), radius=0), "positive size"),  # pyright: ignore[reportArgumentType]
+    "press of zero size": (lambda m: simulate_press(RoundSkin(), None, (0, 0), radius=0), "positive size"),  # pyright: ignore[reportArgumentType]
     "unknown method": (lambda m: ImagingSettings(method="two-step"), "one-step, back-projection"),
     "nearly a format": (lambda m: read(__file__, "kit"), "format must be one of .* \\(did you mean 'kit4'"),
     "nearly a choice": (lambda m: pr.opposite(8, drives="distnct"), "got 'distnct' \\(did you mean 'distinct'"),
@@ -162,7 +162,7 @@ COMPUTING = {
     "a path for a reference": (lambda m: prepare_imager("a.csv"), "^reference must be a Measurement.* 'a.csv'"),  # pyright: ignore[reportArgumentType]
     "settings of an image": (lambda m: prepare_imager(m, ImagingSettings()), "StreamSettings.* is an ImagingSettings"),  # pyright: ignore[reportArgumentType]
     "memory in words": (lambda m: StreamSettings(memory="long"), "number of frames.* it is 'long'"),  # pyright: ignore[reportArgumentType]
-    "what prepare_imager gives": (lambda m: stream((m, m), []), r"imager must be an Imager, .*\[0\]; it is a tuple"),  # pyright: ignore[reportArgumentType]
+    "result of prepare_imager": (lambda m: stream((m, m), []), r"imager must be an Imager, .*\[0\]; it is a tuple"),  # pyright: ignore[reportArgumentType]
     "a model by name": (lambda m: one_step("tank", 1.0), "model must be a ForwardModel.* it is 'tank'"),  # pyright: ignore[reportArgumentType]
     "a mesh to calibrate": (lambda m: calibrate(m.mesh, np.ones(40)), "model must be a ForwardModel.* it is a Mesh"),  # pyright: ignore[reportArgumentType]
     "prior as a class": (lambda m: one_step(m, 1.0, prior=Noser), "prior must be .* it is the class Noser itself"),  # pyright: ignore[reportArgumentType]
@@ -206,7 +206,7 @@ def test_computing(name, model):
 
 
 def test_messages_of_one_table_differ():
-    """Each fault has its own message: the same words for two faults teach nothing."""
+    """Each fault has its own message, because one message for two faults does not help the user."""
     messages = []
     for call, _ in (*GEOMETRY.values(), *PATTERNS.values()):
         with pytest.raises(ValueError, match=" ") as caught:
@@ -215,15 +215,15 @@ def test_messages_of_one_table_differ():
     assert len(set(messages)) == len(messages)
 
 
-# On the command line: DATA, REFERENCE and options out of a good tank with one thing spoilt.
+# On the command line: DATA, REFERENCE and options of a valid tank with one fault.
 
 
 def good(tank, *options):
     return ["reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", *options]
 
 
-def spoilt(tank, old, new):
-    """The good tank with other words in the description of both files."""
+def faulty(tank, old, new):
+    """The arguments for the valid tank, with one replacement in the description of both files."""
     assert old in tank.description
     description = tank.description.replace(old, new)
     tank.write("rest", tank.rest, description)
@@ -254,7 +254,7 @@ COMMANDS = {
     "data is a folder": (lambda t: ["reconstruct", t.folder], "is a folder"),
     "empty file": (lambda t: raw(t, "a.csv", b""), "is empty"),
     "a spreadsheet": (lambda t: raw(t, "a.xlsx", b"PK\x03\x04"), "no known format"),
-    "not text": (lambda t: spoilt(t, "V", "V") and raw(t, "rest.csv", b"\xff\xfe\x00"), "not a text file"),
+    "not text": (lambda t: faulty(t, "V", "V") and raw(t, "rest.csv", b"\xff\xfe\x00"), "not a text file"),
     "damaged mat": (lambda t: raw(t, "a.mat", b"MATLAB 5.0" + b"\0" * 200), "not a readable .mat"),
     "mat of another kind": (lambda t: matlab(t, x=1.0), "there are x (1 × 1). Name the array"),
     "unknown format": (lambda t: good(t, "--format", "xls"), "it is 'xls'"),
@@ -265,24 +265,24 @@ COMMANDS = {
         "--rule must be one of gcv, l-curve",
     ),
     "no description": (lambda t: with_data(t, t.touched, description=None)[:2], "nothing says what they mean"),
-    "description is no TOML": (lambda t: spoilt(t, "[geometry]", "[geometry"), "is no TOML file"),
-    "unknown key": (lambda t: spoilt(t, "radius", "diameter"), "geometry.diameter is no key of a disk"),
-    "negative radius": (lambda t: spoilt(t, "radius = 0.1", "radius = -0.1"), "geometry.radius is -0.1, and must be"),
+    "description is not TOML": (lambda t: faulty(t, "[geometry]", "[geometry"), "is no TOML file"),
+    "unknown key": (lambda t: faulty(t, "radius", "diameter"), "geometry.diameter is no key of a disk"),
+    "negative radius": (lambda t: faulty(t, "radius = 0.1", "radius = -0.1"), "geometry.radius is -0.1, and must be"),
     "no geometry": (
-        lambda t: spoilt(
+        lambda t: faulty(
             t, t.description.split("[protocol]")[0], f"[electrodes]\nkind = 'point'\npositions = {POINTS}\n"
         ),
         "[geometry] (a TOML file beside the data, or --description)",
     ),
-    "five amperes": (lambda t: spoilt(t, "current = 1e-3", "current = 5"), "if you meant 5 mA"),
-    "unknown protocol": (lambda t: spoilt(t, '"adjacent"', '"nextdoor"'), "adjacent, skip, opposite"),
-    "another protocol": (lambda t: spoilt(t, '"adjacent"', '"opposite"'), "channels"),
-    "electrodes overlap": (lambda t: spoilt(t, "width = 0.005", "width = 0.09"), "overlap"),
+    "five amperes": (lambda t: faulty(t, "current = 1e-3", "current = 5"), "if you meant 5 mA"),
+    "unknown protocol": (lambda t: faulty(t, '"adjacent"', '"nextdoor"'), "adjacent, skip, opposite"),
+    "another protocol": (lambda t: faulty(t, '"adjacent"', '"opposite"'), "channels"),
+    "electrodes overlap": (lambda t: faulty(t, "width = 0.005", "width = 0.09"), "overlap"),
     "electrodes off the edge": (
-        lambda t: spoilt(t, 'layout = "ring"\nnumber = 8\nclockwise = true', "positions = " + POINTS),
+        lambda t: faulty(t, 'layout = "ring"\nnumber = 8\nclockwise = true', "positions = " + POINTS),
         "from the boundary",
     ),
-    "unknown unit": (lambda t: spoilt(t, 'unit = "V"', 'unit = "dB"'), "unit must be one of V"),
+    "unknown unit": (lambda t: faulty(t, 'unit = "V"', 'unit = "dB"'), "unit must be one of V"),
     "words between numbers": (lambda t: with_data(t, "1,2\na,b\n1,2"), "line 2"),
     "ragged rows": (lambda t: with_data(t, "1,2,3\n1,2\n1,2,3"), "row 2 has length 2"),
     "too few channels": (lambda t: with_data(t, t.touched[:-1]), "40 channels"),
@@ -343,7 +343,7 @@ COMMANDS = {
         lambda t: ["layout", "compare", "park", "park-inner", "--output", t.folder],
         "layout: there is no",
     ),
-    "no file of a layout": (
+    "not a layout file": (
         lambda t: ["layout", "optimise", "a.csv", "--output", t.folder],
         "layout: there is no file",
     ),
@@ -396,7 +396,7 @@ def test_command_line(name, tank, run):
     assert "should not have happened" not in error
 
 
-def test_output_that_is_a_file(tank, run):
+def test_output_that_is_an_existing_file(tank, run):
     status, _, error = run(*good(tank, "--output", tank.folder / "rest.csv"))
     assert status == 1
     assert "is a file; give a folder" in error
@@ -418,24 +418,24 @@ def test_no_output(tank, run):
     assert "--output" in error
 
 
-def test_a_frame_too_noisy_says_so_in_python_too(tank):
+def test_python_error_for_a_frame_that_is_too_noisy(tank):
     noise = tank.write("noise", np.random.default_rng(1).normal(size=40))
     with pytest.raises(ValueError, match="too noisy"):
         image_difference(read(noise), read(tank.folder / "rest.csv"), ImagingSettings(num_points=250))
 
 
-def test_the_module_leaves_one_line_and_a_status(tmp_path, monkeypatch, capsys):
-    """What `python -m jeit` runs; a process of its own is for the slow suite."""
+def test_module_prints_one_line_and_returns_a_status(tmp_path, monkeypatch, capsys):
+    """Call what `python -m jeit` runs; the slow tests run it in a process of its own."""
     monkeypatch.setattr("sys.argv", ["jeit", "reconstruct", "absent.mat", "--output", str(tmp_path / "out")])
     with pytest.raises(SystemExit) as left:
         runpy.run_module("jeit", run_name="__main__")
     assert left.value.code == 1
-    said = "jeit: DATA: there is no file absent.mat. Check the name and the working directory.\n"
-    assert capsys.readouterr().err == said
+    expected = "jeit: DATA: there is no file absent.mat. Check the name and the working directory.\n"
+    assert capsys.readouterr().err == expected
 
 
 @pytest.mark.slow
-def test_a_real_process_leaves_one_line_and_a_status(tmp_path):
+def test_process_prints_one_line_and_returns_a_status(tmp_path):
     command = [sys.executable, "-m", "jeit", "reconstruct", "absent.mat", "--output", "out"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=os.environ, check=False)
     assert done.returncode == 1

@@ -1,4 +1,4 @@
-"""`jeit choose`: a table, a picture and a report of what every rule chooses."""
+"""`jeit choose`: the table, picture and report of the hyperparameters that the rules choose."""
 
 import json
 
@@ -21,7 +21,7 @@ def choose(run, folder, *options):
     return output, json.loads((folder / "choice.json").read_text("utf-8"), parse_constant=pytest.fail)
 
 
-def test_every_rule_in_table_picture_and_report(tank, run, tmp_path):
+def test_every_rule_is_in_table_picture_and_report(tank, run, tmp_path):
     files = (tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv")
     folder = tmp_path / "out"
     output, written = choose(run, folder, *files, *SMALL, "--prior", "noser")
@@ -38,12 +38,12 @@ def test_every_rule_in_table_picture_and_report(tank, run, tmp_path):
         assert 0 < entry["relative_residual"] < 1
         lengths = {len(entry[curve]) for curve in ("candidates", "criterion", "residual", "penalty")}
         assert len(lengths) == 1
-    # Data without noise: what reciprocity tells of it is nil, and no residual is as small.
+    # Without noise in the data, the noise estimated from reciprocity is zero, and no residual is as small.
     (edge,) = [entry for entry in written["rules"] if entry["rule"] == "discrepancy"]
     assert edge["edge_of_grid"] == "smallest"
     assert edge["note"] in output
     assert rows["discrepancy"].split()[1] == "*"
-    # The same λ as an image in one step has.
+    # The same λ as the one-step image.
     settings = ImagingSettings(num_points=250, contact="fixed", method="one-step", prior="noser")
     imaged = image_difference(read(files[0]), read(files[2]), settings)
     (figure,) = [entry for entry in written["rules"] if entry["rule"] == "noise-figure"]
@@ -53,8 +53,9 @@ def test_every_rule_in_table_picture_and_report(tank, run, tmp_path):
 
 
 @pytest.mark.slow
-def test_every_image_has_a_scale_and_few_marks(tank):
-    """A bar each, from end to end of its own values, in a unit; and no marks where they would lie over each other."""
+def test_every_image_has_a_colour_bar_with_few_ticks(tank):
+    """A colour bar for each image over the range of its own values, in a readable unit, without overlapping tick
+    labels."""
     settings = ImagingSettings(num_points=250, contact="fixed")
     result = compare_on_data(
         read(tank.folder / "touched.csv"), read(tank.folder / "rest.csv"), settings, rules=list(RULES)[:3]
@@ -78,7 +79,7 @@ def test_every_image_has_a_scale_and_few_marks(tank):
 
 
 @pytest.mark.slow
-def test_one_rule_and_quiet(tank, run, tmp_path):
+def test_one_rule_quietly(tank, run, tmp_path):
     options = ("--rule", "l-curve", "--rule", "gcv", "--quiet", *SMALL)
     output, written = choose(
         run, tmp_path / "out", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", *options
@@ -87,7 +88,7 @@ def test_one_rule_and_quiet(tank, run, tmp_path):
     assert [entry["rule"] for entry in written["rules"]] == ["l-curve", "gcv"]
 
 
-def test_reconstruct_says_when_its_rule_ran_to_the_edge(tank, run, tmp_path):
+def test_reconstruct_reports_a_choice_at_the_edge_of_the_range(tank, run, tmp_path):
     files = (tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv")
     status, output, error = run(
         "reconstruct", *files, *SMALL, "--hyperparameter", "discrepancy", "--output", tmp_path / "out"
@@ -98,8 +99,8 @@ def test_reconstruct_says_when_its_rule_ran_to_the_edge(tank, run, tmp_path):
     assert "not to be" in " ".join(output.split())
 
 
-def test_a_rule_that_cannot_choose_is_refused_and_the_others_are_not(tank, capsys):
-    """Of every two reciprocal channels only one: nothing tells of the noise."""
+def test_a_rule_that_cannot_choose_is_refused_alone(tank, capsys):
+    """With only one of every two reciprocal channels, the data contain no estimate of the noise."""
     pairs, _ = read(tank.folder / "rest.csv").protocol.reciprocal_pairs()
     usable = np.ones(40, bool)
     usable[np.asarray(pairs)[:, 1]] = False
@@ -139,7 +140,7 @@ def test_bad_input_is_refused_in_one_line(arguments, words, tank, run, tmp_path)
     assert error.count("\n") == 1
 
 
-def test_output_that_is_a_file_is_refused_before_any_work(tank, run):
+def test_output_that_is_a_file_is_refused_before_any_computation(tank, run):
     status, output, error = run("choose", *good(tank), "--output", tank.folder / "rest.csv")
     assert (status, output) == (1, "")
     assert "is a file" in error
@@ -147,8 +148,8 @@ def test_output_that_is_a_file_is_refused_before_any_work(tank, run):
 
 @pytest.mark.slow
 def test_measured_tank(data_folder, run, tmp_path):
-    """Three metal rods: the rules that look at the system or at the corner find them; gcv and discrepancy, misled by
-    the model, do not."""
+    """Three metal rods. The rules based on the system or on the corner of the L-curve find them. GCV and discrepancy do
+    not, because of model errors."""
     folder = data_folder / "kit4"
     files = (folder / "datamat_3_4.mat", "--reference", folder / "datamat_1_0.mat")
     _, written = choose(run, tmp_path / "out", *files, "--num-points", 600)

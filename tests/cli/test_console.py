@@ -1,4 +1,4 @@
-"""Numbers as the commands print them."""
+"""Numbers and tables as the commands print them."""
 
 import io
 from types import SimpleNamespace
@@ -28,11 +28,11 @@ SAID = {
 
 
 @pytest.mark.parametrize("value", SAID)
-def test_per_cents_have_no_exponents(value):
+def test_percentages_have_no_exponents(value):
     assert percent(value) == SAID[value]
 
 
-def test_what_is_not_known():
+def test_unknown_values():
     assert percent(None) == "not known"
 
 
@@ -45,13 +45,13 @@ def printed(bodies, **known):
 BODIES = [Inclusion(1, (0.01, 0.02, 0.03), 2e-5, 0.2), Inclusion(-1, (0.0, 0.0, 0.0), 1e-5, -0.004)]
 
 
-def test_a_peak_is_in_one_unit():
+def test_a_peak_has_one_unit():
     lines = printed(BODIES)
     assert [line[0] for line in lines] == ["volume", "inclusion", "conductive", "resistive"]
     assert [line[-1] for line in lines] == ["change", "mS/m", "200", "-4"]
 
 
-def test_a_peak_is_told_as_a_change_and_with_the_share_of_the_background_that_it_is():
+def test_a_peak_is_printed_as_a_change_and_relative_to_the_background():
     lines = printed(BODIES, background=0.05)
     assert lines[0][-4:] == ["peak", "change", "of", "back-"]
     assert lines[1][-3:] == ["/", "mS/m", "ground"]
@@ -75,8 +75,8 @@ def test_numbers_of_a_large_body_have_three_digits_and_no_exponents():
     assert {"12300", "10900", "13500", "9880", "+11000", "+13000"} <= words
 
 
-def test_columns_are_called_so():
-    """On one line where all of the table goes into 80 columns."""
+def test_column_headings():
+    """Headings take one line where the whole table fits into 80 columns."""
     form = SolidForm((0.0, 0.0, 0.0), ((0.01, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.05)), True)
     column = Inclusion(1, (-0.2595, -0.1297, 0.1477), 0.0123456, 0.999, form=form)
     first = [line[:2] for line in printed([column, BODIES[1]]) if line]
@@ -91,9 +91,9 @@ def test_columns_are_called_so():
 
 
 @pytest.mark.parametrize(("dimension", "edge"), [(2, "outlines"), (3, "surfaces")])
-def test_bodies_end_at_outlines_in_a_sheet_and_at_surfaces_in_a_solid(dimension, edge):
-    told, strong = (SimpleNamespace(contrast_is_determined=known) for known in (True, False))
-    shapes: Any = SimpleNamespace(bodies=[told, strong], doubtful=[told], drift=0.01)
+def test_extent_of_bodies_is_an_outline_in_a_sheet_and_a_surface_in_a_solid(dimension, edge):
+    determined, undetermined = (SimpleNamespace(contrast_is_determined=known) for known in (True, False))
+    shapes: Any = SimpleNamespace(bodies=[determined, undetermined], doubtful=[determined], drift=0.01)
     assert bodies_text(shapes, dimension) == (
         f"2 {edge} fitted; 1 ghost left out; of 1 the data give a limit of the change only; the background "
         "has drifted by 1 %"

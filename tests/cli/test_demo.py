@@ -1,4 +1,4 @@
-"""The demo, and what a first contact with jeit meets: help, version, import."""
+"""The demo, and what new users call first: help, version and import."""
 
 import json
 import re
@@ -12,7 +12,7 @@ from jeit.inverse.prior.matern import PRIORS
 
 
 @pytest.mark.slow
-def test_demo_finds_the_press(run, tmp_path):
+def test_demo_locates_the_press(run, tmp_path):
     status, output, error = run("demo", "--x", "0.01", "--y", "-0.02", "--output", tmp_path)
     assert (status, error) == (0, "")
     assert "error" in output
@@ -33,7 +33,7 @@ def test_the_same_seed_gives_the_same_press():
     frames = [simulate_press(skin, jax.random.key(seed), (0.01, 0.0))[0].voltages for seed in (3, 3, 4)]
     np.testing.assert_array_equal(frames[0], frames[1])
     assert not np.array_equal(frames[0], frames[2])
-    # The noise asked for, relative to the root mean square: 208 draws give it to about 5 %.
+    # The requested noise, relative to the root mean square: 208 draws give it to about 5 %.
     spread = np.std(frames[0] - frames[2]) / np.sqrt(2) / np.sqrt(np.mean(frames[0] ** 2))
     assert spread == pytest.approx(1e-4, rel=0.2)
 
@@ -48,22 +48,22 @@ def test_help_and_version(run):
     assert run()[0] == 0
 
 
-def test_help_tells_the_defaults(run):
+def test_help_states_the_defaults(run):
     _, output, _ = run("reconstruct", "--help")
-    told = " ".join(output.replace("│", " ").split())
+    text = " ".join(output.replace("│", " ").split())
     settings = jeit.imaging.ImagingSettings()
     rule = jeit.imaging.ImagingSettings(method="one-step").hyperparameter
     for value in (settings.method, settings.prior, rule):
-        assert f"{value} (default)" in told
+        assert f"{value} (default)" in text
     assert settings.num_points is None
-    assert f"(default {SHEET_POINTS}; of a solid body {SOLID_POINTS})" in told
+    assert f"(default {SHEET_POINTS}; of a solid body {SOLID_POINTS})" in text
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "choose"])
 def test_help_names_all_priors(run, command):
-    told = " ".join(run(command, "--help")[1].replace("│", " ").split())
+    text = " ".join(run(command, "--help")[1].replace("│", " ").split())
     for name in PRIORS:
-        assert re.search(rf"\b{name}\b", told.partition("--prior")[2].partition("--contact")[0])
+        assert re.search(rf"\b{name}\b", text.partition("--prior")[2].partition("--contact")[0])
 
 
 def test_contents_page():

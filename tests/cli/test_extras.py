@@ -1,4 +1,5 @@
-"""Without the packages of an extra, each command that needs them names the extra to install, and does nothing else."""
+"""Without the packages of an extra, each command that needs them fails before any work and names the extra to
+install."""
 
 import sys
 import tomllib
@@ -26,7 +27,7 @@ diameter_mm = 10
 cell_mm = 8
 """
 
-# Of each command, and of each extra that some of its input needs: what it is called with.
+# The arguments with which each command is called, for each extra that it or some of its input needs.
 NEEDED = [
     ("layout compare", "cad", "skin.dxf ring-16 -o out"),
     ("layout optimise", "cad", "skin.dxf -o out"),
@@ -55,7 +56,7 @@ NOTHING_NEEDED = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Files of every kind that the commands take; what is in them is not looked at before the packages are."""
+    """Files of every kind that the commands read. The packages are checked before the content of these files."""
     folder = tmp_path_factory.mktemp("extras")
     random = np.random.default_rng(0)
     frames = random.standard_normal((20, 10))
@@ -78,7 +79,7 @@ def folder(tmp_path_factory):
 
 
 def commands(one=None, path=()):
-    """Every command that does something, by its words."""
+    """Every command that is not a group of commands, by its words."""
     one = one or as_command()
     inside = getattr(one, "commands", {})
     for name, other in inside.items():
@@ -87,12 +88,12 @@ def commands(one=None, path=()):
         yield " ".join(path)
 
 
-def test_every_command_is_looked_at():
+def test_every_command_is_tested():
     assert set(commands()) == {name for name, _, _ in NEEDED} | NOTHING_NEEDED
 
 
 @pytest.mark.parametrize(("command", "extra", "arguments"), NEEDED)
-def test_the_extra_is_named(folder, run, monkeypatch, command, extra, arguments):
+def test_missing_extra_is_named(folder, run, monkeypatch, command, extra, arguments):
     for module in EXTRAS[extra]:
         monkeypatch.setitem(sys.modules, module, None)
     for reader in ("jeit.touch.listening.Listener.read", "jeit.acoustic.Calibration.load"):
@@ -109,8 +110,8 @@ def test_the_extra_is_named(folder, run, monkeypatch, command, extra, arguments)
     ("package", "arguments"),
     [("ezdxf", "layout compare skin.dxf ring-16 -o out"), ("sklearn", "touch fit presses.npz -o out")],
 )
-def test_a_package_that_is_broken(folder, run, monkeypatch, tmp_path, package, arguments):
-    """It is there, and cannot be imported: said in a line, with the reason."""
+def test_package_that_cannot_be_imported(folder, run, monkeypatch, tmp_path, package, arguments):
+    """The package is installed but its import fails: the error is one line with the reason."""
     (tmp_path / f"{package}.py").write_text("raise ImportError('libnothing.so: no such file')")
     monkeypatch.syspath_prepend(tmp_path)
     for name in [name for name in sys.modules if name.partition(".")[0] == package]:
@@ -123,7 +124,7 @@ def test_a_package_that_is_broken(folder, run, monkeypatch, tmp_path, package, a
 
 
 def test_extras_are_those_of_the_project():
-    """Of its file: the same names, and the same packages in each."""
+    """The extras and their packages are those of pyproject.toml."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["optional-dependencies"]
     named = {extra: {Requirement(one).name for one in needs} for extra, needs in extras.items()}
     given = {extra: set(packages.values()) for extra, packages in EXTRAS.items()}

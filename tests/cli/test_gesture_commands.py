@@ -1,6 +1,7 @@
-"""`jeit touch gestures` and `jeit touch watch`: learnt from a file, named from files and from standard input.
+"""`jeit touch gestures` and `jeit touch watch`: training on a file, classification from files and from standard input.
 
-Frames are those of a linear skin, whose touches are spots of higher conductivity: commands are judged, not methods.
+The frames are those of a linear skin, whose touches are spots of higher conductivity: the commands are tested, not the
+methods.
 """
 
 import contextlib
@@ -19,7 +20,7 @@ from jeit.data import GestureSet
 
 @pytest.fixture(scope="module", autouse=True)
 def coarse_images():
-    """Commands have no option for the mesh of their images."""
+    """Image on a coarse mesh, for which the commands have no option."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("jeit.imaging.stream_preparation.STREAM_POINTS", 250)
         yield
@@ -50,7 +51,7 @@ def files(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def learnt(files):
-    """Where the command wrote what it learnt, and what it printed."""
+    """The folder that the command wrote, and what it printed."""
     folder, _ = files
     arguments = ("touch", "gestures", folder / "gestures.npz", "--skin", folder / "skin.toml", "-o", folder / "model")
     with contextlib.redirect_stdout(io.StringIO()) as printed:
@@ -67,7 +68,7 @@ def events(folder):
     return list(csv.DictReader((folder / "events.csv").read_text("utf-8").splitlines()))
 
 
-def test_gestures_are_learnt(learnt):
+def test_training_writes_a_model_and_a_report(learnt):
     folder, output = learnt
     assert "24, of 2 people" in output
     assert "right, held out" in output
@@ -77,7 +78,7 @@ def test_gestures_are_learnt(learnt):
     assert (folder / "gestures.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_file_is_watched(files, model, run):
+def test_gestures_in_a_file_are_classified(files, model, run):
     folder, stream = files
     status, output, error = run(
         *("touch", "watch", folder / "stream.npz", "--skin", folder / "skin.toml", "--gestures", model),
@@ -85,22 +86,22 @@ def test_a_file_is_watched(files, model, run):
     )
     assert (status, error) == (0, "")
     assert "99 % within" in output
-    told = events(folder / "out")
-    assert [one["gesture"] for one in told] == 2 * list(GESTURES)
-    np.testing.assert_allclose([float(one["onset_s"]) for one in told], stream.onset, atol=0.2)
-    for one in told:
+    detected = events(folder / "out")
+    assert [one["gesture"] for one in detected] == 2 * list(GESTURES)
+    np.testing.assert_allclose([float(one["onset_s"]) for one in detected], stream.onset, atol=0.2)
+    for one in detected:
         assert 0 < float(one["probability"]) <= 1
         assert abs(float(one["x_m"])) <= 0.16
         assert abs(float(one["y_m"])) <= 0.1
     paths = list(csv.DictReader((folder / "out" / "paths.csv").read_text("utf-8").splitlines()))
-    assert {one["touch"] for one in paths} == {one["touch"] for one in told}
+    assert {one["touch"] for one in paths} == {one["touch"] for one in detected}
     report = json.loads((folder / "out" / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
     assert report["frames"] == len(stream.seconds)
-    assert report["touches"] == len(told)
+    assert report["touches"] == len(detected)
     assert (folder / "out" / "timeline.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_table_by_its_rate_tells_the_same(files, model, run, tmp_path):
+def test_a_table_with_a_given_rate_gives_the_same_labels(files, model, run, tmp_path):
     folder, _ = files
     status, _, error = run(
         *("touch", "watch", folder / "stream.csv", "--skin", folder / "skin.toml", "--gestures", model),
@@ -110,7 +111,7 @@ def test_a_table_by_its_rate_tells_the_same(files, model, run, tmp_path):
     assert [one["gesture"] for one in events(tmp_path)] == list(GESTURES)
 
 
-def test_standard_input_is_watched(files, model, run, tmp_path, monkeypatch):
+def test_gestures_on_standard_input_are_classified(files, model, run, tmp_path, monkeypatch):
     folder, stream = files
     lines = "\n".join(" ".join(map(repr, map(float, row))) for row in stream.voltages[:420])
     monkeypatch.setattr("sys.stdin", io.StringIO(lines + "\nno numbers\n"))
@@ -124,7 +125,7 @@ def test_standard_input_is_watched(files, model, run, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
-def test_a_signal_ends_it_and_all_is_written(files, model, run, tmp_path, monkeypatch, number):
+def test_results_are_written_after_a_signal(files, model, run, tmp_path, monkeypatch, number):
     folder, stream = files
 
     def lines():
@@ -148,7 +149,7 @@ def test_a_signal_ends_it_and_all_is_written(files, model, run, tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    ("stream", "options", "said"),
+    ("stream", "options", "message"),
     [
         ("empty.csv", {}, "holds no numbers"),
         ("none.npz", {}, "frames: there is none"),
@@ -172,7 +173,7 @@ def test_a_signal_ends_it_and_all_is_written(files, model, run, tmp_path, monkey
         ("stream.npz", {"--untouched": "0.01"}, "--untouched: the first 0.01 s"),
     ],
 )
-def test_what_cannot_be_is_said(files, model, run, tmp_path, stream, options, said):
+def test_invalid_input_is_reported(files, model, run, tmp_path, stream, options, message):
     folder, _ = files
     given = {"--skin": "skin.toml", "--gestures": "model", "--output": tmp_path / "out"} | options
     words = [
@@ -182,12 +183,12 @@ def test_what_cannot_be_is_said(files, model, run, tmp_path, stream, options, sa
     ]
     status, _, error = run("touch", "watch", folder / stream, *words)
     assert status == 1
-    assert said in error
+    assert message in error
     assert len(error) < 400
     assert not (tmp_path / "out" / "events.csv").exists()
 
 
-def test_recordings_that_are_none(files, run, tmp_path):
+def test_invalid_recordings_are_reported(files, run, tmp_path):
     folder, _ = files
     made = GestureSet.read(folder / "gestures.npz")
     skin = ("--skin", folder / "skin.toml", "--output", tmp_path / "out")

@@ -1,4 +1,4 @@
-"""`jeit touch health`: damage told of recordings, on frames alone and with a skin described."""
+"""`jeit touch health`: damage detected in recordings, from frames alone and with a described skin."""
 
 import csv
 import json
@@ -31,7 +31,7 @@ SECONDS = np.arange(0, 30, 0.2)
 
 
 def touched(rng, number, rest, noise=1e-3):
-    """Frames of a made-up skin with a touch of eight frames in every thirty."""
+    """Frames of a synthetic skin with a touch of eight frames in every thirty."""
     frames = rest + noise * rng.normal(size=(number, len(rest)))
     for start in range(10, number - 20, 30):
         frames[start : start + 8] += 0.1 * np.exp(-((np.arange(len(rest)) - rng.uniform(0, len(rest))) ** 2) / 20)
@@ -59,7 +59,7 @@ def events(folder):
     return list(csv.DictReader((folder / "events.csv").read_text("utf-8").splitlines()))
 
 
-def test_frames_alone_are_enough(files, run, tmp_path):
+def test_damage_is_detected_from_frames_alone(files, run, tmp_path):
     status, output, error = run(
         "touch", "health", files / "hurt.csv", "--healthy", files / "healthy.csv", "--output", tmp_path
     )
@@ -93,7 +93,8 @@ def cut(tmp_path_factory):
     torn, centres = np.asarray(cut.conductivity(mesh, whole)), np.asarray(centroids(mesh))
 
     def seen(conductivity):
-        """Voltages at rest, and under touches at eight places, from one second to two of every four."""
+        """Voltages at rest and under touches at eight places; each touch lasts from second 1 to 2 of every four
+        seconds."""
         angle = 2.0 * np.arange(8)
         places = 0.03 * np.array([np.cos(angle), np.sin(angle)]).T
         spots = 1 + 0.5 * np.exp(-np.sum((centres - places[:, None]) ** 2, axis=-1) / 0.012**2)
@@ -101,10 +102,10 @@ def cut(tmp_path_factory):
         return np.stack([model.voltages((one * conductivity.T).T) for one in scales])
 
     number = np.where((SECONDS % 4 > 1) & (SECONDS % 4 < 2), 1 + SECONDS // 4, 0).astype(int)
-    sound, hurt = seen(whole), seen(torn)
+    intact, damaged = seen(whole), seen(torn)
 
     def recorded(at):
-        frames = np.where((at > SECONDS)[:, None], sound[number], hurt[number])
+        frames = np.where((at > SECONDS)[:, None], intact[number], damaged[number])
         return frames + 1e-4 * np.abs(frames).mean() * rng.normal(size=frames.shape)
 
     np.savez(folder / "healthy.npz", frames=recorded(np.inf), seconds=SECONDS)
@@ -113,8 +114,8 @@ def cut(tmp_path_factory):
     return folder
 
 
-def test_a_cut_is_drawn_on_a_described_skin(cut, run, tmp_path, monkeypatch):
-    """On a mesh whose edges are twice as long as usual, from fewer starts: its place to a centimetre."""
+def test_a_cut_is_located_on_a_described_skin(cut, run, tmp_path, monkeypatch):
+    """On a mesh with edges twice as long as usual, from fewer starting paths: the cut is located to a centimetre."""
     for name, value in (("_EDGE", 0.025), ("_FOLLOWED", 1), ("_DIRECTIONS", 4)):
         monkeypatch.setattr(f"jeit.touch.health.cut_path.{name}", value)
     status, output, error = run(
@@ -132,7 +133,7 @@ def test_a_cut_is_drawn_on_a_described_skin(cut, run, tmp_path, monkeypatch):
     assert report["with_a_model"]
 
 
-def test_what_speaks_against_it_is_said(files, run, tmp_path):
+def test_limitations_of_the_recordings_are_noted(files, run, tmp_path):
     hurt, healthy = (np.loadtxt(files / name, delimiter=",") for name in ("hurt.csv", "healthy.csv"))
     still = hurt.copy()
     still[:, 3], still[:, 5] = still[0, 3], np.nan
@@ -149,9 +150,9 @@ def test_what_speaks_against_it_is_said(files, run, tmp_path):
         )
         assert status == 0, name
         report = json.loads((tmp_path / name / "report.json").read_text("utf-8"), parse_constant=pytest.fail)
-        for said in notes:
-            assert said in " ".join(output.split())
-            assert any(said in one for one in report["notes"])
+        for message in notes:
+            assert message in " ".join(output.split())
+            assert any(message in one for one in report["notes"])
     np.save(tmp_path / "few.npy", healthy[:60])
     _, output, _ = run("touch", "health", files / "hurt.csv", "--healthy", tmp_path / "few.npy", "-o", tmp_path / "few")
     assert "few beside the length of touches" in " ".join(output.split())
@@ -163,7 +164,7 @@ def test_what_speaks_against_it_is_said(files, run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("recording", "healthy", "options", "said"),
+    ("recording", "healthy", "options", "message"),
     [
         ("hurt.csv", "fewer.csv", (), "has 40 channels, and"),
         ("hurt.csv", "short.csv", (), "5 frames are too few"),
@@ -176,10 +177,10 @@ def test_what_speaks_against_it_is_said(files, run, tmp_path):
         ("hurt.csv", "healthy.csv", ("--skin", "nowhere.toml"), "there is no such file"),
     ],
 )
-def test_what_cannot_be_is_said(files, run, tmp_path, recording, healthy, options, said):
+def test_invalid_input_is_reported(files, run, tmp_path, recording, healthy, options, message):
     status, _, error = run(
         *("touch", "health", files / recording, "--healthy", files / healthy, "--output", tmp_path / "out", *options)
     )
     assert status == 1
-    assert said in error
+    assert message in error
     assert not (tmp_path / "out" / "events.csv").exists()

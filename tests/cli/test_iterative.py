@@ -1,4 +1,4 @@
-"""Iterative methods, segmentation and streams from the command line."""
+"""Iterative methods, segmentation and streams on the command line."""
 
 import csv
 import io
@@ -30,7 +30,7 @@ def arrays_of(path):
     [
         pytest.param("gauss-newton", marks=pytest.mark.slow),
         pytest.param("levenberg-marquardt", marks=pytest.mark.slow),
-        # Quickly in the test of segmentation.
+        # Segmentation is tested with the quick methods.
         pytest.param("total-variation", marks=pytest.mark.slow),
     ],
 )
@@ -67,7 +67,7 @@ def test_segmentation(tank, run, tmp_path):
     assert content["labels"].any()
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["hyperparameter"]["chosen_by"] == "default"
-    # What is listed is what the labels show; inclusions that share a corner of the mesh touch in a pixel.
+    # The listed bodies are those of the labels; inclusions that share a corner of the mesh touch in a pixel.
     islands = sum(label(binary_erosion(content["labels"] == kind, iterations=3))[1] for kind in (1, 2))
     listed = sum(printed.count(f"  {kind}") for kind in ("conductive", "resistive"))
     assert len(report["inclusions"]) == islands == listed
@@ -128,7 +128,7 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     assert [row["status"] for row in rows_of(tmp_path / "out")] == [
         "imaged", "refused", "imaged", "refused", "partial",
     ]  # fmt: skip
-    # One whose frames are all refused says why, and fails; what it leaves has the reasons.
+    # A stream of which all frames are refused fails with the reason, and its table holds the reasons.
     monkeypatch.setattr("sys.stdin", io.StringIO("1 2 3\nrubbish\n"))
     status, _, error = run(
         "stream", "-", "--reference", tank.folder / "rest.csv", "--output", tmp_path / "out", "--method", "one-step",
@@ -138,7 +138,7 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     assert "2 frames, and none could be imaged" in error
     assert "not 40 real voltages" in error
     assert [row["status"] for row in rows_of(tmp_path / "out")] == ["refused", "refused"]
-    # A stream that fails leaves no images of an earlier one behind.
+    # A stream that fails leaves no images of an earlier run behind.
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     assert (tmp_path / "out" / "images.npz").exists()
     status, _, error = run(
@@ -149,8 +149,8 @@ def test_a_stream_from_standard_input(tank, run, tmp_path, monkeypatch):
     assert not (tmp_path / "out" / "images.npz").exists()
 
 
-def test_a_stream_borrows_the_description_of_its_reference(tank, run, tmp_path):
-    """Of an NPZ written by jeit, whose description lies beside it; the frames lie elsewhere, with none."""
+def test_a_stream_uses_the_description_of_its_reference(tank, run, tmp_path):
+    """The reference is an NPZ file of jeit with its description beside it; the frames lie elsewhere without one."""
     write_table(read(tank.folder / "rest.csv"), tmp_path / "empty.npz")
     (tmp_path / "live").mkdir()
     np.savetxt(tmp_path / "live" / "frames.csv", tank.touched[None], delimiter=",")
@@ -172,7 +172,7 @@ def test_a_stream_borrows_the_description_of_its_reference(tank, run, tmp_path):
     assert (status, "--rate must be positive" in error) == (1, True)
 
 
-def test_the_help_of_a_stream_tells_the_defaults(run):
+def test_help_of_a_stream_states_the_defaults(run):
     settings = StreamSettings()
     printed = " ".join(run("stream", "--help")[1].replace("│", " ").split())
     assert f"{settings.solver.name} (default)" in printed
@@ -181,7 +181,7 @@ def test_the_help_of_a_stream_tells_the_defaults(run):
     assert f"(default {FRAME_STEPS})" in printed
 
 
-def test_the_help_lists_the_methods_that_are_taken(run):
+def test_help_lists_the_accepted_methods(run):
     printed = " ".join(run("reconstruct", "--help")[1].replace("│", " ").split())
     assert [name for name in (AUTO, *METHODS, NETWORK) if name not in printed] == []
 
@@ -219,11 +219,11 @@ def test_bad_input_is_refused_in_one_line(arguments, words, tank, run, tmp_path)
     assert error.count("\n") == 1
 
 
-def test_one_unit_a_column():
+def test_columns_have_one_unit():
     assert in_one_unit([2.7e-3, -1.85e-4], "S") == ("mS", ["2.7", "-0.185"])
     assert in_one_unit([12.0], "S/m") == ("S/m", ["12"])
     assert in_one_unit([], "S") == ("S", [])
 
 
-def test_one_of_a_thing_is_no_plural():
+def test_singular_and_plural():
     assert [counted(number, "frame") for number in (0, 1, 1000)] == ["0 frames", "1 frame", "1,000 frames"]

@@ -1,4 +1,5 @@
-"""Commands killed with kill -9 where it hurts: what is left can be read, and the next run is as one undisturbed."""
+"""Commands killed with kill -9 at critical moments: the remaining files are readable, and the next run is
+undisturbed."""
 
 import csv
 import os
@@ -29,7 +30,7 @@ def dying(self, *given, **options):
 from jeit.cli import main
 sys.exit(main(sys.argv[1:]))
 """
-# What is called for the how-manieth time when it dies, and the files that there are then.
+# The function in which the process dies, the number of the call, and the files that exist then.
 STREAM = {
     "its third line": ("jeit.report.growing", "GrowingTable", "write", 4, {"frames.csv"}),
     "its images": ("zipfile", "_ZipWriteFile", "write", 3, {"frames.csv"}),
@@ -40,7 +41,8 @@ STREAM = {
 
 @pytest.mark.slow
 def test_a_stream(tank, run, tmp_path):
-    """Killed at each moment: whole lines and files are left, and the next run makes what an undisturbed one does."""
+    """Killed at each moment: complete lines and files remain, and the next run gives the results of an undisturbed
+    one."""
     data = tank.write("many", np.stack([tank.touched, tank.rest, 1.02 * tank.touched, tank.touched]))
     given = "stream", data, "--reference", tank.folder / "rest.csv", "--method", "one-step", "--num-points", 250
     assert run(*given, "--quiet", "--output", tmp_path / "undisturbed")[0] == 0
@@ -65,7 +67,7 @@ def test_a_stream(tank, run, tmp_path):
 
 @pytest.mark.slow
 def test_an_image(tank, run, tmp_path):
-    """The second of its files takes its place: one is new, the others are those of an earlier run."""
+    """The process dies while it replaces the second file: one file is new, the others are those of an earlier run."""
     given = "--reference", tank.folder / "rest.csv", "--num-points", 250, "--quiet", "--output"
     assert run("reconstruct", tank.write("less", 0.5 * (tank.rest + tank.touched)), *given, tmp_path / "out")[0] == 0
     code = KILLED.format(module="pathlib", owner="Path", method="replace", calls=2)
@@ -102,7 +104,7 @@ sys.exit(main(sys.argv[1:]))
 
 @pytest.mark.slow
 def test_while_compiled_code_is_kept(tank, run, tmp_path):
-    """Half a program is left; the next run says nothing of it, and keeps it whole."""
+    """Half a compiled program remains; the next run replaces it without a message."""
     given = ["reconstruct", tank.folder / "touched.csv", "--reference", tank.folder / "rest.csv", "--num-points", 250]
     given = [*map(str, given), "--quiet", "--output"]
     kept = ("JAX_COMPILATION_CACHE_DIR", "JEIT_COMPILATION_CACHE")

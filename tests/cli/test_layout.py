@@ -1,4 +1,4 @@
-"""`jeit layout compare`: two layouts side by side, in a table, a report and a picture."""
+"""`jeit layout compare`: two layouts compared in a table, a report and a picture."""
 
 import json
 
@@ -21,7 +21,7 @@ def layouts(tmp_path):
     return tmp_path / "inside.svg", tmp_path / "left.csv"
 
 
-def test_two_files_side_by_side(layouts, run, tmp_path):
+def test_two_files_are_compared(layouts, run, tmp_path):
     folder = tmp_path / "out"
     size = ["--width-mm", 60, "--height-mm", 50]
     status, output, error = run("layout", "compare", *layouts, "--output", folder, *OPTIONS, "--contrast", 5, *size)
@@ -32,7 +32,7 @@ def test_two_files_side_by_side(layouts, run, tmp_path):
     inside, left = report["layouts"]
     assert [one["layout"] for one in report["layouts"]] == ["inside", "left"]
     assert inside["measurements"] == 6
-    # Its right side is far from all electrodes.
+    # The right side of this layout is far from all electrodes.
     assert left["sensitivity_min_V"] < 0.5 * inside["sensitivity_min_V"]
     assert left["blind_spot_fraction"] > 0.1
     assert inside["blind_spot_fraction"] == 0
@@ -43,8 +43,8 @@ def test_two_files_side_by_side(layouts, run, tmp_path):
     assert report["options"]["contrast"] == 5
 
 
-def test_a_layout_and_its_file_are_alike(run, tmp_path):
-    """Files have millimetres of nine digits: what is rounded off makes no place blind."""
+def test_a_layout_and_its_file_give_the_same_result(run, tmp_path):
+    """Files hold millimetres with nine digits; this rounding causes no blind spot."""
     write_layout(named_layout("grid-3x2", Rectangle(0.06, 0.05)), tmp_path / "file.csv")
     options = ["--width-mm", 60, "--height-mm", 50, "--output", tmp_path / "out", *OPTIONS]
     assert run("layout", "compare", "grid-3x2", tmp_path / "file.csv", *options)[0] == 0
@@ -52,12 +52,12 @@ def test_a_layout_and_its_file_are_alike(run, tmp_path):
     assert [one["blind_spot_fraction"] for one in report["layouts"]] == [0, 0]
 
 
-def test_the_second_layout_is_checked_before_the_first_is_touched(layouts, run, tmp_path, monkeypatch):
+def test_the_second_layout_is_checked_before_the_first_is_simulated(layouts, run, tmp_path, monkeypatch):
     touched = []
     monkeypatch.setattr(Skin, "voltage_changes", lambda skin, cells: touched.append(skin.layout.name))
     write_layout(Layout(grid(0.04, 0.03, 3, 2), 3e-3, outline=SKIN), tmp_path / "small.svg")
     write_layout(Layout(grid(0.04, 0.0, 3, 1), 8e-3, outline=SKIN), tmp_path / "three.svg")
-    for second, said in (
+    for second, message in (
         ("none.svg", "none.svg"),
         ("small.svg", "--cell-mm is 5 mm; give no more than 4.5 mm, as electrodes of 'small' are 3 mm across"),
         ("three.svg", "--pairs is 6; 'three' has 3 electrodes, and they make 3 pairs"),
@@ -65,13 +65,13 @@ def test_the_second_layout_is_checked_before_the_first_is_touched(layouts, run, 
         command = ["layout", "compare", layouts[0], tmp_path / second, "--output", tmp_path / "out", *OPTIONS]
         status, _, error = run(*command)
         assert status == 1
-        assert said in error
+        assert message in error
         assert "metres" not in error
     assert touched == []
 
 
 @pytest.mark.slow
-def test_touches_that_conduct(layouts, run, tmp_path):
+def test_touches_that_increase_the_conductivity(layouts, run, tmp_path):
     for contrast in (0, 5):
         options = ["--output", tmp_path / f"out-{contrast}", *OPTIONS, "--contrast", contrast, "--quiet"]
         assert run("layout", "compare", layouts[0], layouts[0], *options)[0] == 0
@@ -82,14 +82,14 @@ def test_touches_that_conduct(layouts, run, tmp_path):
 
 
 @pytest.mark.parametrize(("option", "value"), [("--width-mm", 0), ("--height-mm", 1e6)])
-def test_the_side_of_a_skin_is_a_length(option, value, layouts, run, tmp_path):
+def test_the_side_of_a_skin_must_be_a_length(option, value, layouts, run, tmp_path):
     status, _, error = run("layout", "compare", *layouts, "--output", tmp_path / "out", *OPTIONS, option, value)
     assert status == 1
     assert f"{option} must be from 1 to 5000 mm" in error
 
 
 def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
-    """A CSV file is taken to be of the usual skin unless its sides are given."""
+    """A CSV file is assumed to describe the default skin unless the sides are given."""
     status, _, error = run("layout", "compare", *layouts, "--output", tmp_path / "out", *OPTIONS)
     assert status == 1
     assert "different skins, 'inside' 60 × 50 mm and 'left' 200 × 200 mm" in error
@@ -97,7 +97,7 @@ def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (["park-iner"], "park-inner"),
         (["missing.svg"], "missing.svg"),
@@ -121,9 +121,9 @@ def test_layouts_on_different_skins_are_not_compared(layouts, run, tmp_path):
         (["grid-2x1"], "'grid-2x1' has 2 electrodes; give a layout of three or more"),
     ],
 )
-def test_bad_input_is_explained(change, said, layouts, run, tmp_path):
+def test_bad_input_is_explained(change, message, layouts, run, tmp_path):
     first = change[0] or layouts[0]
     status, _, error = run("layout", "compare", first, layouts[0], "--output", tmp_path / "out", *OPTIONS, *change[1:])
     assert status == 1
-    assert said in error
+    assert message in error
     assert len(error.strip().splitlines()) == 1

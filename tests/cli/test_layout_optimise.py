@@ -1,4 +1,4 @@
-"""`jeit layout optimise`: a better layout, its drawing, its report."""
+"""`jeit layout optimise`: an improved layout, its drawing and its report."""
 
 import io
 import json
@@ -20,7 +20,7 @@ def run(*arguments):
 
 
 @pytest.mark.slow
-def test_optimised_layout_is_written_and_better(tmp_path):
+def test_the_optimised_layout_is_written_and_scores_higher(tmp_path):
     start = tmp_path / "low.svg"
     centres = [(x, y) for y in (-0.04, -0.015) for x in (-0.03, 0.0, 0.03)]
     write_layout(Layout(centres, 8e-3, outline=Rectangle(0.1, 0.1)), start)
@@ -37,17 +37,17 @@ def test_optimised_layout_is_written_and_better(tmp_path):
     assert (np.linalg.norm(found.centres - np.array([-0.03, 0]), axis=1) > 0.012 - 1e-6).all()
 
 
-def test_progress_says_the_step_and_the_best_score(monkeypatch):
-    said = []
+def test_progress_shows_the_step_and_the_best_score(monkeypatch):
+    messages = []
     step = Steps(Console(file=io.StringIO(), force_terminal=True), quiet=False)
     with step:
         step.report("nothing is under way yet")
         step("optimise")
-        monkeypatch.setattr(step._status, "update", said.append)
+        monkeypatch.setattr(step._status, "update", messages.append)
         step.report("step 3 of at most 60, best score 1.234")
         monkeypatch.setattr(step, "_start", step._start - 7.2)
         step.report("step 40 of at most 60")
-    assert [str(one.__rich__()) for one in said] == [
+    assert [str(one.__rich__()) for one in messages] == [
         "optimise … step 3 of at most 60, best score 1.234",
         "optimise … step 40 of at most 60  7 s",
     ]
@@ -60,7 +60,7 @@ def test_progress_says_the_step_and_the_best_score(monkeypatch):
         ("-10, 20, 30, -5", Rectangle(0.04, 0.025, (0.01, 0.0075))),
     ],
 )
-def test_regions_to_keep_out(text, region):
+def test_excluded_regions(text, region):
     found = _parse_region(text, Rectangle(0.2, 0.2))
     assert type(found) is type(region)
     np.testing.assert_allclose(found.extent, region.extent, atol=1e-15)
@@ -76,7 +76,7 @@ def test_bad_input_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (["--thickness-mm", 0.01], "--thickness-mm must be more than the 2.5 mm"),
         (["--thickness-mm", 500], "--thickness-mm is 500 mm, more than the skin is wide, "),
@@ -97,6 +97,6 @@ def test_bad_input_is_refused(tmp_path):
         (["--keep-out", "0,0,5", "--keep-out", "500,0,10"], "500,0,10 lies off the skin, which spans -100 to 100 mm"),
     ],
 )
-def test_options_are_named(options, said, tmp_path):
-    with pytest.raises(ValueError, match=re.escape(said)):
+def test_error_messages_name_the_options(options, message, tmp_path):
+    with pytest.raises(ValueError, match=re.escape(message)):
         run("park-inner", "--output", tmp_path, *options)

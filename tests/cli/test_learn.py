@@ -1,4 +1,5 @@
-"""`jeit learn image`: from a description to a network; the quick preset, whose figure an untrained one misses."""
+"""`jeit learn image`: from a description to a network. The quick preset must exceed the score of an untrained
+network."""
 
 import dataclasses
 import json
@@ -18,7 +19,7 @@ from jeit.touch.simulate.contact.indent_sets import image_places
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("[electrodes]\nlayout = 'grid-4x4'\n[skin]\nthick = 3", "skin.thick is no key of a skin"),
         ("[skin]\nwidth_mm = 100", "electrodes.layout is missing"),
@@ -27,11 +28,11 @@ from jeit.touch.simulate.contact.indent_sets import image_places
         ("not toml", "is no TOML file"),
     ],
 )
-def test_descriptions_that_are_wrong(run, tmp_path, text, said):
+def test_invalid_descriptions(run, tmp_path, text, message):
     (tmp_path / "skin.toml").write_text(text)
     status, _, error = run("learn", "image", tmp_path / "skin.toml", "--output", tmp_path / "model")
     assert status == 1
-    assert said in error
+    assert message in error
 
 
 def test_a_described_skin(tmp_path):
@@ -58,7 +59,7 @@ def test_curved_skins_are_refused_before_a_folder_is_made(run, tmp_path):
     assert not (tmp_path / "model").exists()
 
 
-def test_no_such_preset(run, tmp_path):
+def test_unknown_preset(run, tmp_path):
     (tmp_path / "skin.toml").write_text(SKIN)
     status, _, error = run("learn", "image", tmp_path / "skin.toml", "--output", tmp_path / "m", "--preset", "slow")
     assert status == 1
@@ -67,15 +68,16 @@ def test_no_such_preset(run, tmp_path):
 
 @pytest.mark.slow
 def test_the_quick_preset(run, tmp_path):
-    """It explains 0.64 of squared depth. A network taught other touches' maps explains 0.12; linear images, which an
-    untrained one of this design is, 0.44, and an untrained one of the other design is worse than empty maps."""
+    """The network explains 0.64 of the squared depth. A network trained on the maps of other touches explains 0.12;
+    linear images, and an untrained network of this design, 0.44; an untrained one of the other design is worse than
+    empty maps."""
     import xarray
 
     (tmp_path / "skin.toml").write_text(SKIN)
     model = tmp_path / "model"
-    status, told, error = run("learn", "image", tmp_path / "skin.toml", "--output", model, "--preset", "quick")
+    status, output, error = run("learn", "image", tmp_path / "skin.toml", "--output", model, "--preset", "quick")
     assert (status, error) == (0, "")
-    assert "of squared depth explained" in told
+    assert "of squared depth explained" in output
     report = json.loads((model / "report.json").read_text())
     assert report["share_of_squared_depth_explained"] > 0.6
     assert report["error_of_a_ball_m"]["mean"] < 2e-3

@@ -1,4 +1,4 @@
-"""`jeit learn image --scheduler`: the command is killed, and so is a worker; the network is that of one process."""
+"""`jeit learn image --scheduler` with the command and a worker killed: the network is that of one process."""
 
 import json
 import os
@@ -10,7 +10,7 @@ import time
 import pytest
 from small_networks import SKIN
 
-# What is killed here is the making of touches: one epoch of training will do.
+# The processes are killed while touches are simulated; one epoch of training is enough.
 QUICK = """
 import sys
 from jeit.cli import main
@@ -22,14 +22,14 @@ sys.exit(main(sys.argv[1:]))
 
 
 def finished(model) -> int:
-    """Chunks of the touches to learn from."""
+    """Finished chunks of the training touches."""
     path = model / "work" / "learnt.zarr" / "zarr.json"
     return len(json.loads(path.read_bytes())["attributes"]["finished"]) if path.exists() else 0
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")
-def test_killed_with_its_workers(tmp_path):
+def test_command_and_workers_killed(tmp_path):
     distributed = pytest.importorskip("distributed")
     skin = tmp_path / "skin.toml"
     skin.write_text(SKIN)

@@ -1,4 +1,5 @@
-"""`jeit listen` and `jeit listen fit`: clips in, a model out; a recording in, names and places out; every bad file."""
+"""`jeit listen` and `jeit listen fit`: a model from clips, labels and positions of a recording, and every invalid
+file."""
 
 import csv
 import json
@@ -31,7 +32,7 @@ def sounds(random: np.random.Generator, pitch: float, seconds: float = 0.3) -> n
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Clips of two classes, every format of WAV among them, with a broken one; and a model of them."""
+    """Clips of two classes in every WAV format, one of them broken, and a model trained on them."""
     folder, random = tmp_path_factory.mktemp("listen"), np.random.default_rng(0)
     kinds = (np.int16, np.int32, np.uint8, np.float32, np.float64)
     for name, pitch in (("low", 400.0), ("high", 3000.0)):
@@ -53,7 +54,7 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_a_model_is_made_and_its_report_says_how_good(folder):
+def test_fit_writes_a_model_and_its_accuracy(folder):
     assert sorted(one.name for one in (folder / "model").iterdir()) == ["learning.png", "listener.jeit", "report.json"]
     report = json.loads((folder / "model" / "report.json").read_text("utf-8"))
     assert report["classes"] == ["high", "low"]
@@ -65,44 +66,45 @@ def test_a_model_is_made_and_its_report_says_how_good(folder):
     assert (folder / "model" / "learning.png").stat().st_size > 10_000
 
 
-def test_nothing_is_surer_than_clips_can_show(folder):
-    """Ten clips, all of them right: 11 in 12 of the next, half of the twelfth its own; silence is nothing at all."""
+def test_probabilities_are_limited_by_the_number_of_clips(folder):
+    """Ten clips classified correctly: the next is correct with probability 11/12, plus half of the rest. Silence has no
+    label."""
     listener = Listener.read(folder / "model")
     assert listener.doubt == pytest.approx(1 / 12)
-    heard = listener.hear(read_recording(folder / "one.wav"))
-    assert heard.probabilities.max() <= 1 - 1 / 24 + 1e-9
-    np.testing.assert_allclose(heard.probabilities.sum(axis=1), 1)
+    labels = listener.hear(read_recording(folder / "one.wav"))
+    assert labels.probabilities.max() <= 1 - 1 / 24 + 1e-9
+    np.testing.assert_allclose(labels.probabilities.sum(axis=1), 1)
     hush = listener.hear(Recording(1e-9 * np.random.default_rng(0).normal(size=(1, RATE)), RATE))
     assert hush.whole == ("", 0.0)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--output", "CLIPS/model"), "lies in the folder of clips"),
         (("--output", "model", "--method", "linear", "--batches", "10"), "--batches applies to networks"),
     ],
 )
-def test_what_is_not_begun(folder, tmp_path, capsys, options, said):
-    """And nothing is left of it."""
+def test_refused_options_leave_no_files(folder, tmp_path, capsys, options, message):
+    """The error comes before any computation."""
     clips = folder / "clips"
     options = [one.replace("CLIPS", str(clips)).replace("model", str(tmp_path / "model")) for one in options]
     options = [str(clips / "model") if one.startswith(str(clips)) else one for one in options]
     assert main(["listen", "fit", str(clips), *options]) == 1
-    assert said in " ".join(capsys.readouterr().err.split())
+    assert message in " ".join(capsys.readouterr().err.split())
     assert not (clips / "model").exists()
     assert not (tmp_path / "model").exists()
 
 
-def test_names_are_printed_as_they_are(folder, tmp_path, capsys):
-    """Square brackets are no markup."""
+def test_names_are_printed_without_markup(folder, tmp_path, capsys):
+    """Square brackets in a name are printed as they are."""
     output = tmp_path / "out [bold]x[/bold]"
     command = ["listen", str(folder / "one.wav"), "--model", str(folder / "model"), "--output", str(output)]
     assert main(command) == 0
     assert "out [bold]x[/bold]" in capsys.readouterr().out
 
 
-def test_files_beside_the_classes_and_silent_clips_are_told_of(tmp_path):
+def test_files_without_a_class_and_silent_clips_are_noted(tmp_path):
     random = np.random.default_rng(0)
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
@@ -114,12 +116,12 @@ def test_files_beside_the_classes_and_silent_clips_are_told_of(tmp_path):
     assert "1 file of no class, beside their folders, left out ('c.wav')" in notes
 
 
-def test_a_recording_is_named(folder, tmp_path, capsys):
-    """Options may come before the recording, and the model may be its file."""
+def test_a_recording_is_classified(folder, tmp_path, capsys):
+    """Options may come before the recording, and the model may be given as its file."""
     model = folder / "model" / "listener.jeit"
     assert main(["listen", "--model", str(model), "--output", str(tmp_path), str(folder / "one.wav")]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "as a whole low" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "as a whole low" in printed
     with open(tmp_path / "events.csv", encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["time_s", "heard", "probability", "p_high", "p_low", "microphone"]
@@ -128,8 +130,8 @@ def test_a_recording_is_named(folder, tmp_path, capsys):
     assert report["whole"]["heard"] == "low"
     assert len(rows) == report["windows"]
     assert (tmp_path / "timeline.png").stat().st_size > 5_000
-    heard = Listener.read(model).hear(read_recording(folder / "one.wav"))
-    assert [row["heard"] for row in rows] == heard.named.tolist()
+    labels = Listener.read(model).hear(read_recording(folder / "one.wav"))
+    assert [row["heard"] for row in rows] == labels.named.tolist()
 
 
 def test_folders_within_a_class_are_held_out_together(folder, tmp_path):
@@ -144,8 +146,8 @@ def test_folders_within_a_class_are_held_out_together(folder, tmp_path):
 
 
 @pytest.mark.slow
-def test_places_come_with_a_calibration(tmp_path):
-    """Pats on a simulated skin: named, and found to a centimetre."""
+def test_sounds_are_located_with_a_calibration(tmp_path):
+    """Pats on a simulated skin are classified, and located to a centimetre."""
     skin = SoundingSkin(jax.random.key(0), microphone_grid(3))
     outline = [[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]
     taps = simulate_calibration_taps(skin, jax.random.key(1), microphone_grid(7))
@@ -163,9 +165,9 @@ def test_places_come_with_a_calibration(tmp_path):
             write_recording(tmp_path / "clips" / name / f"{number}.npz", Recording(made.samples, made.rate))
     model = str(tmp_path / "model")
     assert main(["listen", "fit", str(tmp_path / "clips"), "-o", model, "--method", "linear", "-q"]) == 0
-    heard = simulate_pat(skin, jax.random.key(30), (-0.03, 0.04), duration=1.5)
-    write_recording(tmp_path / "heard.npz", Recording(heard.samples, heard.rate))
-    command = ["listen", str(tmp_path / "heard.npz"), "-m", model, "-o", str(tmp_path / "out"), "-q"]
+    recorded = simulate_pat(skin, jax.random.key(30), (-0.03, 0.04), duration=1.5)
+    write_recording(tmp_path / "pat.npz", Recording(recorded.samples, recorded.rate))
+    command = ["listen", str(tmp_path / "pat.npz"), "-m", model, "-o", str(tmp_path / "out"), "-q"]
     assert main([*command, "-c", str(tmp_path / "skin.json")]) == 0
     with open(tmp_path / "out" / "events.csv", encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row["x_m"]]
@@ -175,18 +177,18 @@ def test_places_come_with_a_calibration(tmp_path):
     assert np.abs(found - [-0.03, 0.04]).max() < 0.01
 
 
-def test_help_says_what_is_typed(capsys):
+def test_help_shows_the_usage(capsys):
     for command in (["listen"], ["listen", "--help"]):
         assert main(command) == 0
-        said = capsys.readouterr().out
-        assert "Usage: jeit listen [OPTIONS]" in said
-        assert "jeit listen fit" in " ".join(said.split())
+        printed = capsys.readouterr().out
+        assert "Usage: jeit listen [OPTIONS]" in printed
+        assert "jeit listen fit" in " ".join(printed.split())
     assert main(["listen", "fit", "--help"]) == 0
     assert "Usage: jeit listen fit [OPTIONS]" in capsys.readouterr().out
 
 
 def _bad(folder) -> None:
-    """Recordings and folders that are none, or nearly."""
+    """Write invalid recordings and folders."""
     loud = sounds(np.random.default_rng(1), 400.0)
     wavfile.write(folder / "empty.wav", RATE, np.zeros(0, np.int16))
     wavfile.write(folder / "stereo_sample.wav", RATE, np.zeros((1, 2), np.int16))
@@ -194,7 +196,7 @@ def _bad(folder) -> None:
     (folder / "text.wav").write_text("text", "utf-8")
     (folder / "cut.wav").write_bytes((folder / "one.wav").read_bytes()[:2000])
     (folder / "sound.flac").write_bytes(b"fLaC and no more")
-    np.savez(folder / "heard.npz", intensity=np.ones((3, 4)), times=0.05 * np.arange(3))
+    np.savez(folder / "intensities.npz", intensity=np.ones((3, 4)), times=0.05 * np.arange(3))
     (folder / "lonely" / "low").mkdir(parents=True)
     (folder / "hollow" / "low").mkdir(parents=True)
     (folder / "hollow" / "high").mkdir()
@@ -203,22 +205,19 @@ def _bad(folder) -> None:
     (folder / "files" / "1.wav").write_bytes((folder / "one.wav").read_bytes())
 
 
-HEAR = ["listen", "RECORDING", "-m", "model", "-o", "out"]
-
-
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "message"),
     [
         *(
-            (["listen", name, "-m", "model", "-o", "out"], said)
-            for name, said in (
+            (["listen", name, "-m", "model", "-o", "out"], message)
+            for name, message in (
                 ("empty.wav", "empty"),
                 ("stereo_sample.wav", "looks transposed"),
                 ("eight.wav", "has 8000 samples a second"),
                 ("text.wav", "neither an NPZ nor a sound"),
                 ("cut.wav", "cut off"),
                 ("sound.flac", "soundfile"),
-                ("heard.npz", "holds intensities"),
+                ("intensities.npz", "holds intensities"),
                 ("missing.wav", "missing.wav"),
             )
         ),
@@ -235,20 +234,20 @@ HEAR = ["listen", "RECORDING", "-m", "model", "-o", "out"]
         (["listen", "fit", "clips", "-o", "new", "--loudness", "loud"], "--loudness must be one of auto, counts"),
     ],
 )
-def test_bad_input_is_explained(command, said, folder, monkeypatch, capsys):
-    """Exit status 1, one line on standard error, and nothing like a traceback."""
+def test_bad_input_is_explained(command, message, folder, monkeypatch, capsys):
+    """Exit status 1 and one line on standard error, without a traceback."""
     monkeypatch.chdir(folder)
     if not (folder / "text.wav").exists():
         _bad(folder)
     assert main(command) == 1
-    told = capsys.readouterr().err
-    assert said in told
-    assert told.count("\n") == 1
-    assert "should not have happened" not in told
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert "should not have happened" not in error
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "message"),
     [
         (["listen", "one.wav"], "Missing option '--model' / '-m'. See 'jeit listen --help'"),
         (["listen", "fit"], "Missing argument 'FOLDER-BY-CLASS'. See 'jeit listen fit --help'"),
@@ -256,13 +255,13 @@ def test_bad_input_is_explained(command, said, folder, monkeypatch, capsys):
         (["listen", "one.wav", "--modle", "model"], "--modle"),
     ],
 )
-def test_wrong_calls_are_explained(command, said, capsys):
+def test_usage_errors_are_explained(command, message, capsys):
     assert main(command) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-def test_odd_recordings_are_heard(folder, tmp_path, capsys):
-    """One sample, silence, NaN, two channels, another rate: named or quiet, and never a traceback."""
+def test_unusual_recordings_are_classified(folder, tmp_path, capsys):
+    """One sample, silence, NaN, two channels, another rate: a label or "quiet", and never a traceback."""
     loud = sounds(np.random.default_rng(2), 400.0, seconds=1.0)
     holed = loud.copy()
     holed[100:4000] = np.nan

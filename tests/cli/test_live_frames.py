@@ -1,4 +1,4 @@
-"""Frames of standard input: what came before it was read is left out, the clock tells the rest; files by a rate."""
+"""Frames from standard input: old frames are skipped, times come from the clock or a given rate; files have a rate."""
 
 import signal
 
@@ -12,7 +12,7 @@ from jeit.cli.stopping import Stopping
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that goes when it is told to."""
+    """A clock whose time tests advance."""
 
     class Clock:
         now = 100.0
@@ -27,19 +27,19 @@ def clock(monkeypatch):
 
 
 def frames(clock, number, period=0.01, first=0):
-    """Frames that have to be waited for."""
+    """Frames that arrive after a delay."""
     for one in range(number):
         clock.now += period
         yield [float(first + one), 1.0]
 
 
 def backlog(clock, before, number, period=0.01):
-    """Some that are there already, then such as have to be waited for."""
+    """Frames that are available at once, followed by frames that arrive after a delay."""
     yield from ([float(one), 1.0] for one in range(before))
     yield from frames(clock, number, period, before)
 
 
-def test_by_a_rate_every_frame_counts(clock):
+def test_no_frame_is_skipped_with_a_given_rate(clock):
     live = LiveFrames(backlog(clock, 20, 30), 100.0, 60.0)
     still = live.untouched(0.095)
     assert still[:, 0].tolist() == list(range(10))
@@ -49,13 +49,13 @@ def test_by_a_rate_every_frame_counts(clock):
     assert (live.left_out, live.rate_seen) == (0, 100.0)
 
 
-def test_what_came_before_is_left_out(clock):
+def test_old_frames_are_skipped(clock):
     live = LiveFrames(backlog(clock, 20, 300), None, 100.0)
     still = live.untouched(0.1)
-    assert live.left_out == 22  # and two of the three that had to be waited for
+    assert live.left_out == 22  # and two of the three delayed frames
     assert still[0, 0] == 22
     assert live.rate_seen == pytest.approx(100, rel=1e-2)
-    clock.now += 1.0  # something is made ready meanwhile
+    clock.now += 1.0  # time that the caller takes to get ready
     seconds, values = zip(*live, strict=True)
     assert values[0][0] == 22
     assert seconds[0] == 0
@@ -64,7 +64,7 @@ def test_what_came_before_is_left_out(clock):
     assert values[-1][0] == 319
 
 
-def test_a_file_without_a_rate_has_the_usual_one(clock):
+def test_a_file_without_a_rate_has_the_default_one(clock):
     live = LiveFrames(backlog(clock, 50, 0), None, 25.0)
     assert len(live.untouched(0.4)) == 11
     seconds, values = zip(*live, strict=True)
@@ -73,13 +73,13 @@ def test_a_file_without_a_rate_has_the_usual_one(clock):
     assert live.left_out == 0
 
 
-def test_a_source_too_quick_to_wait_for_is_read_all_the_same(clock):
+def test_a_source_that_never_waits_is_read_all_the_same(clock):
     live = LiveFrames(frames(clock, 20_000, 1e-3), None, 60.0)
     assert len(live.untouched(1.0)) == pytest.approx(1000, abs=3)
     assert live.left_out == pytest.approx(5000, rel=0.05)
 
 
-def test_what_are_no_numbers_is_not_taken_for_the_untouched_skin(clock):
+def test_lines_without_numbers_are_not_taken_for_the_reference(clock):
     def lines():
         yield from frames(clock, 5)
         yield "no numbers"
@@ -93,8 +93,8 @@ def test_what_are_no_numbers_is_not_taken_for_the_untouched_skin(clock):
         LiveFrames(iter(["a", "b"]), None, 60.0).untouched(1.0)
 
 
-def test_ctrl_c_ends_it(clock):
-    """While a frame is waited for, and while one is looked at."""
+def test_ctrl_c_ends_the_stream(clock):
+    """Both while waiting for a frame and while a frame is processed."""
 
     def lines():
         yield from frames(clock, 3)

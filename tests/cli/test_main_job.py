@@ -1,4 +1,4 @@
-"""The main job on measured tanks: a file in; a picture, arrays and a report out."""
+"""The main command on measured tanks: from a file to a picture, arrays and a report."""
 
 import csv
 import json
@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-RADIUS = 0.14  # of the KIT4 tank, metres
+RADIUS = 0.14  # radius of the KIT4 tank, metres
 
 
 def reconstruct(run, folder, *options):
@@ -22,7 +22,7 @@ def kit4(data_folder):
 
 @pytest.mark.slow
 def test_kit4_three_conductive_inclusions(kit4, run, tmp_path):
-    """`jeit reconstruct datamat_3_4.mat --reference datamat_1_0.mat --output out`, and all that it leaves."""
+    """`jeit reconstruct datamat_3_4.mat --reference datamat_1_0.mat --output out`, and every file that it writes."""
     folder = tmp_path / "out"
     output, report = reconstruct(run, folder, kit4 / "datamat_3_4.mat", "--reference", kit4 / "datamat_1_0.mat")
     assert sorted(file.name for file in folder.iterdir()) == ["image.npz", "image.png", "report.json"]
@@ -39,14 +39,14 @@ def test_kit4_three_conductive_inclusions(kit4, run, tmp_path):
     # The disk fills π/4 of its square; outside there is NaN.
     assert np.isfinite(raster).mean() == pytest.approx(np.pi / 4, rel=0.01)
     assert np.isnan(raster[[0, 0, -1, -1], [0, -1, 0, -1]]).all()
-    # Row 0 is at the top, column 0 at the left: a cell's value stands at the pixel of its centre.
+    # Row 0 is at the top, column 0 at the left: a cell's value is at the pixel of its centre.
     centre = points[cells].mean(axis=1)
     column = ((centre[:, 0] - extent[0]) / (extent[1] - extent[0]) * 256).astype(int)
     row = ((extent[3] - centre[:, 1]) / (extent[3] - extent[2]) * 256).astype(int)
-    # Cells are larger than pixels, but a pixel's centre may lie just beyond a cell's edge.
+    # Cells are larger than pixels, but a pixel's centre may lie just outside its cell.
     assert np.mean(raster[row, column] == conductivity) > 0.95
 
-    # The reference tank is fitted to 1.4 %; the independent model of the data's README gave 1.318 mS.
+    # The reference frame is fitted to 1.4 %; the independent model in the data's README gave 1.318 mS.
     assert report["calibration"]["relative_misfit"] < 0.02
     assert report["calibration"]["status"] == "converged"
     assert report["calibration"]["conductivity"] == pytest.approx(1.318e-3, rel=0.02)
@@ -81,7 +81,7 @@ def test_kit4_three_conductive_inclusions(kit4, run, tmp_path):
 
 
 @pytest.mark.slow
-def test_quiet_says_nothing(kit4, run, tmp_path):
+def test_quiet_prints_nothing(kit4, run, tmp_path):
     files = (kit4 / "datamat_2_2.mat", "--reference", kit4 / "datamat_1_0.mat")
     output, _ = reconstruct(run, tmp_path, *files, "--quiet", "--num-points", 300)
     assert output == ""
@@ -97,7 +97,7 @@ def test_quiet_says_nothing(kit4, run, tmp_path):
     ],
 )
 def test_every_method_finds_the_rod(method, options, data_folder, run, tmp_path):
-    """The metal rod beside electrode 1 (12 o'clock) of the small tank, which needs no --reference."""
+    """The metal rod beside electrode 1 (12 o'clock) of the small tank, for which --reference is not needed."""
     (file,) = (data_folder / "tank6cm" / "electrode01_metal").glob("*.csv")
     _, report = reconstruct(run, tmp_path, file, "--method", method, "--num-points", 500, *options)
     assert report["reconstruction"]["method"] == method
@@ -119,8 +119,8 @@ def test_every_prior_finds_the_rod(prior, data_folder, run, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rule", ["gcv", "l-curve", "discrepancy"])
-def test_rules_are_taken_and_reported(rule, data_folder, run, tmp_path):
-    """Where the model misses a quarter of the voltages, as here, these rules smooth too little."""
+def test_rules_are_accepted_and_reported(rule, data_folder, run, tmp_path):
+    """Where the model error is a quarter of the voltages, as here, these rules regularise too little."""
     (file,) = (data_folder / "tank6cm" / "electrode01_metal").glob("*.csv")
     _, report = reconstruct(run, tmp_path, file, "--hyperparameter", rule, "--num-points", 500)
     assert report["hyperparameter"]["chosen_by"] == rule

@@ -1,4 +1,4 @@
-"""What is found in the small tank and in the challenge's tank, at jeit's default settings."""
+"""Detection of bodies in the small tank and in the challenge's tank, with jeit's default settings."""
 
 import csv
 import re
@@ -18,7 +18,7 @@ PITCH = 22.5  # degrees between electrodes of the 6 cm tank
 
 
 def named_rods(folder_name):
-    """(electrode from 1, sign) of every rod that a folder's name tells of."""
+    """(electrode from 1, sign) of every rod, from the folder's name."""
     rods = re.findall(r"electrode(\d+)_(metal|plastic)", folder_name)
     return [(int(number), 1 if kind == "metal" else -1) for number, kind in rods]
 
@@ -43,7 +43,7 @@ def test_tank6cm_every_rod_beside_its_electrode(data_folder):
             assert min(angles) < 12, f"{file.parent.name}: electrode {number}, {min(angles):.1f}° off"
 
 
-def test_tank6cm_weak_current_is_refused(data_folder, run, tmp_path):
+def test_tank6cm_frames_of_weak_current_are_refused(data_folder, run, tmp_path):
     (file,) = (data_folder / "tank6cm").glob("*/*20uA*.csv")
     status, _, error = run("reconstruct", file, "--output", tmp_path)
     assert status == 1
@@ -55,7 +55,7 @@ KIT4_RADIUS = 0.14
 
 
 def kit4_truth(folder):
-    """Sign and place, metres, of every inclusion, by the name of its file."""
+    """Sign and position in metres of every inclusion, by the name of its file."""
     truth: dict[str, list[tuple[int, np.ndarray]]] = {}
     with open(folder / "truth_centroids.csv", newline="") as file:
         for row in csv.DictReader(file):
@@ -65,7 +65,7 @@ def kit4_truth(folder):
 
 
 def matched(case, found, inclusions):
-    """Distances, over the radius, to the nearest found inclusion of the same sign; each is matched once."""
+    """Distance, relative to the radius, to the nearest detected inclusion of the same sign; each is matched once."""
     errors, left = [], list(found)
     for sign, place in inclusions:
         distances = {i: np.hypot(*(one.centroid - place)) for i, one in enumerate(left) if one.sign == sign}
@@ -78,7 +78,7 @@ def matched(case, found, inclusions):
 
 @pytest.mark.slow
 def test_kit4_every_inclusion_with_its_sign(data_folder):
-    """All 34 inclusions of the 17 files at one setting; each is matched with the nearest found one of its sign."""
+    """All 34 inclusions of the 17 files with one setting; each is matched with the nearest detected one of its sign."""
     folder = data_folder / "kit4"
     truth = kit4_truth(folder)
     assert sum(map(len, truth.values())) == 34
@@ -89,20 +89,20 @@ def test_kit4_every_inclusion_with_its_sign(data_folder):
         assert len(found) == len(inclusions), f"{case}: {len(found)} inclusions found, {len(inclusions)} are there"
         errors += matched(case, found, inclusions)
     assert max(errors) <= 0.10
-    # 0.037 with every mesh and setting tried. Half of it is one shift of 0.018 R common to all inclusions, within the
-    # ±0.03 R of the published centroids.
+    # It was 0.037 with every mesh and setting tried. Half of it is a shift of 0.018 R common to all inclusions, within
+    # the ±0.03 R of the published centroids.
     assert np.median(errors) <= 0.04
 
 
-# Correlation of the image, on the logarithm's scale, with the truth (water 0, resistive -1, conductive +1), all pixels
-# of the tank, and how many bodies are in it. Default settings on a 2-D model with 8 % misfit: what was reached, less a
+# Correlation of the image on a logarithmic scale with the truth (water 0, resistive -1, conductive +1) over all pixels
+# of the tank, and the number of bodies. Default settings with a 2-D model of 8 % misfit: the values reached, less a
 # margin of 0.05 for other meshes and machines.
 LEAST_CORRELATION = {1: (0.84, 2), 2: (0.84, 2), 3: (0.84, 1), 4: (0.71, 1)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", LEAST_CORRELATION)
-def test_ktc2023_images_correlate_with_their_truth(number, data_folder):
+def test_ktc2023_images_correlate_with_the_truth(number, data_folder):
     import scipy.io
 
     folder = data_folder / "ktc2023"
@@ -119,7 +119,7 @@ def test_ktc2023_images_correlate_with_their_truth(number, data_folder):
 
 @pytest.mark.slow
 def test_kit4_gauss_newton_converges_on_every_file(data_folder):
-    """At the command's settings; calibrated once, as all files share their reference."""
+    """With the command's settings. One calibration serves all files, which share their reference."""
     folder = data_folder / "kit4"
     truth = kit4_truth(folder)
     reference = read(folder / "datamat_1_0.mat")
@@ -143,8 +143,11 @@ def test_kit4_gauss_newton_converges_on_every_file(data_folder):
 
 @pytest.mark.slow
 def test_ktc2023_segmentation(data_folder):
-    """The challenge's training targets with all electrodes, and with 12 of 32 gone; 0.95 and 0.88 on the default mesh.
-    Asked is a mean of 0.8 over all levels, and of 0.7 from the fourth on."""
+    """The challenge's training targets with all electrodes and with 12 of 32 removed. The scores on the default mesh
+    are 0.95 and 0.88.
+
+    The requirement is a mean of 0.8 over all levels, and of 0.7 from the fourth on.
+    """
     from benchmarks.cases.ktc2023 import scores
 
     whole, hardest = scores(data_folder / "ktc2023", "auto", levels=(1, 7), report=lambda line: None).mean(axis=1)

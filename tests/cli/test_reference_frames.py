@@ -1,4 +1,4 @@
-"""A recording that begins with the undisturbed body: its own frames as the reference."""
+"""Recordings that begin with the undisturbed body: the reference from their own frames."""
 
 import json
 
@@ -10,11 +10,11 @@ from jeit.cli.options import read_pair
 
 @pytest.fixture
 def recording(tank):
-    """Two frames at rest, a little apart, and a third that is touched; described beside it."""
+    """Two frames at rest, slightly different, and a third with a touch, with a description beside the file."""
     return tank.write("frames", [0.999 * tank.rest, 1.001 * tank.rest, tank.touched])
 
 
-def test_the_reference_is_the_mean_of_frames_of_data_or_of_the_file_given(tank, recording):
+def test_reference_is_the_mean_of_frames_of_the_data_or_of_the_given_file(tank, recording):
     voltages = np.loadtxt(recording, delimiter=",")
     measurement, base = read_pair(recording, None, "0-1", None, None)
     assert measurement.num_frames == 3
@@ -29,13 +29,13 @@ def test_the_reference_is_the_mean_of_frames_of_data_or_of_the_file_given(tank, 
 
 
 @pytest.mark.parametrize("frames", ["1-0", "0-3", "3", "-1", "0:2", "a", ""])
-def test_frames_that_there_are_not_are_refused(recording, frames):
+def test_frames_that_do_not_exist_are_refused(recording, frames):
     with pytest.raises(ValueError, match=r"--reference-frames: give FIRST-LAST, .* frames 0 to 2 of 'frames'; it is '"):
         read_pair(recording, None, frames, None, None)
 
 
 @pytest.mark.slow
-def test_an_image_by_own_frames_is_that_by_a_file_of_them(tank, recording, run, tmp_path):
+def test_own_frames_and_a_file_of_them_give_the_same_image(tank, recording, run, tmp_path):
     found = []
     for name, given in (("own", ("--reference-frames", "0-1")), ("file", ("--reference", tank.folder / "rest.csv"))):
         folder = tmp_path / name
@@ -48,7 +48,7 @@ def test_an_image_by_own_frames_is_that_by_a_file_of_them(tank, recording, run, 
 
 
 @pytest.mark.parametrize("command", ["choose", "series", "reconstruct"])
-def test_other_commands_take_frames_too(recording, run, tmp_path, command):
+def test_other_commands_accept_frames_too(recording, run, tmp_path, command):
     status, _, error = run(command, recording, "--reference-frames", "5", "--output", tmp_path / "out")
     assert status != 0
     assert "--reference-frames: give FIRST-LAST" in error

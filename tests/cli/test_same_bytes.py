@@ -1,4 +1,5 @@
-"""The same input gives the same bytes: two runs of each command, in processes that hash otherwise, but for times."""
+"""Reproducibility: two runs of a command, in processes with different hash seeds, give the same bytes, except for
+times."""
 
 import json
 import os
@@ -14,7 +15,7 @@ from studies import SMALL
 from jeit.layout import named_layout, write_layout
 from jeit.mesh import Rectangle
 
-# Keys of reports, and columns of tables, that say how long it took.
+# Keys of reports and columns of tables that hold computing times.
 _TIMES = ("timings", "latency_ms")
 FEW = ("--cell-mm", "8", "--places", "16", "--taxels", "20")
 RUNS = {
@@ -30,7 +31,7 @@ _PROGRAM = "from jeit.cli import main; raise SystemExit(main())"
 
 @pytest.fixture
 def given(tank):
-    """The files that the commands ask for."""
+    """The files that the commands read."""
     np.savez(tank.folder / "presses.npz", **record(60))
     (tank.folder / "study.toml").write_text(SMALL)
     for name in ("grid-4x4", "inner-16"):
@@ -39,7 +40,7 @@ def given(tank):
 
 
 def written(name: str, given: dict[str, bytes], folder: Path, seed: str) -> dict[str, bytes]:
-    """What a command leaves in a folder that held what is `given`."""
+    """The files that a command writes in a folder that holds the `given` files."""
     folder.mkdir()
     for one, content in given.items():
         (folder / one).write_bytes(content)
@@ -63,7 +64,7 @@ def without_times(name: str, content: bytes):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RUNS)
-def test_two_runs(name, given, tmp_path):
+def test_two_runs_write_the_same_bytes(name, given, tmp_path):
     one, other = (written(name, given, tmp_path / f"run{seed}", seed) for seed in ("1", "2"))
     assert one
     assert list(one) == list(other)

@@ -1,4 +1,4 @@
-"""`jeit series`: a recording of a tank in which something oscillates, and what is refused."""
+"""`jeit series`: a recording of a tank with oscillations, and the inputs that are refused."""
 
 import json
 
@@ -40,7 +40,7 @@ def recording(tmp_path_factory):
     return folder
 
 
-def test_what_is_written(recording, tmp_path, capsys):
+def test_results_are_written(recording, tmp_path, capsys):
     given = ["series", str(recording / "frames.csv"), "-o", str(tmp_path), "--num-points", "250"]
     asked = ["--frequency", "0.5-2", "--region", "half:1,0", "--region", "box:-0.09,-0.09,0,0.09", "--film", "a.gif"]
     assert main([*given, *asked]) == 0
@@ -84,7 +84,7 @@ def test_frames_without_times_are_numbered(recording, tmp_path, capsys, monkeypa
         (["--film", "film.txt"], "--film must be"),
     ],
 )
-def test_what_is_refused(recording, tmp_path, capsys, monkeypatch, options, message):
+def test_invalid_input_is_refused(recording, tmp_path, capsys, monkeypatch, options, message):
     monkeypatch.chdir(recording)
     assert main(["series", "frames.csv", "-o", str(tmp_path / "out"), "--num-points", "250", *options]) == 1
     assert message in " ".join(capsys.readouterr().err.split())
@@ -92,19 +92,17 @@ def test_what_is_refused(recording, tmp_path, capsys, monkeypatch, options, mess
 
 
 @pytest.mark.parametrize("options", [["--frequency", "7"], ["--frequency", "2-1"], ["--region", "left"]])
-def test_what_no_mesh_is_needed_for_is_refused_before_it(recording, tmp_path, capsys, monkeypatch, options):
+def test_options_that_need_no_mesh_are_checked_before_it_is_made(recording, tmp_path, capsys, monkeypatch, options):
     monkeypatch.chdir(recording)
     assert main(["series", "frames.csv", "-o", str(tmp_path / "out"), *options]) == 1
-    told = capsys.readouterr()
-    assert "mesh" not in told.out + told.err
+    printed = capsys.readouterr()
+    assert "mesh" not in printed.out + printed.err
 
 
 @pytest.mark.parametrize("region", ["ball:1,2,0.1", "ball:0,0,0,0.1"])
-def test_a_region_that_is_none_of_the_mesh_is_refused_before_any_image(
-    recording, tmp_path, capsys, monkeypatch, region
-):
-    begun, told = [], Steps.__call__
-    monkeypatch.setattr(Steps, "__call__", lambda self, name: (begun.append(name), told(self, name)))
+def test_a_region_outside_of_the_mesh_is_refused_before_any_image(recording, tmp_path, capsys, monkeypatch, region):
+    begun, original = [], Steps.__call__
+    monkeypatch.setattr(Steps, "__call__", lambda self, name: (begun.append(name), original(self, name)))
     monkeypatch.chdir(recording)
     output = ["-o", str(tmp_path / "out"), "--num-points", "250"]
     assert main(["series", "frames.csv", *output, "--region", "half:1,0", "--region", region]) == 1

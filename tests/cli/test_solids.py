@@ -1,4 +1,4 @@
-"""A tank described as a solid, and one as a mesh of one's own, from a table of numbers to a picture."""
+"""A tank described as a solid and one on the user's own mesh, from a table of numbers to a picture."""
 
 import json
 
@@ -38,12 +38,12 @@ positions = {[[0.049 * float(f(k)) for f in (np.cos, np.sin)] for k in np.arange
 
 
 NODES = {"solid": {"num_points": 1500}, "mesh": {}}
-# Bodies in solids are sought in tests of imaging.
+# The search for bodies in solids is tested in tests/imaging.
 OPTIONS = {"solid": ["--num-points", 600, "--method", "one-step"], "mesh": ["--segment"]}
 
 
 def check_segments_of_outlines(folder, report, side):
-    """Bodies that were sought by their outlines are those listed, and those whose labels were kept."""
+    """The bodies found by outlines are those listed and those of the saved labels."""
     assert report["reconstruction"]["method"] == "gauss-newton"
     bodies = report["shapes"]["bodies"]
     assert len(bodies) == len(report["inclusions"]) > 0
@@ -94,7 +94,7 @@ def test_from_description_to_picture(body, run, tmp_path):
 
 
 @pytest.mark.parametrize("command", [["reconstruct"], ["stream"], ["choose"]])
-def test_nodes_of_a_mesh_that_is_there_are_refused(command, run, tmp_path):
+def test_number_of_nodes_is_refused_for_a_given_mesh(command, run, tmp_path):
     write(Disk(0.05).mesh(num_points=250), tmp_path / "tank.vtu")
     (tmp_path / "full.toml").write_text(BODIES["mesh"] + PROTOCOL)
     model = load_description(tmp_path / "full.toml").model(tmp_path / "full.csv")
@@ -109,11 +109,11 @@ def test_nodes_of_a_mesh_that_is_there_are_refused(command, run, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_nodes_of_a_model(tmp_path):
+def test_number_of_nodes_of_the_model(tmp_path):
     write(Disk(0.05).mesh(num_points=250), tmp_path / "tank.vtu")
-    for body, number, said in (("mesh", 250, "num_points has no effect"), ("solid", None, "num_points is missing")):
+    for body, number, message in (("mesh", 250, "num_points has no effect"), ("solid", None, "num_points is missing")):
         (tmp_path / "tank.toml").write_text(BODIES[body] + PROTOCOL)
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             load_description(tmp_path / "tank.toml").model("full.csv", num_points=number)
 
 
@@ -126,7 +126,7 @@ SOLIDS = {
 
 
 @pytest.mark.parametrize("printed", SOLIDS)
-def test_info_tells_a_body_in_the_words_of_its_description(printed, run, tmp_path):
+def test_info_describes_a_body_in_the_words_of_its_description(printed, run, tmp_path):
     (tmp_path / "full.toml").write_text(f"[geometry]\n{SOLIDS[printed]}\n{PROTOCOL}number = 8\n")
     np.savetxt(tmp_path / "full.csv", np.arange(1.0, 41)[None], delimiter=",")
     status, out, error = run("info", tmp_path / "full.csv")

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM at any moment of a stream: readable files, and an exit status that tells of the signal."""
+"""Ctrl-C and SIGTERM at any moment of a stream: the files are readable and the exit status names the signal."""
 
 import csv
 import os
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSI
 
 
 def read(folder):
-    """Frames in the table, and in the NPZ; every line is whole."""
+    """Frames in the table and in the NPZ file; every line is complete."""
     with open(folder / "frames.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert all(None not in row.values() and row["status"] for row in rows)
@@ -39,7 +39,7 @@ def streamed(tank, run, tmp_path, monkeypatch):
 
 
 def lines(tank, number, *then):
-    """So many frames, then what these do."""
+    """Yield a number of frames, then the results of these calls."""
     for _ in range(number):
         yield " ".join(map(repr, map(float, tank.touched)))
     for one in then:
@@ -48,7 +48,7 @@ def lines(tank, number, *then):
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_while_a_frame_is_waited_for(number, tank, streamed, tmp_path):
+def test_while_waiting_for_a_frame(number, tank, streamed, tmp_path):
     handlers = [signal.getsignal(one) for one in SIGNALS]
     status, out, error = streamed(lines(tank, 3, lambda: signal.raise_signal(number)))
     assert (status, out) == (128 + number, "")
@@ -64,19 +64,19 @@ def test_before_there_is_a_frame(tank, streamed, tmp_path):
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["frames.csv"]
 
 
-def test_before_the_first_frame_is_asked_for(streamed, tank, monkeypatch):
+def test_before_the_first_frame_is_requested(streamed, tank, monkeypatch):
     monkeypatch.setattr("jeit.report.write_stream", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     assert streamed(lines(tank, 3)) == (130, "", "jeit: stopped after 0 frames.\n")
 
 
-def test_while_it_is_made_ready(tank, streamed, tmp_path, monkeypatch):
+def test_while_the_model_is_prepared(tank, streamed, tmp_path, monkeypatch):
     monkeypatch.setattr("jeit.imaging.stream_preparation.find_wiring", lambda *_: signal.raise_signal(signal.SIGTERM))
     status, _, error = streamed(lines(tank, 3))
     assert (status, error) == (143, "jeit: stopped.\n")
     assert not (tmp_path / "out").exists()
 
 
-def test_while_a_frame_is_imaged_it_is_finished(tank, streamed, tmp_path, monkeypatch):
+def test_a_frame_in_progress_is_finished(tank, streamed, tmp_path, monkeypatch):
     from jeit.report import stream as stream_module
 
     row = stream_module._table_row
@@ -92,7 +92,7 @@ def test_while_a_frame_is_imaged_it_is_finished(tank, streamed, tmp_path, monkey
     assert read(tmp_path / "out") == (2, 2)
 
 
-def test_while_images_are_written_and_again(tank, streamed, tmp_path, monkeypatch):
+def test_while_images_are_written_and_by_a_second_signal(tank, streamed, tmp_path, monkeypatch):
     from jeit.report.growing import GrowingRows
 
     write, times = GrowingRows.write_npz, [1]
@@ -112,14 +112,14 @@ def test_while_images_are_written_and_again(tank, streamed, tmp_path, monkeypatc
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["frames.csv"]
 
 
-def test_an_image_is_stopped(tank, run, tmp_path, monkeypatch):
+def test_reconstruct_is_stopped(tank, run, tmp_path, monkeypatch):
     monkeypatch.setattr("jeit.imaging.preparation.find_wiring", lambda *_: signal.raise_signal(signal.SIGINT))
     given = "--reference", tank.folder / "rest.csv", "--num-points", 250, "--quiet", "--output", tmp_path / "a" / "out"
     assert run("reconstruct", tank.folder / "touched.csv", *given) == (130, "", "jeit: stopped.\n")
     assert not (tmp_path / "a").exists()
 
 
-def test_what_was_ignored_is_ignored():
+def test_ignored_signals_stay_ignored():
     """As under nohup."""
     earlier = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -131,7 +131,7 @@ def test_what_was_ignored_is_ignored():
         signal.signal(signal.SIGINT, earlier)
 
 
-def test_a_second_signal_ends_at_once():
+def test_a_second_signal_ends_the_process_at_once():
     def stream():
         with Stopping() as stopping:
             for _ in stopping.until(range(9)):
@@ -146,8 +146,8 @@ def test_a_second_signal_ends_at_once():
 @pytest.mark.slow
 @pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize("moment", [0.0, 0.05, 0.2, 0.5])
-def test_a_process_of_its_own(number, moment, tank, tmp_path):
-    """A moment after its first frame, while more come than it can image."""
+def test_in_a_process_of_its_own(number, moment, tank, tmp_path):
+    """The signal comes shortly after the first frame, while frames arrive faster than they are imaged."""
     command = [sys.executable, "-m", "jeit", "stream", "-", "--reference", tank.folder / "rest.csv"]
     command += ["--output", tmp_path / "out", "--num-points", "250", "--quiet"]
     line = " ".join(map(repr, map(float, tank.touched))) + "\n"

@@ -1,4 +1,4 @@
-"""`jeit study`: run, resume, status, report, and every fault in one line."""
+"""`jeit study`: run, resume, status and report, and one line for every fault."""
 
 import errno
 import os
@@ -65,7 +65,7 @@ def test_run_stop_resume_and_report(file, run, monkeypatch):
     assert "another study, or of this one before it was changed" in failed(run("study", "resume", file))
 
 
-def test_a_study_is_stopped_and_goes_on(file, run, monkeypatch):
+def test_a_stopped_study_is_resumed(file, run, monkeypatch):
     def stopped(*_):
         signal.raise_signal(signal.SIGINT)
 
@@ -78,7 +78,7 @@ def test_a_study_is_stopped_and_goes_on(file, run, monkeypatch):
 
 
 @pytest.mark.parametrize("command", ["run", "resume"])
-def test_a_study_that_another_process_writes(file, run, command):
+def test_a_study_that_another_process_writes_is_refused(file, run, command):
     store = Store(read_study(file), file.with_suffix(".zarr"))
     with locked(store.path, "study"):
         assert f"{store.path} is being written by this process since " in failed(run("study", command, file, "-q"))
@@ -87,7 +87,7 @@ def test_a_study_that_another_process_writes(file, run, command):
 
 
 @pytest.mark.parametrize("command", ["resume", "status", "report"])
-def test_a_folder_that_holds_no_study(file, run, command):
+def test_a_folder_without_a_study_is_refused(file, run, command):
     folder = file.parent / "letters"
     folder.mkdir()
     (folder / "letter.txt").write_text("dear")
@@ -101,7 +101,7 @@ def test_a_folder_that_holds_no_study(file, run, command):
 
 
 @pytest.mark.parametrize("command", ["resume", "status", "report"])
-def test_a_damaged_store(file, run, command):
+def test_a_damaged_store_is_reported(file, run, command):
     store = Store(read_study(file), file.with_suffix(".zarr"))
     (store.path / "zarr.json").write_text('{"zarr_format": 3, "node', "utf-8")
     error = failed(run("study", command, file))
@@ -118,7 +118,7 @@ def test_bad_studies_are_refused_in_one_line(file, run, command):
     assert not file.with_suffix(".zarr").exists()
 
 
-def test_faults_are_said_before_anything_runs(file, run):
+def test_faults_are_reported_before_the_study_runs(file, run):
     assert "no file" in failed(run("study", "run", file.parent / "none.toml"))
     assert "cannot be made" in failed(run("study", "run", file, "--output", file / "in a file.zarr"))
     page = file.parent / "none" / "page.html"
@@ -127,7 +127,7 @@ def test_faults_are_said_before_anything_runs(file, run):
     assert run("study", "rerun", file)[0] == 2
 
 
-def test_a_missing_package_is_said_with_its_extra(file, run, monkeypatch):
+def test_a_missing_package_is_reported_with_its_extra(file, run, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
     assert "a study needs zarr: pip install 'jeit[cluster]'" in failed(run("study", "run", file))
 

@@ -1,4 +1,4 @@
-"""`jeit touch`: presses to a learnt skin, frames to touches, and what is said of files that cannot be."""
+"""`jeit touch`: presses to a learnt skin, frames to touches, and the errors for invalid files."""
 
 import csv
 import json
@@ -77,7 +77,7 @@ current = 1e-3
 
 
 def test_a_described_skin_is_imaged(tmp_path, run):
-    """The description is the one that measured tables have."""
+    """The description is of the kind that measured tables have."""
     skin = tmp_path / "skin.toml"
     skin.write_text(DISK)
     model = load_description(skin).model(skin, num_points=200)
@@ -90,18 +90,18 @@ def test_a_described_skin_is_imaged(tmp_path, run):
     status, output, error = run(*fit, skin)
     assert (status, error) == (0, "")
     assert "ridge on contacts" in output
-    for wrong, said in (
+    for wrong, message in (
         (DISK.replace("number = 8", "number = 16"), "--description: its protocol has 208 channels, and frames have 40"),
         (DISK[DISK.index("[protocol]") :] + "number = 8", "a model needs [geometry], [electrodes] too"),
     ):
         skin.write_text(wrong)
         status, _, error = run(*fit, skin)
         assert status == 1
-        assert said in error
+        assert message in error
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (("fit", "millimetres.npz"), "are these metres"),
         (("fit", "none.npz"), "there is no such file"),
@@ -115,12 +115,12 @@ def test_a_described_skin_is_imaged(tmp_path, run):
         (("predict", "skin", "fewer.npz"), "frames have 9 channels, and the skin that was learnt has 40"),
     ],
 )
-def test_what_cannot_be_is_said(files, run, tmp_path, words, said):
+def test_invalid_input_is_reported(files, run, tmp_path, words, message):
     folder, _ = files
     if words[1] == "skin" and not (folder / "skin").exists():
         run("touch", "fit", folder / "places.npz", "--output", folder / "skin", "--method", "ridge", "--quiet")
     words = [folder / word if word.endswith(".npz") or word in ("skin", "nowhere") else word for word in words]
     status, _, error = run("touch", *words, "--output", tmp_path / "out")
     assert status == 1
-    assert said in error
+    assert message in error
     assert error.count("\n") == 1

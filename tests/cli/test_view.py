@@ -1,4 +1,4 @@
-"""`jeit view`: from an image on disk to pictures from several sides."""
+"""`jeit view`: from a saved image to pictures from several sides."""
 
 import sys
 
@@ -38,7 +38,7 @@ def no_display(monkeypatch):
 
 
 def test_a_solid_is_shown_from_several_sides(run, solid, tmp_path):
-    status, told, error = run(
+    status, output, error = run(
         "view", solid, "--output", tmp_path / "out", "--plane-mm", "x=20", "--plane-mm", "0,0,30/1,1,0",
         "--level", 0.3, "--level", 0.6, "--axis", "x", "--slices", 4, "--azimuth", 30,
     )  # fmt: skip
@@ -46,13 +46,13 @@ def test_a_solid_is_shown_from_several_sides(run, solid, tmp_path):
     names = {"overview.png", "isosurfaces.png", "slices.png", "planes.png"}
     assert {one.name for one in (tmp_path / "out").iterdir()} == names
     assert all((tmp_path / "out" / name).stat().st_size > 20_000 for name in names)
-    assert all(name in told for name in names)
+    assert all(name in output for name in names)
 
 
-def test_without_a_display_pictures_are_beside_the_image_and_it_says_why(run, solid, tmp_path):
-    status, told, error = run("view", solid, "--slices", 1)
+def test_without_a_display_pictures_are_written_with_the_reason(run, solid, tmp_path):
+    status, output, error = run("view", solid, "--slices", 1)
     assert (status, error) == (0, "")
-    assert "pictures, not a window: " in told
+    assert "pictures, not a window: " in output
     assert (tmp_path / "view" / "overview.png").is_file()
     assert not (tmp_path / "view" / "planes.png").exists()
 
@@ -95,7 +95,7 @@ def test_a_skin_in_space(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("--plane-mm", "w=3"), "--plane-mm must be such as z=20"),
         (("--plane-mm", "1,2/3"), "--plane-mm must be such as z=20"),
@@ -110,20 +110,20 @@ def test_a_skin_in_space(run, tmp_path):
         (("--axis", "w"), "--axis must be"),
     ],
 )
-def test_options_that_cannot_be(run, solid, tmp_path, arguments, said):
+def test_invalid_options(run, solid, tmp_path, arguments, message):
     status, _, error = run("view", solid, "-o", tmp_path / "out", *arguments)
     assert status == 1
-    assert said in error
+    assert message in error
     assert len(error.splitlines()) == 1
     assert not (tmp_path / "out").exists()
 
 
-def test_files_that_are_none(run, tmp_path):
+def test_invalid_files(run, tmp_path):
     (tmp_path / "image.png").write_bytes(b"\x89PNG")
-    for name, said in (("image.png", "not an image that jeit wrote"), ("none.npz", "No such file"), (".", "folder")):
+    for name, message in (("image.png", "not an image that jeit wrote"), ("none.npz", "No such file"), (".", "folder")):
         status, _, error = run("view", tmp_path / name)
         assert status == 1
-        assert said in error
+        assert message in error
     others = {
         "frames.csv": "a table of data, which is to be imaged first",
         "image.vtu": "a file for ParaView",
@@ -132,8 +132,10 @@ def test_files_that_are_none(run, tmp_path):
     }
     for name, kind in others.items():
         (tmp_path / name).write_text("1, 2, 3")
-        said = f"{name}: not an image that jeit wrote, but {kind}; give the image.npz that jeit reconstruct writes.\n"
-        assert run("view", tmp_path / name)[2].endswith(said)
+        message = (
+            f"{name}: not an image that jeit wrote, but {kind}; give the image.npz that jeit reconstruct writes.\n"
+        )
+        assert run("view", tmp_path / name)[2].endswith(message)
     np.savez(tmp_path / "frames.npz", voltages=np.ones((3, 4)))
     assert "it holds voltages, and no image" in run("view", tmp_path / "frames.npz")[2]
     np.savez(tmp_path / "series.npz", changes=np.ones((3, 4)), functional=np.ones(4), points=1, cells=1)

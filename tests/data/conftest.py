@@ -1,4 +1,4 @@
-"""A tank that needs no forward model: the disk with point electrodes, whose transfer impedance is a logarithm."""
+"""A tank that needs no forward model: a disk with point electrodes, whose transfer impedance is a logarithm."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,8 @@ RADIUS = 0.1
 def disk_voltages(protocol: Protocol, change: float = 0.0) -> np.ndarray:
     """Voltages (M,) of a homogeneous disk of 1 mS with small electrodes, the first at 12 o'clock, then clockwise.
 
-    `change` times the largest impedance is added as one more symmetric term: something touched it, not like noise.
+    `change` times the largest impedance is added as a further symmetric term: a change of the body that differs from
+    noise.
     """
     position = ring(RADIUS, protocol.num_electrodes, clockwise=True)
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
@@ -30,7 +31,7 @@ def disk_voltages(protocol: Protocol, change: float = 0.0) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def tank() -> Callable[..., np.ndarray]:
-    """`disk_voltages`."""
+    """The function `disk_voltages`."""
     return disk_voltages
 
 

@@ -1,4 +1,4 @@
-"""Writers of what instruments write, each spelt out from what its format says, not by the reader's tables."""
+"""Writers of instruments' file formats, written from the published descriptions and independent of the readers."""
 
 import struct
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def adjacent_channels(number=16):
-    """Electrodes (drive and read pairs, from 0) of every channel, as the Göttingen systems go round."""
+    """Drive and measurement pairs (electrodes from 0) of every channel, in the order of the Göttingen systems."""
     return [
         (drive, (drive + 1) % number, (drive + step) % number, (drive + step + 1) % number)
         for drive in range(number)
@@ -15,7 +15,7 @@ def adjacent_channels(number=16):
 
 
 def adjacent_voltages(impedance, current=5e-3):
-    """(208,) positive voltages: current enters at the second electrode of a pair."""
+    """Positive voltages (208,): the current enters at the second electrode of a pair."""
     return np.array([current * (impedance[r] - impedance[s]) @ (np.eye(16)[q] - np.eye(16)[p])
                      for p, q, r, s in adjacent_channels()])  # fmt: skip
 
@@ -40,7 +40,7 @@ def write_get(path, frames, *, text=False):
 
 
 def write_carefusion(path, frames):
-    """Frames (F, 208), with an image and a wave between them."""
+    """Frames (F, 208), with an image and a waveform between them."""
     text = '<?xml version="1.0" ?>\r\n<EIT_File>\r\n<Header>{:05d} bytes</Header>\r\n</EIT_File>\r\n'
     length = 2 + 2 * len(text.format(0))
     content = b"\xff\xfe" + text.format(length).encode("utf-16-le")
@@ -55,7 +55,7 @@ def write_carefusion(path, frames):
 
 
 def write_swisstom(path, impedances, microseconds, *, scale=2.048 / (2**20 * 360 * 1000)):
-    """Frames of transfer impedances (F, 32, 32), complex, of which events come after the first."""
+    """Frames of transfer impedances (F, 32, 32), complex; events follow the first frame."""
     content = struct.pack("<ii", 4, 64) + b"\0" * 56
     pairs = [(one, (one + 5) % 32) for one in range(32)]
     for number, (impedance, time) in enumerate(zip(impedances, microseconds, strict=True)):
@@ -72,7 +72,8 @@ def write_swisstom(path, impedances, microseconds, *, scale=2.048 / (2**20 * 360
 
 
 def write_sciospec(path, impedances, pairs, *, current=1e-3, header=18, date="2020.01.02. 10:00:00.250", spare=0):
-    """One file: impedances (frequencies, L, L), complex, pairs from 1; `spare` more channels than electrodes."""
+    """One file of complex impedances (frequencies, L, L), with pairs numbered from 1 and `spare` more channels than
+    electrodes."""
     count = impedances.shape[1]
     lines = [str(header), "2", "setup", date, "1000", "10000", "0", str(len(impedances)), str(current), "20.0", "0"]
     if header == 9:

@@ -1,4 +1,4 @@
-"""Bad files and descriptions: each is refused with one line that says what is wrong and what to do."""
+"""Invalid files and descriptions: each is refused with one line that says what is wrong and what to do."""
 
 import numpy as np
 import pytest
@@ -158,14 +158,14 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
-def test_bad_files_are_refused_with_a_lesson(name, tmp_path):
+def test_invalid_files_are_refused_with_advice(name, tmp_path):
     write, lesson = BAD_FILES[name]
     with pytest.raises(ValueError, match=lesson) as error:
         data.read(write(tmp_path))
     assert "\n" not in str(error.value)
 
 
-def test_the_file_that_the_bad_ones_were_made_from_is_good(tmp_path):
+def test_the_valid_file_is_read(tmp_path):
     assert data.read(table()(tmp_path)).num_channels == 40
 
 
@@ -182,7 +182,7 @@ def test_the_file_that_the_bad_ones_were_made_from_is_good(tmp_path):
         ({"description": "absent.toml"}, "no such file"),
     ],
 )
-def test_bad_options(options, lesson, tmp_path):
+def test_invalid_options(options, lesson, tmp_path):
     with pytest.raises(ValueError, match=lesson):
         data.read(table()(tmp_path), **options)
 
@@ -209,7 +209,7 @@ BAD_CALLS = {
 
 
 @pytest.mark.parametrize("name", BAD_CALLS)
-def test_bad_calls_are_refused_with_a_lesson(name):
+def test_invalid_calls_are_refused_with_advice(name):
     call, lesson = BAD_CALLS[name]
     with pytest.raises(ValueError, match=lesson):
         call()
@@ -220,7 +220,7 @@ def test_electrodes_and_protocol_must_agree(setup):
         data.screen(ONES, ADJACENT, **setup(16))
 
 
-def test_what_cannot_be_described_is_not_written(tmp_path):
+def test_setups_that_cannot_be_described_are_not_written(tmp_path):
     from jeit.electrodes import NodeElectrodes
 
     measurement = data.screen(ONES, ADJACENT, electrodes=NodeElectrodes(np.arange(8)))

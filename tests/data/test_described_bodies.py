@@ -1,4 +1,4 @@
-"""Descriptions of solids and of meshes of one's own, from the TOML to the electrodes on them."""
+"""Descriptions of solids and of the user's own meshes, from TOML to the electrodes on them."""
 
 import numpy as np
 import pytest
@@ -54,7 +54,7 @@ def test_a_box_with_patches_in_two_levels():
 STRIP = {"kind": "patch", "layout": "ring", "number": 8, "width": 0.01, "contact_impedance": 1e-3, "levels": [0.02]}
 
 
-def test_a_strip_may_be_as_tall_as_its_wall_and_no_taller():
+def test_a_strip_may_be_as_tall_as_its_wall_but_not_taller():
     assert described(CYLINDER, STRIP | {"height": 0.04}).electrodes.num_electrodes == 8
     with pytest.raises(ValueError, match=r"electrode 1 reaches from -0.005 to 0.045 m, and its wall from 0 to 0.04 m"):
         described(CYLINDER, STRIP | {"height": 0.05})
@@ -72,15 +72,15 @@ def test_electrodes_lie_on_the_surface(size):
 @pytest.mark.parametrize(
     ("place", "off"),
     [
-        ([0.0, 15.0, 0.02], "14.9 m"),  # beyond the wall by far more than from either lid
+        ([0.0, 15.0, 0.02], "14.9 m"),  # farther from the wall than from either lid
         ([0.0, 0.15, 0.02], "100 mm"),
-        ([0.0, 0.15, 0.04], "100 mm"),  # as high as the lid, but not on it
-        ([0.0, 0.08, 0.08], "50 mm"),  # beyond wall and lid, by 30 and 40 mm
+        ([0.0, 0.15, 0.04], "100 mm"),  # at the height of the lid, but off it
+        ([0.0, 0.08, 0.08], "50 mm"),  # outside of wall and lid, by 30 and 40 mm
         ([0.0, 0.0, 0.055], "15 mm"),
         ([0.0, 0.04, 0.025], "10 mm"),  # inside
     ],
 )
-def test_the_distance_from_the_surface_is_the_real_one(place, off):
+def test_distance_from_the_surface_is_exact(place, off):
     disc = {"kind": "disc", "radius": 0.004, "contact_impedance": 1e-3, "positions": [[0.05, 0.0, 0.02], place]}
     with pytest.raises(ValueError, match=rf"electrode 2 at .* m lies {off} off the body's surface"):
         described(CYLINDER, disc)
@@ -91,13 +91,13 @@ def test_any_outline_with_a_thickness_is_a_solid():
     found = described({"shape": "polygon", "vertices": SQUARE, "thickness": 0.01}, corner)
     assert isinstance(found.domain, Solid)
     assert isinstance(found.domain.outline, Polygon)
-    assert found.electrodes.refinement(found.domain)[0].points.shape == (2, 2)  # seen from above, for the plane mesh
+    assert found.electrodes.refinement(found.domain)[0].points.shape == (2, 2)  # in the plane mesh, seen from above
     assert found.domain.mesh(num_points=500, refine=found.electrodes.refinement(found.domain)).dimension == 3
 
 
 @pytest.fixture
 def folder(tmp_path):
-    """Two meshes in centimetres: a disk, and a cylinder with two named plates."""
+    """A folder of two meshes in centimetres: a disk, and a cylinder with two named plates."""
     solid = cylinder(5.0, 4.0, num_points=400)
     facets, middle = np.asarray(solid.facets), np.asarray(solid.points)[np.asarray(solid.facets)].mean(axis=1)
     plates = {"east": facets[middle[:, 0] > 4], "west": facets[middle[:, 0] < -4]}
@@ -220,13 +220,13 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_is_wrong_is_said(name):
+def test_faults_are_named(name):
     geometry, electrodes, message = WRONG[name]
     with pytest.raises(ValueError, match=rf"^d\.toml.*{message}"):
         described(geometry, electrodes)
 
 
-def test_what_is_no_mesh_is_told_with_the_key_alone(tmp_path):
+def test_a_file_that_is_no_mesh_is_named_with_its_key(tmp_path):
     (tmp_path / "junk.msh").write_text("hello")
     with pytest.raises(
         ValueError, match=r"^d\.toml: geometry\.mesh: junk\.msh does not work .* its content does not fit"
@@ -234,12 +234,12 @@ def test_what_is_no_mesh_is_told_with_the_key_alone(tmp_path):
         described({"mesh": "junk.msh"}, FACETS, tmp_path)
 
 
-def test_patches_on_a_mesh_of_another_unit(folder):
-    """None of its facets is near one."""
+def test_patches_on_a_mesh_in_another_unit(folder):
+    """With the wrong unit, no facet of the mesh is near a patch."""
     patches = PATCH | {"positions": [[0.05, 0, 0.02], [0, 0.05, 0.02]], "contact_impedance": 1e-3}
     described({"mesh": "plates.msh", "scale": 1e-2}, patches | {"width": 0.03, "height": 0.03}, folder)
-    said = r"lies 20 mm off the body's surface; is the mesh in millimetres\? Read it with scale = 1e-3\.$"
-    with pytest.warns(UserWarning, match="is large"), pytest.raises(ValueError, match=said):
+    expected = r"lies 20 mm off the body's surface; is the mesh in millimetres\? Read it with scale = 1e-3\.$"
+    with pytest.warns(UserWarning, match="is large"), pytest.raises(ValueError, match=expected):
         described({"mesh": "plates.msh", "scale": 10}, patches, folder)
     placed = FacePatches([[50, 0, 20], [0, 50, 20]], 0.01, 0.01, 1e-3)
     body = described({"mesh": "plates.msh", "scale": 1e-2}, None, folder).domain
@@ -249,7 +249,7 @@ def test_patches_on_a_mesh_of_another_unit(folder):
         described({"mesh": "plates.msh", "scale": 1e-2}, patches | {"width": 12}, folder)
 
 
-def test_a_surface_is_no_volume(folder):
+def test_a_surface_is_refused_as_a_volume(folder):
     corners = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     write(Mesh.create(corners, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]), folder / "shell.vtu")
     with pytest.raises(ValueError, match=r"tagged 'a'.* It is a surface, without tetrahedra: mesh the volume"):
@@ -273,7 +273,7 @@ def test_solids_are_written_and_read_again(tmp_path, kind):
     np.testing.assert_array_equal(again.electrodes.position, places)
 
 
-def test_a_plain_mesh_is_a_body_and_a_path_is_none():
+def test_a_mesh_is_accepted_as_a_domain_but_a_path_is_not():
     mesh = Disk(0.05).mesh(num_points=200)
     body = Measurement(np.ones((1, 40)), np.ones((1, 40), bool), adjacent(8), domain=mesh).domain
     assert isinstance(body, OwnMesh)
@@ -282,9 +282,9 @@ def test_a_plain_mesh_is_a_body_and_a_path_is_none():
         screen(np.arange(40.0) + 1, adjacent(8), electrodes=electrodes, domain="tank.msh")
 
 
-def test_a_radius_in_millimetres_is_told_in_metres():
-    said = r"^d\.toml: geometry\.radius: 150 m is large .* If the lengths are millimetres, give 0\.15, "
-    with pytest.warns(UserWarning, match=said):
+def test_a_radius_in_millimetres_is_reported_in_metres():
+    expected = r"^d\.toml: geometry\.radius: 150 m is large .* If the lengths are millimetres, give 0\.15, "
+    with pytest.warns(UserWarning, match=expected):
         described({"shape": "disk", "radius": 150}, {"kind": "point", "positions": [[0, 150]]})
 
 
@@ -295,7 +295,7 @@ SHEET = {
 }
 
 
-def test_an_uncertainty_is_described_in_degrees_and_per_cent_and_stays_with_the_measurement(tmp_path):
+def test_an_uncertainty_in_degrees_and_percent_is_kept_by_measurements(tmp_path):
     known = parse_description(
         {**SHEET, "uncertainty": {"position_degrees": 1, "size_percent": 3}}, "d.toml"
     ).uncertainty
@@ -316,7 +316,7 @@ def test_an_uncertainty_is_described_in_degrees_and_per_cent_and_stays_with_the_
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "expected"),
     [
         ({"position": 1e-3, "position_degrees": 1}, "the same"),
         ({"position": -1}, "from 0"),
@@ -324,25 +324,25 @@ def test_an_uncertainty_is_described_in_degrees_and_per_cent_and_stays_with_the_
         ({"other_percent": 101}, r"101, and must be from 0 to 100 %\.$"),
     ],
 )
-def test_a_faulty_uncertainty_is_named(given, said):
-    with pytest.raises(ValueError, match=said):
+def test_a_faulty_uncertainty_is_named(given, expected):
+    with pytest.raises(ValueError, match=expected):
         parse_description({**SHEET, "uncertainty": given}, "d.toml")
 
 
 @pytest.mark.parametrize(
     "given", [{"position": -1e-3}, {"position": "1 mm"}, {"drift": np.nan}, {"size": 3}, {"other": -1}, {"drift": None}]
 )
-def test_an_uncertainty_of_wrong_values_is_refused(given):
+def test_an_uncertainty_with_invalid_values_is_refused(given):
     with pytest.raises(ValueError, match=f"{next(iter(given))} must be a number"):
         Uncertainty(**given)
 
 
-def test_an_uncertainty_of_another_kind_is_refused():
+def test_an_uncertainty_of_another_type_is_refused():
     with pytest.raises(ValueError, match=r"jeit\.inverse\.Uncertainty"):
         Measurement(np.ones(40), np.ones(40, bool), adjacent(8), uncertainty={"position": 1e-3})  # pyright: ignore
 
 
-def test_degrees_need_a_round_body():
+def test_degrees_need_a_circular_body():
     square = {"geometry": {"shape": "rectangle", "width": 0.1, "height": 0.1}}
     electrodes = {"electrodes": {**SHEET["electrodes"], "layout": "perimeter"}}
     with pytest.raises(ValueError, match="position_degrees is of a disk"):

@@ -1,4 +1,5 @@
-"""What a description asks for is counted before it is made, and currents are found in names at once."""
+"""Limits of descriptions: sizes are checked before memory is allocated, and currents in file names are found
+quickly."""
 
 import time
 import tracemalloc
@@ -16,11 +17,11 @@ MANY = {
         {"kind": "bipolar", "number": 4, "drive_pairs": [[0, 1]] * 20_000, "measurement_pairs": [[2, 3]] * 20_000},
         r"protocol would take 51\.2 GB",
     ),
-    "an electrode that is not there": (
+    "an electrode that does not exist": (
         {"kind": "bipolar", "number": 4, "drive_pairs": [[0, 1]], "measurement_pairs": [[2, 4]] * 20_000},
         r"protocol\.measurement_pairs has electrode 4, and there are 4, numbered from 0 to 3",
     ),
-    "no protocol's options": ({"kind": "adjacent", "number": 8, "colour": 1}, r"protocol\.colour is no key"),
+    "an unknown option": ({"kind": "adjacent", "number": 8, "colour": 1}, r"protocol\.colour is no key"),
 }
 MATRICES = {
     "patterns": (
@@ -49,8 +50,8 @@ MATRICES = {
     + [({"kind": "matrices"} | protocol, message) for protocol, message in MATRICES.values()],
     ids=[*MANY, *MATRICES],
 )
-def test_refused_before_it_is_made(protocol, message):
-    parse_description({}, "d.toml")  # imports what takes longer than the rest
+def test_refused_before_memory_is_allocated(protocol, message):
+    parse_description({}, "d.toml")  # keeps the first import, which is slow, out of the timing
     tracemalloc.start()
     start = time.process_time()
     try:
@@ -81,18 +82,18 @@ def test_refused_before_it_is_made(protocol, message):
         ("*aa*aa*{current}", "aaaa1", 1),
     ],
 )
-def test_a_current_in_a_name(pattern, name, number):
+def test_current_in_a_file_name(pattern, name, number):
     assert number_in_name(pattern, name) == number
 
 
-def test_a_pattern_of_many_parts_takes_no_time():
+def test_a_pattern_of_many_parts_is_fast():
     start = time.process_time()
     assert number_in_name("*a" * 90 + "{current}b", "1" + "a1" * 125) is None
     assert time.process_time() - start < 0.5
 
 
 @pytest.mark.parametrize("pattern", ["([0-9.]+)uA", "(a+)+$", "*uA*", "{current}{current}"])
-def test_a_regular_expression_is_told_what_to_write(pattern):
+def test_error_for_a_regular_expression_shows_a_pattern(pattern):
     protocol = {"kind": "adjacent", "number": 8, "current_from_name": pattern}
     with pytest.raises(ValueError, match=r"protocol\.current_from_name must be .* '\*_\{current\}uA_\*'"):
         parse_description({"protocol": protocol}, "d.toml")

@@ -1,4 +1,4 @@
-"""Electrodes that are not numbered along the edge: said, and whether the voltages agree."""
+"""Electrodes that are not numbered along the edge are reported, with whether the voltages agree."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ PROTOCOL = adjacent(NUMBER)
 
 
 def measured(tank, rows, kind=BoundaryElectrodes, wired=None):
-    """Voltages of a tank whose electrodes are wired in the order `wired`, with positions in the order of `rows`."""
+    """Notes on a tank whose electrodes are wired in the order `wired`, with positions in the order of `rows`."""
     position = ring(RADIUS, NUMBER, clockwise=True)
     voltages = tank(PROTOCOL if wired is None else rewired(wired))
     electrodes = kind(position[rows], 1e-3, 0.01) if kind is BoundaryElectrodes else kind(position[rows])
@@ -37,11 +37,11 @@ def exchanged(*pairs):
 
 
 @pytest.mark.parametrize("rows", [np.arange(16), np.arange(16)[::-1], np.roll(np.arange(16), 5)])
-def test_rings_either_way_round_are_in_order(tank, rows):
+def test_rings_in_either_direction_are_in_order(tank, rows):
     assert measured(tank, rows, wired=np.argsort(rows)) == ()
 
 
-def test_two_rows_exchanged_are_said_and_the_voltages_contradict_them(tank):
+def test_two_exchanged_rows_are_reported_and_contradicted_by_the_voltages(tank):
     (note,) = measured(tank, exchanged((4, 5)))
     assert "come in the order 1, 2, 3, 4, 6, 5, 7, 8" in note
     assert "the voltages contradict it" in note
@@ -50,17 +50,17 @@ def test_two_rows_exchanged_are_said_and_the_voltages_contradict_them(tank):
     assert "exchanged: mend them" in note
 
 
-def test_a_layout_numbered_otherwise_agrees_with_its_voltages(tank):
+def test_a_layout_numbered_in_another_order_agrees_with_its_voltages(tank):
     rows = np.argsort(np.r_[np.arange(0, 16, 2), np.arange(1, 16, 2)])
     (note,) = measured(tank, rows, wired=np.argsort(rows))
     assert note.endswith("; the signs of the voltages agree.")
 
 
-def test_points_have_no_edge_to_follow(tank):
+def test_point_electrodes_are_not_checked(tank):
     assert measured(tank, exchanged((4, 5)), kind=PointElectrodes) == ()
 
 
-def test_a_shuffled_ring_is_told_by_the_commands(tank, tmp_path, capsys):
+def test_a_shuffled_ring_is_reported_by_the_commands(tank, tmp_path, capsys):
     from jeit.cli import main
 
     positions = ring(RADIUS, NUMBER, clockwise=True)[exchanged((2, 9))].tolist()

@@ -1,4 +1,4 @@
-"""Models of other toolkits: their voltages, on their meshes."""
+"""Models of other toolkits: their voltages on their own meshes."""
 
 from types import SimpleNamespace
 
@@ -17,7 +17,7 @@ SOLVE = 1e-11
 
 
 def as_struct(arrays):
-    """An EIDORS `fwd_model` of the arrays of a reference file."""
+    """An EIDORS `fwd_model` from the arrays of a reference file."""
     drives = np.ravel(arrays["meas_stim"]).astype(int)
     places = arrays["elec_nodes"].astype(int)
     impedances = np.ravel(arrays.get("z_contact", np.full(len(places), 0.01)))
@@ -40,7 +40,7 @@ def test_voltages_of_an_eidors_model(case, reference_folder, tmp_path):
     assert np.abs(found - expected).max() < SOLVE * np.abs(expected).max()
 
 
-def test_files_that_hold_no_model(tmp_path):
+def test_files_without_a_model(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"x": 1.0})
     with pytest.raises(ValueError, match=r"variable: a\.mat has no model; save a fwd_model"):
         from_eidors(tmp_path / "a.mat")
@@ -51,7 +51,7 @@ def test_files_that_hold_no_model(tmp_path):
 
 @pytest.mark.parametrize("made", [adjacent, opposite])
 def test_a_pyeit_model(made):
-    """The pairs of its protocol come drive by drive, and the nodes of a plane have a coordinate z."""
+    """Its protocol lists pairs for each drive, and nodes of a plane mesh have a z coordinate."""
     mesh = Disk(1.0).mesh(num_points=200)
     points = np.asarray(mesh.points)
     rim = np.flatnonzero(np.isclose(np.linalg.norm(points, axis=1), 1))

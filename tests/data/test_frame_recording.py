@@ -1,4 +1,4 @@
-"""Frames as recorded: units, rows and columns, times, the untouched skin among them; and files that are none."""
+"""Recorded frames: units, rows and columns, times, reference frames, and files that are refused."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_an_npz_has_times_and_a_reference(tmp_path):
     assert read_frame_recording(path).frames.shape == (5, 4)
 
 
-def test_a_table_may_lie_on_its_side(tmp_path):
+def test_a_transposed_table_is_accepted(tmp_path):
     path = tmp_path / "stream.csv"
     np.savetxt(path, FRAMES.T, delimiter=";", header="a; b; c")
     names = ["reference", "one", "two", "three", "four"]
@@ -36,14 +36,14 @@ def test_a_table_may_lie_on_its_side(tmp_path):
     assert found.seconds is None
 
 
-def test_without_a_description_any_channels_will_do(tmp_path):
+def test_any_number_of_channels_without_a_description(tmp_path):
     np.save(tmp_path / "counts.npy", (100 * FRAMES).astype(np.int16))
     found = read_frame_recording(tmp_path / "counts.npy")
     np.testing.assert_array_equal(found.frames, 100 * FRAMES)
     assert found.frames.dtype == float
 
 
-def test_of_complex_voltages_a_part_is_taken(tmp_path):
+def test_part_of_complex_voltages(tmp_path):
     np.save(tmp_path / "complex.npy", FRAMES + 2j)
     for component, value in (("real", FRAMES), ("imaginary", np.full((5, 4), 2.0))):
         found = read_frame_recording(tmp_path / "complex.npy", described(component=component))
@@ -52,14 +52,14 @@ def test_of_complex_voltages_a_part_is_taken(tmp_path):
         read_frame_recording(tmp_path / "complex.npy", described(component="complex"))
 
 
-def test_what_is_not_finite_has_no_reading(tmp_path):
+def test_values_that_are_not_finite_are_missing(tmp_path):
     (tmp_path / "holes.csv").write_text("1,nan,3,4\n1,2,inf,4\n", "utf-8")
     found = read_frame_recording(tmp_path / "holes.csv")
     np.testing.assert_array_equal(np.isnan(found.frames), [[0, 1, 0, 0], [0, 0, 1, 0]])
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         ({"other": FRAMES}, "there is no array 'frames'; the file holds other"),
         ({"frames": FRAMES[:, :3]}, r"frames have shape \(5, 3\)"),
@@ -73,13 +73,13 @@ def test_what_is_not_finite_has_no_reading(tmp_path):
         ({"frames": np.array([None])}, "plain arrays"),
     ],
 )
-def test_what_is_no_recording_is_said(tmp_path, arrays, said):
+def test_invalid_recordings_are_reported(tmp_path, arrays, message):
     np.savez(tmp_path / "stream.npz", **arrays)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         read_frame_recording(tmp_path / "stream.npz", described())
 
 
-def test_files_that_are_not_there(tmp_path):
+def test_missing_files(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         read_frame_recording(tmp_path / "stream.npz")
     with pytest.raises(ValueError, match="it is a folder"):

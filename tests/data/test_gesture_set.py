@@ -1,4 +1,4 @@
-"""Sets of recorded gestures: kept in files, and refused where their arrays do not belong together."""
+"""Sets of recorded gestures: written to files and read back, and refused if their arrays do not match."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ ARRAYS = {
 }
 
 
-def test_a_file_keeps_it(tmp_path):
+def test_round_trip(tmp_path):
     made = GestureSet(**ARRAYS)
     made.write(tmp_path / "set.npz")
     again = GestureSet.read(tmp_path / "set.npz")
@@ -27,7 +27,7 @@ def test_a_file_keeps_it(tmp_path):
     np.testing.assert_array_equal(changes, ARRAYS["voltages"][2:] - 1)
 
 
-def test_nobody_named_is_one_person(tmp_path):
+def test_recordings_without_names_are_of_one_person(tmp_path):
     np.savez(tmp_path / "set.npz", **{name: array for name, array in ARRAYS.items() if name != "person"})
     assert GestureSet.read(tmp_path / "set.npz").person.tolist() == [0, 0]
 
@@ -46,7 +46,7 @@ def test_other_files_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"start": np.array([0, 2, 4])}, "start goes from 0 to 4; give 0 first"),
         ({"voltages": np.ones(5)}, r"voltages \(F, M\)"),
@@ -61,6 +61,6 @@ def test_other_files_are_refused(tmp_path):
         ({"voltages": np.ones((5, 3), complex)}, "voltages is complex128; give real numbers"),
     ],
 )
-def test_what_does_not_belong_together_is_said(change, said):
-    with pytest.raises(ValueError, match=said):
+def test_arrays_that_do_not_match_are_reported(change, message):
+    with pytest.raises(ValueError, match=message):
         GestureSet(**(ARRAYS | change))

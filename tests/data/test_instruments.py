@@ -1,4 +1,5 @@
-"""Files of instruments: what is written by the published description comes back, in order, and nothing breaks."""
+"""Readers of instruments' files: what is written by the published description is read back in order, and every fault is
+reported."""
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ RING = (
 
 
 def impedance(number, seed=0):
-    """Of a disk with small electrodes and something in it, symmetric, rows summing to zero."""
+    """Transfer impedance of a disk with small electrodes and a body in it; symmetric, with rows that sum to zero."""
     angle = 2 * np.pi * np.arange(number) / number
     place = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     distance = np.linalg.norm(place[:, None] - place, axis=-1) + np.eye(number) * 0.05
@@ -49,13 +50,13 @@ ADJACENT = {
 
 
 @pytest.mark.parametrize("kind", ADJACENT)
-def test_adjacent_voltages_come_back_in_order(kind, tmp_path):
+def test_adjacent_voltages_are_read_in_order(kind, tmp_path):
     name, write, rate = ADJACENT[kind]
     made = frames()
     write(tmp_path / name, made)
     (tmp_path / "a.toml").write_text(RING + "number = 16\n")
     found = data.read(tmp_path / name)
-    exact = 1e-6 if name.endswith(".get") or kind == "carefusion" else 1e-12  # numbers of four bytes
+    exact = 1e-6 if name.endswith(".get") or kind == "carefusion" else 1e-12  # 32-bit numbers
     np.testing.assert_allclose(found.voltages, -made, rtol=exact)
     drives, reads = np.asarray(found.protocol.channel_drive), np.asarray(found.protocol.channel_measurement)
     for channel, (p, q, r, s) in enumerate(adjacent_channels()):
@@ -78,8 +79,8 @@ def test_adjacent_voltages_come_back_in_order(kind, tmp_path):
     ids=lambda one: getattr(one, "name", ""),
 )
 def test_lines_of_openeit(made, table, tmp_path):
-    """With line ends of every kind or none, zeros of open circuits, and a last frame that is cut off; signs come from
-    the body."""
+    """Line ends of every kind or none, zeros of open circuits, and an incomplete last frame; the signs come from the
+    body."""
     ohms = made.channel_measurement @ impedance(made.num_electrodes) * made.channel_drive
     ohms = np.asarray(ohms.sum(axis=1)) / 1e-3
     line = "magnitudes :" + "".join(f"{abs(one):12.4f} ," for one in ohms)
@@ -95,7 +96,7 @@ def test_lines_of_openeit(made, table, tmp_path):
     rod = data.read(tmp_path / "rod.txt", like=found)
     assert np.asarray(rod.mask)[0].tolist() == [False] + [True] * (len(ohms) - 1)
     np.testing.assert_allclose(rod.voltages[0, 1:], found.voltages[0, 1:])
-    # A protocol that is described takes precedence, and numbers are what it takes them for.
+    # A described protocol takes precedence and decides the meaning of the numbers.
     kind = '[protocol]\nkind = "two-terminal"\ncurrent = 1.0\n'
     (tmp_path / "rod.toml").write_text(RING + "number = 8\n" + kind)
     if made.num_measurements == 28:
@@ -105,8 +106,8 @@ def test_lines_of_openeit(made, table, tmp_path):
             data.read(tmp_path / "rod.txt")
 
 
-def test_characters_that_openeit_lost(tmp_path):
-    """Serial lines lose some: what is left of a number or of a frame is masked, and never taken for another."""
+def test_characters_lost_by_openeit(tmp_path):
+    """Serial lines lose characters: the rest of a number or frame is masked, and never taken for another."""
     path = tmp_path / "a.txt"
     frame = "magnitudes: " + "".join(f"{one}.5 , " for one in range(1, 33))
     cells = frame.replace("3.5", "3x5", 1).replace("7.5", "-7.5", 1).replace("9.5", "1_000", 1)
@@ -118,7 +119,7 @@ def test_characters_that_openeit_lost(tmp_path):
     assert any("4 readings of zero, as of an open circuit, or illegible" in note for note in found.notes)
     path.write_text(frame + frame[:40])
     assert data.read(path).num_frames == 1
-    # A lost word makes two frames one, and those after them keep their times.
+    # A lost word joins two frames; the later frames keep their times.
     path.write_text(frame + frame + frame.replace("magnitudes: ", "") + frame + "\n")
     path.with_suffix(".toml").write_text("[data]\nframe_rate = 10\n")
     found = data.read(path)
@@ -126,8 +127,8 @@ def test_characters_that_openeit_lost(tmp_path):
     np.testing.assert_allclose(found.times, [0, 0.1, 0.2, 0.3])
 
 
-def test_what_a_description_leaves_out_is_as_openeit_sends_it(tmp_path):
-    """The order of opposite drives, which no reciprocity shows; units that are stated are those of the numbers."""
+def test_defaults_of_openeit_descriptions(tmp_path):
+    """The order of opposite drives, which reciprocity cannot show; stated units apply to the numbers."""
     path = tmp_path / "a.txt"
     path.write_text("magnitudes: " + "".join(f"{one}.5 , " for one in range(1, 33)))
     body, kind = RING + "number = 8\n", '[protocol]\nkind = "opposite"\ndrives = "all"\ncurrent = 2e-3\n'
@@ -142,7 +143,7 @@ def test_what_a_description_leaves_out_is_as_openeit_sends_it(tmp_path):
     np.testing.assert_allclose(np.abs(data.read(path).voltages[0]), 1e-3 * (np.arange(1, 33) + 0.5))
 
 
-def test_what_openeit_does_not_send_is_refused(tmp_path):
+def test_setups_that_openeit_does_not_support_are_refused(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("magnitudes: 1, 2, 3")
     with pytest.raises(ValueError, match="most frames have 3 numbers; the firmware sends 32 \\(8 electrodes\\)"):
@@ -158,7 +159,7 @@ def test_what_openeit_does_not_send_is_refused(tmp_path):
         data.read(path, key="a")
 
 
-def test_channels_that_reciprocity_repeats_may_be_left_out(tmp_path):
+def test_reciprocal_channels_may_be_missing(tmp_path):
     made = frames()
     later = [(p, r) for p, _, r, _ in adjacent_channels()]
     made[:, [r < p for p, r in later]] = 0
@@ -168,7 +169,7 @@ def test_channels_that_reciprocity_repeats_may_be_left_out(tmp_path):
     assert any("104 of 208 channels were not measured" in note for note in found.notes)
 
 
-def test_the_rate_of_goettingen_frames_is_in_the_record_beside_them(tmp_path):
+def test_the_rate_of_goettingen_frames_is_read_from_the_record_beside_them(tmp_path):
     write_get(tmp_path / "a.get", frames())
     (tmp_path / "a.prl").write_text("Number of frames = 3\r\nFramerate = 13 per second\r\nGain = 1000")
     found = data.read(tmp_path / "a.get")
@@ -183,7 +184,7 @@ def test_the_rate_of_goettingen_frames_is_in_the_record_beside_them(tmp_path):
 
 def test_swisstom(tmp_path):
     made = np.array([1e-3 * impedance(32, seed) * (1 + 0.1j) for seed in range(3)])
-    times = np.array([2**32 - 30_000, 2**32 - 10_000, 2**32 + 10_000])  # the counter goes round
+    times = np.array([2**32 - 30_000, 2**32 - 10_000, 2**32 + 10_000])  # the counter overflows
     write_swisstom(tmp_path / "a.eit", made, times)
     (tmp_path / "a.toml").write_text(RING + 'number = 32\n[data]\ncomponent = "complex"\n')
     found = data.read(tmp_path / "a.eit")
@@ -215,7 +216,7 @@ def test_sciospec(tmp_path, header):
 
 
 def test_sciospec_differences_and_polarity(tmp_path):
-    """The current enters where the potential is higher, whatever the order of the pair."""
+    """The current enters at the higher potential, whatever the order of the pair."""
     made = impedance(8)[None]
     write_sciospec(tmp_path / "a.eit", made, PAIRS)
     write_sciospec(tmp_path / "b.eit", -made, PAIRS)
@@ -232,7 +233,7 @@ def test_sciospec_differences_and_polarity(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "write"), [("a.get", write_get), ("a.eit", write_carefusion)])
-def test_a_rate_is_asked_for_where_none_is_described(name, write, tmp_path):
+def test_a_rate_is_required_where_none_is_described(name, write, tmp_path):
     write(tmp_path / name, frames())
     (tmp_path / "a.toml").write_text(RING + "number = 16\n")
     assert any("says no rate" in note for note in data.read(tmp_path / name).notes)
@@ -258,15 +259,15 @@ def test_a_folder_of_sciospec_files_is_a_series(tmp_path):
     )
 
 
-def test_the_rate_of_a_folder_of_sciospec_files_is_the_described_one(tmp_path):
+def test_the_described_rate_of_a_folder_of_sciospec_files(tmp_path):
     for number in range(3):
         write_sciospec(tmp_path / f"setup_{number}.eit", impedance(8, number)[None], PAIRS)
-    assert data.read(tmp_path).times is None  # all of one date
+    assert data.read(tmp_path).times is None  # all files have the same date
     (tmp_path / "description.toml").write_text('[protocol]\nkind = "measured"\n[data]\nframe_rate = 4\n')
     np.testing.assert_allclose(data.read(tmp_path).times, [0, 0.25, 0.5])
 
 
-def test_join_takes_one_set_up_only(tank):
+def test_join_accepts_one_setup_only(tank):
     one, two = (data.screen(tank(made), made) for made in (protocol.adjacent(8), protocol.opposite(8)))
     with pytest.raises(ValueError, match="is read otherwise"):
         data.join([one, two])
@@ -275,7 +276,7 @@ def test_join_takes_one_set_up_only(tank):
     assert data.join([one, one]).num_frames == 2
 
 
-def test_each_is_known_by_its_content(tmp_path):
+def test_formats_are_recognised_by_their_content(tmp_path):
     made, small = frames(), impedance(8)[None]
     writers = {
         "draeger": lambda path: write_draeger(path, made),
@@ -288,7 +289,7 @@ def test_each_is_known_by_its_content(tmp_path):
         assert [one for one in FORMATS if FORMATS[one].recognises(tmp_path / "a.eit")] == [name]
 
 
-def test_a_last_frame_that_is_cut_off_is_left_out_and_said(tmp_path):
+def test_an_incomplete_last_frame_is_left_out_and_noted(tmp_path):
     write_draeger(tmp_path / "a.eit", frames(), cut=100)
     found = data.read(tmp_path / "a.eit")
     assert found.num_frames == 2
@@ -340,7 +341,7 @@ FAULTS = {
     "sciospec, no number": (text("1000\n", "fast\n"), "must be a number; it is 'fast'"),
     "sciospec, a million frequencies": (text("0\n1\n", "0\n1000000\n"), "frequencies"),
     "sciospec, ragged": (text("1 4\n", "1 4\n1.0\t2.0\t3.0\t4.0\n"), "two electrodes"),
-    "sciospec, an electrode that is none": (text("1 4\n", "1 9\n"), "electrode 9"),
+    "sciospec, an electrode that does not exist": (text("1 4\n", "1 9\n"), "electrode 9"),
     "sciospec, words": (text("1 4\n", "one four\n"), "is not numbers"),
     "sciospec, no current": (text("0.001\n", "0\n"), "positive"),
     "sciospec, a pair of one": (text("1 4\n", "1 1\n"), "line 19: current enters and leaves at electrode 1;"),
@@ -348,7 +349,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_what_is_wrong_is_told(name, tmp_path):
+def test_faults_are_reported(name, tmp_path):
     make, message = FAULTS[name]
     make(tmp_path / "a.eit")
     with pytest.raises(ValueError, match=message) as caught:
@@ -357,7 +358,7 @@ def test_what_is_wrong_is_told(name, tmp_path):
 
 
 def written(write, name="a.eit"):
-    """A maker of a file of this name, whose content is changed."""
+    """Return a function that writes a file of this name and modifies its content."""
 
     def make(folder, change=lambda content: content):
         write(folder / name)
@@ -426,19 +427,19 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("name", DAMAGED)
-def test_a_damaged_file_is_named_for_what_it_probably_is(name, tmp_path):
-    make, change, said = DAMAGED[name]
+def test_a_damaged_file_is_reported_with_its_probable_format(name, tmp_path):
+    make, change, reason = DAMAGED[name]
     path = make(tmp_path) if change is None else make(tmp_path, change)
-    with pytest.raises(ValueError, match=said) as caught:
+    with pytest.raises(ValueError, match=reason) as caught:
         data.read(path)
     assert len(str(caught.value)) < 500
 
 
-def test_a_mark_of_byte_order_before_sciospec_is_none_of_the_header(tmp_path):
+def test_a_byte_order_mark_before_a_sciospec_header_is_ignored(tmp_path):
     path = written(one_of_sciospec)(tmp_path, lambda content: b"\xef\xbb\xbf" + content)
     assert data.read(path).num_frames == 1
 
 
-def test_a_table_has_one_list_of_endings():
-    """The registry's, by which the reader is imported, and the reader's own."""
+def test_endings_of_tables_agree():
+    """The endings in the registry, which selects the reader, and those in the reader itself."""
     assert FORMATS["table"].endings == table.SUFFIXES

@@ -1,4 +1,4 @@
-"""A described body in another unit than metres is warned of once, by the keys of its description."""
+"""A described body in another unit than metres gives one warning, with the keys of its description."""
 
 import warnings
 
@@ -35,22 +35,22 @@ LARGE = {
 
 
 @pytest.mark.parametrize("name", LARGE)
-def test_said_once_by_the_keys(name, tmp_path):
-    geometry, said = LARGE[name]
+def test_one_warning_with_the_keys(name, tmp_path):
+    geometry, message = LARGE[name]
     write(Disk(4.0).mesh(num_points=100), tmp_path / "disk.vtu")
-    with pytest.warns(UserWarning, match=rf"^tank\.toml: {said}") as found:
+    with pytest.warns(UserWarning, match=rf"^tank\.toml: {message}") as found:
         meshed_twice({"geometry": geometry}, tmp_path)
     assert len(found) == 1
 
 
 def meshed_twice(described, folder):
-    """A mesh of what is described, and a finer one of that."""
+    """Mesh a described body, and refine the mesh."""
     body = parse_description(described, "tank.toml", folder).domain
     assert body is not None
     bisect(body.mesh(num_points=300), lambda corners: np.full(len(corners), 10.0))
 
 
-def test_a_body_in_metres_is_not_warned_of():
+def test_a_body_in_metres_gives_no_warning():
     parse_description({"geometry": {"shape": "cylinder", "radius": 4.9, "height": 9.9}}, "tank.toml")
 
 
@@ -63,19 +63,19 @@ def test_a_body_in_metres_is_not_warned_of():
         (lambda: box(15.0, 9.0, 8.0, num_points=200), "width"),
     ],
 )
-def test_a_size_in_python_is_told_of_once(make, name):
+def test_a_size_in_python_gives_one_warning(make, name):
     with pytest.warns(UserWarning, match=f"^{name}: .* m is large") as found:
         make()
     assert len(found) == 1
 
 
-def test_what_comes_after_is_told_of_again():
+def test_a_later_call_warns_again():
     for _ in range(2):
         with pytest.warns(UserWarning, match="^radius"):
             Disk(15.0).mesh(num_points=100)
 
 
-def test_the_command_says_the_same_once(capsys):
+def test_the_command_prints_a_warning_once(capsys):
     from jeit.cli import app
 
     with warnings.catch_warnings():

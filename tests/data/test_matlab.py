@@ -1,4 +1,4 @@
-"""MATLAB files read as SciPy writes and reads them, whatever the types; and no larger than they say."""
+"""MATLAB files: equal to SciPy's reading and writing for all types, and limited in size."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from jeit.files import matlab
 RNG = np.random.default_rng(0)
 ARRAYS = {
     "double": RNG.random((3, 4)),
-    "whole": np.arange(6.0).reshape(2, 3),  # stored in bytes
+    "whole": np.arange(6.0).reshape(2, 3),  # stored as bytes
     "single": RNG.random((2, 2)).astype("f4"),
     "complex": RNG.random((2, 3)) + 1j,
     "cube": RNG.random((2, 3, 4)),
@@ -23,7 +23,7 @@ ARRAYS = {
 
 
 @pytest.mark.parametrize("options", [{"do_compression": True}, {"do_compression": False}, {"format": "4"}])
-def test_as_scipy_reads_them(tmp_path, options):
+def test_equal_to_scipy(tmp_path, options):
     old = options.get("format") == "4"
     held = {name: one for name, one in ARRAYS.items() if not (old and name in ("cube", "long", "signed", "flags"))}
     others = {} if old else {"text": "abc", "cell": np.array([1, "a"], object), "record": {"a": 1.0}}
@@ -39,10 +39,10 @@ def test_as_scipy_reads_them(tmp_path, options):
         assert old or read[name].dtype == by_scipy[name].dtype
 
 
-def test_what_is_not_wanted_is_not_unpacked(tmp_path):
+def test_other_variables_are_not_unpacked(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"a": np.ones((2, 2)), "b": np.zeros((3, 3))}, do_compression=True)
     whole = (tmp_path / "a.mat").read_bytes()
-    (tmp_path / "a.mat").write_bytes(whole[:-8] + b"\xff" * 8)  # the end of b is no zlib stream any more
+    (tmp_path / "a.mat").write_bytes(whole[:-8] + b"\xff" * 8)  # the zlib stream of b is invalid
     assert set(matlab.load(tmp_path / "a.mat", "a")) == {"", "a"}
     with pytest.raises(ValueError, match=r"not a readable \.mat file"):
         matlab.load(tmp_path / "a.mat", "b")

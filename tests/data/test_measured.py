@@ -1,4 +1,4 @@
-"""The readers on the real files (skipped where there are none)."""
+"""The readers on measured files; skipped without them."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def test_kit4(data_folder):
     np.testing.assert_allclose(reference.electrodes.position[4], [0.14, 0], atol=1e-12)
     assert float(reference.protocol.drive.max()) == pytest.approx(1.41421e-3, rel=1e-5)
     assert any("milliamperes" in note for note in reference.notes)
-    # Electrode 1 drives against 2: it reads positive against its neighbour.
+    # Electrode 1 drives against 2: its voltage against its neighbour is positive.
     assert float(reference.voltages[0, 0]) > 0
     check_kit4(sorted((data_folder / "kit4").glob("*.mat"))[:2], reference)
 
@@ -77,25 +77,25 @@ def test_tank6cm(data_folder):
         assert measurement.frame_names == ("reference", "object")
         assert measurement.voltages.shape == (2, 208)
         objects, reference = measurement.split_reference()
-        # The reference reads 1 to 3 % reciprocity error; the file of an unknown rod up to 6 %.
+        # The reciprocity error of the reference is 1 to 3 %; that of the file of an unknown rod up to 6 %.
         assert data.reciprocity_error(reference) < (0.06 if "unknown" in str(file) else 0.03)
         if TOO_WEAK in file.name:
             with pytest.raises(ValueError, match=r"too noisy.*no passive body"):
                 data.check_imageable(objects, reference)
         else:
             (quality,) = data.check_imageable(objects, reference)
-            # Wide margins on both sides of the limits, 0.25 and 0.63.
+            # The limits 0.25 and 0.63 have wide margins on both sides.
             assert quality.impossible_signs < 0.18
             assert quality.difference_reciprocity_error < 0.21
 
 
-def test_tank6cm_current_comes_from_the_name(data_folder):
+def test_tank6cm_current_is_read_from_the_name(data_folder):
     currents = {float(data.read(file).protocol.drive.max()) for file in tank_files(data_folder)}
     np.testing.assert_allclose(sorted(currents), [20e-6, 50e-6, 55e-6, 60e-6], rtol=1e-12)
 
 
 def test_tank6cm_signs_follow_the_current(data_folder):
-    # Behind the driven pair the potential rises from sink to source: first minus second is negative.
+    # Behind the driven pair the potential increases from sink to source: first minus second is negative.
     file = next(f for f in tank_files(data_folder) if "electrode01_metal/" in f.as_posix())
     measurement = data.read(file)
     assert np.all(np.asarray(measurement.frame("reference").voltages) < 0)
@@ -104,7 +104,7 @@ def test_tank6cm_signs_follow_the_current(data_folder):
 
 
 def test_a_shuffled_channel_order_shows_as_reciprocity_error(data_folder):
-    # The other order of measurement that the tank's files might have had gives 110 %.
+    # The other possible order of measurements of these files would give a reciprocity error of 110 %.
     from jeit.protocol import adjacent
 
     measurement = data.read(tank_files(data_folder)[0])
@@ -112,12 +112,12 @@ def test_a_shuffled_channel_order_shows_as_reciprocity_error(data_folder):
     assert data.reciprocity_error(wrong) > 0.5
 
 
-def test_eidors_vectors_bring_their_pattern(reference_folder):
+def test_eidors_vectors_contain_their_pattern(reference_folder):
     measurement = data.read(reference_folder / "circ2d_cem_576.mat")
     assert measurement.frame_names == ("reference", "object")
     assert measurement.protocol.num_measurements == 208
     assert measurement.protocol.measurement.shape == (16, 16)
-    # Computed data: reciprocity to rounding.
+    # Computed data fulfil reciprocity to rounding.
     assert data.reciprocity_error(measurement) < 1e-12
     trigonometric = data.read(reference_folder / "circ2d_cem_576_trig.mat")
     assert trigonometric.protocol.num_drives == 15
@@ -157,7 +157,7 @@ def test_no_channel_of_any_measured_frame_is_a_spike(data_folder):
 
 
 def check_spikes(pairs):
-    """None is found in frames as measured; one that is made, as large as the largest change, is found in each."""
+    """No spike is detected in measured frames; an artificial one as large as the largest change is detected in each."""
     rng = np.random.default_rng(0)
     for frame, rest in pairs:
         assert mask_spikes(frame, rest) is frame, frame.source

@@ -1,4 +1,4 @@
-"""Files that hold their currents beside electrodes × patterns × frames, and what their transfer impedance tells."""
+"""Files that hold their currents beside electrodes × patterns × frames, and conversions by the transfer impedance."""
 
 import re
 
@@ -35,7 +35,7 @@ keys = ["frame_voltage"]
 
 @pytest.fixture
 def published(tank):
-    """What a university's system writes: currents (L, S) A, voltages (L, S, F) V less their mean."""
+    """Fields of a published system's file: currents (L, S) A and voltages (L, S, F) V without their mean."""
     chosen = protocol.haar(COUNT, current=2.4e-4)
     voltages = tank(chosen).reshape(COUNT - 1, COUNT).T
     drift = 1 + 1e-3 * np.arange(FRAMES)
@@ -59,7 +59,7 @@ def test_read_with_a_short_description(published, tank, tmp_path, suffix):
     assert data.reciprocity_error(found) < 1e-12
 
 
-def test_the_mean_of_the_frames(published, tank, tmp_path):
+def test_mean_of_the_frames(published, tank, tmp_path):
     found = read(tmp_path, published, DESCRIBED + 'frames = "mean"\n')
     np.testing.assert_allclose(found.voltages, [1.002 * tank(found.protocol)], rtol=1e-12)
     assert found.notes[-1] == "the mean of 5 frames."
@@ -67,7 +67,7 @@ def test_the_mean_of_the_frames(published, tank, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".mat", ".npz"])
-def test_potentials_against_ground_lose_their_mean_and_it_is_said(published, tank, tmp_path, suffix):
+def test_potentials_against_ground_lose_their_mean_with_a_note(published, tank, tmp_path, suffix):
     raw = published | {"frame_voltage": published["frame_voltage"] + 0.5}
     found = read(tmp_path, raw, suffix=suffix)
     np.testing.assert_allclose(found.voltages[0], tank(found.protocol), rtol=1e-9)
@@ -78,22 +78,26 @@ def test_potentials_against_ground_lose_their_mean_and_it_is_said(published, tan
 
 
 @pytest.mark.parametrize("suffix", [".mat", ".npz"])
-def test_the_part_of_complex_voltages_is_said(published, tmp_path, suffix):
+def test_part_of_complex_voltages_is_noted(published, tmp_path, suffix):
     found = read(tmp_path, published | {"frame_voltage": published["frame_voltage"] * (1 + 0.1j)}, suffix=suffix)
     assert found.notes[-1] == "of complex voltages this is the real part; see [data] component."
 
 
 def test_other_axes_names_and_units(published, tank, tmp_path):
     turned = {"i": 1e3 * published["current_patterns"].T, "u": np.transpose(published["frame_voltage"], (2, 0, 1))}
-    said = DESCRIBED.replace("frame_voltage", "u") + 'axes = ["frames", "electrodes", "patterns"]\nframe_rate = 20.0\n'
-    said = said.replace('"measured"\n', '"measured"\ndrive_key = "i"\npatterns_in = "rows"\ncurrent_unit = "mA"\n')
-    found = read(tmp_path, turned, said)
+    described = (
+        DESCRIBED.replace("frame_voltage", "u") + 'axes = ["frames", "electrodes", "patterns"]\nframe_rate = 20.0\n'
+    )
+    described = described.replace(
+        '"measured"\n', '"measured"\ndrive_key = "i"\npatterns_in = "rows"\ncurrent_unit = "mA"\n'
+    )
+    found = read(tmp_path, turned, described)
     np.testing.assert_allclose(found.voltages[0], tank(found.protocol), rtol=1e-12)
     np.testing.assert_allclose(found.times, np.arange(FRAMES) / 20)
     assert found.frame_rate == pytest.approx(20)
 
 
-def test_a_matrix_of_what_was_measured(published, tmp_path):
+def test_a_matrix_of_measurement_patterns(published, tmp_path):
     rows = np.eye(COUNT)[:3] - np.eye(COUNT)[3:6]
     arrays = {**published, "meas": rows.T, "frame_voltage": np.einsum("kl,lsf->ksf", rows, published["frame_voltage"])}
     found = read(tmp_path, arrays, DESCRIBED.replace('"measured"\n', '"measured"\nmeasurement_key = "meas"\n'))
@@ -106,7 +110,7 @@ def test_one_frame_of_two_axes(published, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said", "message"),
+    ("change", "replaced", "message"),
     [
         ({"current_patterns": np.ones((8, 7))}, None, "sums to 8"),
         ({"current_patterns": np.eye(8)[None]}, None, "must be a matrix"),
@@ -121,14 +125,14 @@ def test_one_frame_of_two_axes(published, tmp_path):
         ({}, ("kind =", "reference = 1\nkind ="), "no use"),
     ],
 )
-def test_what_does_not_fit(published, tmp_path, change, said, message):
-    description = DESCRIBED if said is None else DESCRIBED.replace(*said, 1)
+def test_arrays_that_do_not_match(published, tmp_path, change, replaced, message):
+    description = DESCRIBED if replaced is None else DESCRIBED.replace(*replaced, 1)
     with pytest.raises(ValueError, match=message):
         read(tmp_path, {**published, **change}, description)
 
 
 @pytest.mark.parametrize(
-    ("said", "message"),
+    ("options", "message"),
     [
         ('kind = "optimal"\ntransfer = [[1, -1], [-1, 1]]', "give one of them"),
         ('kind = "optimal"\ntransfer = [[1, -1], [-1, 1]]\npower = 1e-6', "power needs other"),
@@ -136,8 +140,8 @@ def test_what_does_not_fit(published, tmp_path, change, said, message):
         ('kind = "haar"\nnumber = 8', "current"),
     ],
 )
-def test_protocols_that_cannot_be(tmp_path, said, message):
-    (tmp_path / "p.toml").write_text(f"[protocol]\n{said}\n", "utf-8")
+def test_impossible_protocols(tmp_path, options, message):
+    (tmp_path / "p.toml").write_text(f"[protocol]\n{options}\n", "utf-8")
     with pytest.raises(ValueError, match=re.escape(message)):
         data.load_description(tmp_path / "p.toml").protocol(tmp_path / "p.csv")
 
@@ -148,23 +152,25 @@ def measured(tank, chosen, noise=0.0, seed=0):
 
 
 @pytest.mark.parametrize("measurement", ["adjacent", "mean", "mean-removed", "against"])
-def test_other_currents_are_told_by_the_transfer_impedance(tank, measurement):
+def test_voltages_under_other_currents_follow_from_the_transfer_impedance(tank, measurement):
     made = measured(tank, protocol.trigonometric(COUNT, measurement=measurement))
     for other in (protocol.haar(COUNT), protocol.adjacent(COUNT, driven_electrodes=True), protocol.opposite(COUNT)):
-        told = data.driven_by(made, other)
-        np.testing.assert_allclose(told.voltages[0], tank(other, 0.3), rtol=0, atol=1e-10 * np.abs(told.voltages).max())
-        assert told.protocol is other
+        converted = data.driven_by(made, other)
+        np.testing.assert_allclose(
+            converted.voltages[0], tank(other, 0.3), rtol=0, atol=1e-10 * np.abs(converted.voltages).max()
+        )
+        assert converted.protocol is other
 
 
-def test_what_is_not_measured_is_not_told(tank):
+def test_an_undetermined_transfer_impedance_is_refused(tank):
     with pytest.raises(ValueError, match="leave the transfer impedance open"):
         data.transfer_impedance(measured(tank, protocol.adjacent(COUNT)))
     with pytest.raises(ValueError, match="both must be of the same body"):
         data.driven_by(measured(tank, protocol.haar(COUNT)), protocol.haar(9))
 
 
-def test_noise_by_reciprocity_of_patterns_on_all_electrodes(tank):
-    """Potentials that each carry noise, less their mean: 15 % for 28 independent differences."""
+def test_noise_from_reciprocity_of_patterns_on_all_electrodes(tank):
+    """Potentials with independent noise, less their mean: 28 independent differences give the noise within 15 %."""
     chosen, noise = protocol.haar(16), 1e-4
     clean = tank(chosen).reshape(-1, 16)
     found = []
@@ -178,17 +184,18 @@ def test_noise_by_reciprocity_of_patterns_on_all_electrodes(tank):
     assert np.mean(found) == pytest.approx(noise, rel=0.1)
 
 
-def test_gains_that_differ_break_reciprocity(tank):
+def test_unequal_gains_break_reciprocity(tank):
     chosen = protocol.haar(16)
     gains = 1 + 0.02 * np.random.default_rng(3).normal(size=16)
-    spoilt = (tank(chosen).reshape(-1, 16) * gains).ravel()
+    uneven = (tank(chosen).reshape(-1, 16) * gains).ravel()
     assert data.reciprocity_error(data.screen(tank(chosen), chosen)) < 1e-12
-    assert data.reciprocity_error(data.screen(spoilt, chosen)) > 5e-3
+    assert data.reciprocity_error(data.screen(uneven, chosen)) > 5e-3
 
 
 @pytest.mark.parametrize("rule", ["noise-figure", "gcv", "discrepancy", "l-curve"])
-def test_potentials_less_their_mean_are_not_counted_twice(rule):
-    """L of them are L - 1 facts: the image, and the hyperparameter, are those of L - 1 orthonormal combinations."""
+def test_potentials_without_their_mean_are_not_counted_twice(rule):
+    """L potentials without their mean hold L - 1 values: image and hyperparameter equal those of L - 1 orthonormal
+    combinations."""
     electrodes = BoundaryElectrodes(ring(0.1, COUNT), 0.02, 0.01)
     redundant = ForwardModel(Disk(0.1).mesh(num_points=300), electrodes, protocol.haar(COUNT))
     rows = np.linalg.svd(protocol.measurement_patterns(COUNT, "mean-removed"))[2][:-1]
@@ -211,14 +218,14 @@ def test_potentials_less_their_mean_are_not_counted_twice(rule):
     np.testing.assert_allclose(images[0], images[1], rtol=0, atol=1e-6 * np.abs(images[1]).max())
 
 
-def test_a_reference_of_other_currents_is_turned_into_those_of_the_frames(tank):
+def test_a_reference_under_other_currents_is_converted_to_those_of_the_frames(tank):
     frame = measured(tank, protocol.haar(COUNT), noise=1e-7)
     other = data.screen(tank(protocol.trigonometric(COUNT)), protocol.trigonometric(COUNT))
     _, base = select_frames(frame, other)
     np.testing.assert_allclose(base.voltages[0], tank(frame.protocol), rtol=0, atol=1e-10 * np.abs(base.voltages).max())
     assert any("turned into what" in note for note in base.notes)
     assert any(note.startswith(f"'{other.name}' was measured with") for note in base.notes)
-    # Not where they do not tell, or only how large they are differs.
+    # Not if the transfer impedance is undetermined, or if only the amplitude of the currents differs.
     for made in (protocol.adjacent(COUNT), protocol.haar(COUNT, current=2e-3)):
         _, base = select_frames(frame, data.screen(tank(made), made))
         assert base.protocol is made

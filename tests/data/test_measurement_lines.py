@@ -1,4 +1,4 @@
-"""Text of loggers and of the CN0565 kit: a line for each measurement, or hexadecimal lines; read as they were made."""
+"""Text files of loggers and of the CN0565 kit, with a line for each measurement or hexadecimal lines."""
 
 import numpy as np
 import pytest
@@ -10,18 +10,18 @@ RING = (
     "clockwise = true\nnumber = "
 )
 FIXED = protocol.adjacent(8, order="fixed")
-# Electrodes, counted from 0, of each channel: current enters and leaves, first less second voltage.
+# Electrodes, counted from 0, of each channel: current source and sink, first and second voltage electrode.
 QUADRUPOLES = [(d, (d + 1) % 8, s, (s + 1) % 8) for d in range(8) for s in range(8) if (s - d) % 8 in range(2, 7)]
 
 
 def hexadecimal(frame, scale=1e5):
-    """A line of the kit: 32-bit two's complement, real and imaginary part in turn."""
+    """A line of the kit: 32-bit two's complement, alternating real and imaginary parts."""
     words = [int(part) & 0xFFFFFFFF for one in np.round(scale * frame) for part in (one.real, one.imag)]
     return "!V " + ",".join(f"{one:08X}" for one in words)
 
 
 def test_lines_of_a_cn0565(tank, tmp_path):
-    """With times before them, answers between them, a lost character, and a last line that is cut off."""
+    """Times before the lines, answers between them, a lost character, and an incomplete last line."""
     frame = tank(FIXED) * (1 + 0.2j)
     line = hexadecimal(frame)
     text = f"OK\n[10:00:01] {line}\r\n!C 0\nOK\n{line[:-30]}{line}\n{line}\n{line[:100]}"
@@ -55,14 +55,14 @@ def test_other_distances_of_a_cn0565_are_described(tank, tmp_path):
     path.with_suffix(".toml").write_text(table + "0\n")
     with pytest.raises(ValueError, match=r"has 40 channels, and a frame of a\.txt 32: with force and sense distance"):
         data.read(path)
-    for text, said in (("!V 1,2,3,4,5,6,7,8,9\n", "9 numbers"), ("V 1\n", "no line begins with '!V'")):
+    for text, message in (("!V 1,2,3,4,5,6,7,8,9\n", "9 numbers"), ("V 1\n", "no line begins with '!V'")):
         path.write_text(text)
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             data.read(path, "cn0565")
 
 
 def rows_of(frames, heading, first=0):
-    """A table of loggers: a line for each measurement, with what the frame and the electrodes are called."""
+    """A table of a logger: a line for each measurement, with the names of frame and electrodes."""
     lines = [heading]
     for number, frame in enumerate(frames):
         for k, ((a, b, m, n), value) in enumerate(zip(QUADRUPOLES, frame, strict=True)):
@@ -72,14 +72,14 @@ def rows_of(frames, heading, first=0):
 
 
 def test_a_logger_of_named_electrodes(tank, tmp_path):
-    """In any order of the lines; a line that is missing is masked, and columns of words are left out."""
+    """Lines in any order: a missing line is masked, and columns of text are ignored."""
     heading = "frame_id,block,k,f_plus_index,s_plus_index,s_minus_index,f_minus_index,real_raw,imag_raw"
     frames = np.stack([tank(FIXED, change) for change in (0, 0.1)]) * (1 + 0.1j)
     text = rows_of(frames, heading)
     (tmp_path / "a.csv").write_text(text)
     (tmp_path / "description.toml").write_text(RING + '8\n[data]\ncomponent = "complex"\n')
     found = data.read(tmp_path / "a.csv")
-    assert found.protocol.same_patterns(FIXED)  # sorted by electrodes, as the kit has them
+    assert found.protocol.same_patterns(FIXED)  # sorted by electrodes, as in the kit's files
     np.testing.assert_allclose(found.voltages, frames, rtol=1e-12)
     first, *lines = text.splitlines()
     shuffled = [lines[k] for k in np.random.default_rng(0).permutation(len(lines)) if k != 7]
@@ -113,7 +113,7 @@ def unified(frame, radius=0.1, current=2.0):
 
 
 def test_the_unified_data_format(tank, tmp_path):
-    """With electrodes where the file places them, in its units."""
+    """Electrodes at the file's positions, in the file's unit."""
     made = protocol.adjacent(8, order="fixed", current=2e-3)
     (tmp_path / "a.ohm").write_text(unified(tank(made)))
     no_places = RING.replace('layout = "ring"\n', "").replace("clockwise = true\nnumber = ", "")
@@ -122,12 +122,12 @@ def test_the_unified_data_format(tank, tmp_path):
     assert found.protocol.same_patterns(made)
     np.testing.assert_allclose(found.voltages[0], tank(made), rtol=1e-8)
     np.testing.assert_allclose(found.electrodes.position[0], [0, 0.1], atol=1e-9)
-    # Resistances, of the reference's current.
+    # Resistances, converted with the reference current.
     ohms = [f"{a + 1} {b + 1} {m + 1} {n + 1} {value / 2e-3}"
             for (a, b, m, n), value in zip(QUADRUPOLES, tank(made), strict=True)]  # fmt: skip
     (tmp_path / "b.dat").write_text("# a b m n r/Ohm\n" + "\n".join(ohms))
     np.testing.assert_allclose(data.read(tmp_path / "b.dat", like=found).voltages[0], tank(made), rtol=1e-8)
-    # Apparent resistivities with their factors.
+    # Apparent resistivities with their geometric factors.
     (tmp_path / "c.dat").write_text(
         "# a b m n k rhoa\n" + "\n".join(f"{' '.join(one.split()[:4])} 2 {2 * float(one.split()[4])}" for one in ohms)
     )
@@ -148,22 +148,22 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_what_is_wrong_in_a_line_is_named(tank, name, tmp_path):
-    old, new, said = FAULTS[name]
+def test_faulty_lines_are_reported(tank, name, tmp_path):
+    old, new, message = FAULTS[name]
     text = unified(tank(FIXED))
     assert old in text
     (tmp_path / "a.ohm").write_text(text.replace(old, new, 1))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         data.read(tmp_path / "a.ohm", "quadrupoles")
 
 
-def test_a_file_of_fewer_lines_than_it_states(tank, tmp_path):
+def test_a_file_with_fewer_lines_than_stated(tank, tmp_path):
     (tmp_path / "a.ohm").write_text(unified(tank(FIXED))[:-60])
     found = data.read(tmp_path / "a.ohm")
     assert any("it states 40 measurements, and holds" in note for note in found.notes)
 
 
-def test_a_table_of_plain_numbers_is_none(tmp_path):
+def test_a_table_of_plain_numbers_is_not_read_as_measurement_lines(tmp_path):
     """A heading of letters alone does not make a line a measurement."""
     (tmp_path / "a.csv").write_text("a,b,c,d\n" + "\n".join(",".join(["1.5"] * 4) for _ in range(10)))
     with pytest.raises(ValueError, match="nothing says what they mean"):

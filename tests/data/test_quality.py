@@ -1,4 +1,4 @@
-"""Screening and judging: what is masked, what noise is found, which frames are refused."""
+"""Quality checks: masked channels, estimated noise, and refused frames."""
 
 import jax
 import numpy as np
@@ -24,13 +24,13 @@ def test_missing_saturated_and_dead_channels_are_masked_and_noted(tank, setup):
     np.testing.assert_array_equal(np.flatnonzero(~mask), np.sort([3, 50, *stuck, *np.flatnonzero(dead)]))
     for expected in ("2 of 208 voltages masked: NaN", "8 of 208 voltages masked: saturated", "current did not flow"):
         assert any(expected in note for note in measurement.notes)
-    # Masked channels have no say in the sums.
+    # Masked channels do not contribute to the sums.
     assert data.reciprocity_error(measurement) < 5e-3
     np.testing.assert_array_equal(measurement.filled()[0, ~mask], 0)
 
 
 @pytest.mark.parametrize(("patterns", "named"), [(protocol.adjacent, "5"), (protocol.opposite, "5, 13")])
-def test_channels_that_read_an_electrode_without_current_are_masked_and_it_is_named(tank, patterns, named):
+def test_channels_that_read_an_electrode_without_current_are_masked_and_noted(tank, patterns, named):
     chosen = patterns(16)
     voltages, drives, reads = tank(chosen), np.asarray(chosen.channel_drive)[:, 4], chosen.channel_measurement
     voltages[drives != 0] *= 1e-6
@@ -43,7 +43,7 @@ def test_channels_that_read_an_electrode_without_current_are_masked_and_it_is_na
     assert any(f"they read electrode {named}, through which" in note for note in measurement.notes)
 
 
-def test_channels_that_read_an_electrode_are_kept_where_one_of_its_drives_flows(tank):
+def test_channels_of_an_electrode_are_kept_if_one_of_its_drives_carries_current(tank):
     chosen = protocol.adjacent(16)
     voltages = tank(chosen)
     dead = np.asarray(chosen.drive_index) == 12
@@ -51,7 +51,7 @@ def test_channels_that_read_an_electrode_are_kept_where_one_of_its_drives_flows(
     np.testing.assert_array_equal(np.asarray(data.screen(voltages, chosen).mask)[0], ~dead)
 
 
-def test_a_given_limit_masks_what_reaches_it(tank):
+def test_a_given_limit_masks_saturated_channels(tank):
     chosen = protocol.adjacent(16)
     voltages = tank(chosen)
     limit = 0.3 * np.abs(voltages).max()
@@ -72,7 +72,7 @@ def test_an_all_zero_frame_among_others_is_masked(tank):
 
 
 @pytest.mark.parametrize("chosen", [protocol.adjacent(16), protocol.skip(16, 2, measurement_skipped=0)])
-def test_noise_is_found_from_reciprocity(tank, chosen):
+def test_noise_is_estimated_from_reciprocity(tank, chosen):
     if chosen.name.startswith("skip"):  # spanned by neighbours only with the driven electrodes
         chosen = protocol.skip(16, 2, measurement_skipped=0, driven_electrodes=True)
     clean, deviation = tank(chosen), 1e-5
@@ -86,7 +86,7 @@ def test_noise_is_found_from_reciprocity(tank, chosen):
     assert data.reciprocity_error(data.screen(clean, chosen)) < 1e-12
 
 
-def test_noise_is_found_from_repeated_frames(tank):
+def test_noise_is_estimated_from_repeated_frames(tank):
     chosen = protocol.opposite(16)
     noisy = tank(chosen) + 1e-5 * np.random.default_rng(4).normal(size=(20, 96))
     estimate = data.estimate_noise(data.screen(noisy, chosen))
@@ -96,7 +96,7 @@ def test_noise_is_found_from_repeated_frames(tank):
     assert data.estimate_noise(data.screen(noisy[:2], chosen)) is None
 
 
-def test_channel_reciprocity_error_finds_the_channel(tank):
+def test_channel_reciprocity_error_locates_the_channel(tank):
     chosen = protocol.adjacent(16)
     voltages = tank(chosen)
     voltages[17] *= 1.5
@@ -112,7 +112,7 @@ def test_channel_reciprocity_error_finds_the_channel(tank):
         (protocol.adjacent(16, driven_electrodes=True), True),
         (protocol.opposite(16, driven_electrodes=True), True),
         (protocol.two_terminal(7), True),
-        # Pairs on different sides of the driven ones: their sign depends on the body.
+        # Pairs on different sides of the driven pair: their sign depends on the body.
         (protocol.skip(15, 3, measurement_skipped=1), False),
         (protocol.all_against_one(12), True),
     ],
@@ -156,8 +156,8 @@ def test_noise_in_the_difference_is_refused(tank, setup):
 
 
 @pytest.mark.parametrize("patterns", [protocol.adjacent, protocol.haar])
-def test_the_opposite_sign_is_refused_where_no_edge_tells_it(tank, patterns):
-    """Of solids no sign is known from the protocol; imaged, the change is twice all voltages."""
+def test_the_opposite_sign_is_refused_where_the_protocol_implies_no_sign(tank, patterns):
+    """In solids the protocol implies no sign. If imaged, the change would be twice the voltages."""
     chosen = patterns(16)
     reference = data.screen(tank(chosen), chosen)
     data.check_imageable(data.screen(tank(chosen, change=0.5), chosen), reference)
@@ -165,8 +165,8 @@ def test_the_opposite_sign_is_refused_where_no_edge_tells_it(tank, patterns):
         data.check_imageable(data.screen(-tank(chosen, change=0.5), chosen), reference)
 
 
-def test_currents_that_tell_a_body_best_are_not_taken_for_noise(tank, setup):
-    """Optimal currents make the change diagonal: off the diagonal, which reciprocity compares, is nothing but noise."""
+def test_optimal_currents_are_not_taken_for_noise(tank, setup):
+    """Optimal currents diagonalise the change: reciprocity compares off-diagonal values, which are pure noise here."""
     full = protocol.haar(16)
     empty = data.transfer_impedance(data.screen(tank(full), full))[0]
     touched = empty + 1e-5 * empty @ np.diag(np.arange(16.0)) @ empty
@@ -181,8 +181,9 @@ def test_currents_that_tell_a_body_best_are_not_taken_for_noise(tank, setup):
         data.check_imageable(data.screen(clean + 10 * noise[1], best, **setup(16)), reference)
 
 
-def test_large_voltages_of_driven_electrodes_do_not_pass_for_noise(tank, setup):
-    """One per cent of what is read on driven electrodes, mostly contact, is more than what other channels change by."""
+def test_large_voltages_of_driven_electrodes_are_not_taken_for_noise(tank, setup):
+    """One per cent of the voltages on driven electrodes, mostly of contacts, exceeds the change of the other
+    channels."""
     chosen = protocol.adjacent(16, driven_electrodes=True)
     shared = (np.asarray(chosen.channel_drive) * np.asarray(chosen.channel_measurement)).sum(axis=1)
     contact = 30 * np.abs(tank(chosen)).max() * shared / np.abs(shared).max()
@@ -201,7 +202,7 @@ def test_too_few_channels_are_refused(tank, setup):
         data.check_imageable(data.screen(1.1 * tank(chosen), chosen, mask=np.arange(208) < 9), reference)
 
 
-def test_a_reference_whose_channels_are_in_another_order_is_named(tank, setup):
+def test_a_reference_with_channels_in_another_order_is_named(tank, setup):
     chosen = protocol.adjacent(16)
     clean = tank(chosen)
     rolled = np.roll(clean.reshape(16, 13), 3, axis=1).ravel()
@@ -257,7 +258,7 @@ def rounded(voltages, digits):
 
 
 @pytest.mark.parametrize("to", ["digits", "step", "single precision"])
-def test_the_deviation_of_rounding_is_that_of_the_rounded_voltages(to):
+def test_rounding_deviation_is_that_of_the_rounded_voltages(to):
     rng = np.random.default_rng(0)
     voltages = 1e-3 * rng.lognormal(size=208) * rng.choice([-1, 1], 208)
     seen = 1.7e-5 * np.round(voltages / 1.7e-5) if to == "step" else rounded(voltages, 3)
@@ -277,16 +278,16 @@ def test_masked_voltages_do_not_hide_rounding():
 @pytest.mark.parametrize("driven", [False, True])
 @pytest.mark.parametrize("size", [1, 30])
 def test_spikes_in_single_channels_are_masked_and_named(driven, size, tank, setup):
-    """As large as the largest change, and far larger; with fill, they are what reciprocity says."""
+    """Spikes as large as the largest change, and far larger; `fill` replaces them by the values from reciprocity."""
     chosen, rng = protocol.adjacent(16, driven_electrodes=driven), np.random.default_rng(0)
     empty = data.screen(tank(chosen), chosen, **setup(16))
     noise = 1e-4 * np.abs(tank(chosen)) * rng.normal(size=(3, chosen.num_measurements))
-    sound = data.screen(tank(chosen, 0.05) + noise, chosen, **setup(16))
-    assert mask_spikes(sound, empty) is sound
-    spoilt, each = np.array(sound.voltages), np.asarray(relative_noise(np.abs(tank(chosen))))
+    valid = data.screen(tank(chosen, 0.05) + noise, chosen, **setup(16))
+    assert mask_spikes(valid, empty) is valid
+    disturbed, each = np.array(valid.voltages), np.asarray(relative_noise(np.abs(tank(chosen))))
     largest = np.abs((tank(chosen, 0.05) - tank(chosen)) / each).max()
-    spoilt[1, [17, 100]] += size * largest * each[[17, 100]] * [1, -1]
-    spiky = data.screen(spoilt, chosen, **setup(16))
+    disturbed[1, [17, 100]] += size * largest * each[[17, 100]] * [1, -1]
+    spiky = data.screen(disturbed, chosen, **setup(16))
     found = mask_spikes(spiky, empty)
     assert {(1, 17), (1, 100)} <= {*map(tuple, np.argwhere(~np.asarray(found.mask)).tolist())}
     assert (~np.asarray(found.mask)).sum() <= 3
@@ -294,12 +295,13 @@ def test_spikes_in_single_channels_are_masked_and_named(driven, size, tank, setu
     if size > 1:
         filled = mask_spikes(spiky, empty, fill=True)
         assert np.asarray(filled.mask).all()
-        np.testing.assert_allclose(filled.voltages[1, [17, 100]], sound.voltages[1, [17, 100]], rtol=2e-3)
+        np.testing.assert_allclose(filled.voltages[1, [17, 100]], valid.voltages[1, [17, 100]], rtol=2e-3)
         assert filled.notes[-1].startswith("2 voltages replaced by what others determine")
 
 
-def test_a_channel_that_is_off_by_less_than_channels_change_is_kept(tank, setup):
-    """However precise the others are: an image takes it for noise."""
+def test_small_errors_of_a_channel_are_kept(tank, setup):
+    """An error smaller than the typical change is kept, however precise the other channels are: an image treats it as
+    noise."""
     chosen = protocol.adjacent(16)
     empty = data.screen(tank(chosen), chosen, **setup(16))
     touched = tank(chosen, 0.05)

@@ -1,4 +1,4 @@
-"""The readers on files written here, so that they are tested where no measured data are."""
+"""The readers on files written here, which need no measured data."""
 
 import json
 from dataclasses import replace
@@ -183,8 +183,8 @@ def test_round_trip(tmp_path, tank, setup):
     assert again.notes[0] == "ein „Test“."
 
 
-def test_what_is_written_describes_other_tables(tmp_path, tank, setup):
-    """Of a protocol in no order that a constructor makes, and of other frames than those that were named."""
+def test_written_descriptions_apply_to_other_tables(tmp_path, tank, setup):
+    """A protocol in an order that no constructor makes, and frames other than the named ones."""
     chosen = protocol.adjacent(8, current=1e-3).subset(np.random.default_rng(0).permutation(40)[:33])
     frames = np.stack([tank(chosen), 1.2 * tank(chosen), 1.3 * tank(chosen)])
     frames[0, 3] = np.nan
@@ -200,8 +200,8 @@ def test_what_is_written_describes_other_tables(tmp_path, tank, setup):
 
 
 @pytest.mark.parametrize("given", ["npz", "table in millivolts", "nothing but itself"])
-def test_a_table_borrows_the_description_of_another_measurement(given, tmp_path, tank, setup):
-    """What is said of the reference holds for frames of the same sensor; of its units too, if it is a table."""
+def test_a_table_uses_the_description_of_another_measurement(given, tmp_path, tank, setup):
+    """The description of the reference applies to frames of the same sensor; its units too, if it is a table."""
     chosen = protocol.adjacent(8, current=1e-3)
     rest, scale = tank(chosen), 1.0
     reference = data.screen(rest, chosen, frame_names=("empty",), **setup(8))
@@ -224,7 +224,7 @@ def test_a_table_borrows_the_description_of_another_measurement(given, tmp_path,
     assert found.frame_names == ()
     assert any("described as" in note for note in found.notes)
     (tmp_path / "live.toml").write_text(DESCRIPTION + '[data]\ndelimiter = "x"\n', "utf-8")
-    with pytest.raises(ValueError, match="delimiter"):  # its own description goes before
+    with pytest.raises(ValueError, match="delimiter"):  # its own description takes precedence
         data.read(tmp_path / "live.csv", like=reference)
 
 
@@ -247,7 +247,7 @@ def test_round_trip_of_other_shapes(tmp_path, tank, shape):
 
 
 def test_times_are_kept(tmp_path, tank, setup):
-    """By selections, and by what is written; an average has none."""
+    """Selections and written files keep times; an average has none."""
     chosen = protocol.adjacent(8)
     times = np.array([0.0, 0.02, 0.04, 0.07])
     made = replace(data.screen(np.stack([k * tank(chosen) for k in range(1, 5)]), chosen, **setup(8)), times=times)
@@ -275,7 +275,7 @@ def test_bad_times(tank, times, message):
 
 
 @pytest.mark.parametrize("which", [[], [2, 1], [0, 3], [0.5], np.ones(4, bool), slice(3, None)])
-def test_frames_that_are_not_there(tank, which):
+def test_frames_that_do_not_exist(tank, which):
     chosen = protocol.adjacent(8)
     with pytest.raises(ValueError, match="which: "):
         data.screen(np.stack([tank(chosen)] * 3), chosen).frames(which)

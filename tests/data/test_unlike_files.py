@@ -1,4 +1,4 @@
-"""Voltages in files as people write them: read the same from each, or a question that names what is undecided."""
+"""Voltages in text files of many kinds: each is read alike, or an error names what is undecided."""
 
 from itertools import product
 
@@ -81,7 +81,7 @@ VARIANTS = [
 
 
 @pytest.mark.parametrize("way", VARIANTS, ids=str)
-def test_text_however_it_is_written(way, frames, tmp_path):
+def test_text_formats_are_read_alike(way, frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     found = read(written(tmp_path / "a.txt", values, **way))
     np.testing.assert_allclose(found.voltages, values, rtol=1e-8)
@@ -92,7 +92,7 @@ def test_text_however_it_is_written(way, frames, tmp_path):
 @pytest.mark.parametrize(
     ("driven", "order", "reciprocal"), [*product((False, True), ("rotating", "fixed"), ("all", "half"))]
 )
-def test_channels_that_no_description_states(driven, order, reciprocal, frames, tmp_path):
+def test_channel_orders_without_a_description(driven, order, reciprocal, frames, tmp_path):
     """Half of the channels have no reciprocal ones, so that their order must be stated."""
     values, protocol = voltages_of(frames, driven, order, reciprocal)
     stated = f'order = "{order}"' if reciprocal == "half" else ""
@@ -107,7 +107,7 @@ CHANGES = [("reversed", False), *product(("magnitudes", "zeros"), (False, True))
 
 
 @pytest.mark.parametrize(("change", "driven"), CHANGES)
-def test_signs_that_no_description_states(change, driven, frames, tmp_path):
+def test_signs_without_a_description(change, driven, frames, tmp_path):
     values, protocol = voltages_of(frames, driven, "rotating", "all")
     own = (np.asarray(protocol.channel_drive) != 0) & (np.asarray(protocol.channel_measurement) != 0)
     zero = own.any(axis=1) & (change == "zeros")
@@ -143,7 +143,7 @@ def test_plain_arrays(unit, turned, frames, tmp_path):
     np.testing.assert_allclose(data.read(tmp_path / "b.npz", key="frames").voltages, values, rtol=1e-8)
 
 
-def test_two_arrays_that_fit_are_a_question(frames, tmp_path):
+def test_two_matching_arrays_are_ambiguous(frames, tmp_path):
     values, _ = voltages_of(frames, True, "fixed", "all")
     scipy.io.savemat(tmp_path / "a.mat", {"first": values.T, "second": values[:1].T})
     with pytest.raises(ValueError, match=r"first \(64 × 3\), second \(64 × 1\). Name the array of frames by key="):
@@ -151,8 +151,8 @@ def test_two_arrays_that_fit_are_a_question(frames, tmp_path):
     assert data.read(tmp_path / "a.mat", key="second").num_frames == 1
 
 
-def test_the_frames_are_taken_as_their_reference(frames, tmp_path):
-    """An order that noise hides in one frame is that of the reference."""
+def test_frames_are_read_in_the_order_of_their_reference(frames, tmp_path):
+    """Noise hides the order in a single frame; that of the reference is used."""
     values, _ = voltages_of(frames, True, "fixed", "all")
     reference = read(written(tmp_path / "reference.csv", -values))
     noisy = -values + 2 * np.random.default_rng(1).normal(size=values.shape) * np.abs(values).min()
@@ -160,7 +160,7 @@ def test_the_frames_are_taken_as_their_reference(frames, tmp_path):
     assert found.protocol.same_patterns(reference.protocol)
 
 
-def test_a_last_line_that_is_cut_off_is_left_out(frames, tmp_path):
+def test_an_incomplete_last_line_is_left_out(frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     for wrap, cut in ((0, -30), (10, -20), (10, -70)):
         path = written(tmp_path / "a.txt", values, wrap=wrap)
@@ -170,7 +170,7 @@ def test_a_last_line_that_is_cut_off_is_left_out(frames, tmp_path):
         assert any("cut off" in note for note in found.notes)
 
 
-def test_as_spreadsheets_write_it(frames, tmp_path):
+def test_spreadsheet_exports(frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     rows = [";".join(f'"{one:.9e}"'.replace(".", ",") for one in frame) for frame in values]
     (tmp_path / "a.txt").write_text("\r\n".join(rows) + "\r\n", "utf-16")
@@ -184,29 +184,29 @@ def test_times_in_the_unit_of_their_heading(frames, tmp_path):
     np.testing.assert_allclose(read(path).times, [1, 1.05, 1.1])
 
 
-def test_a_first_channel_that_rises_is_no_time():
-    """Where frames of as many numbers are described, though others have one fewer."""
+def test_a_rising_first_channel_is_not_taken_for_times():
+    """The description matches the number of columns; another one would match one column fewer."""
     table = np.column_stack([[1.0, 2.5, 4.0], np.ones((3, 4))])
     found = frames_in_table(table, [5, 4], TableLayout())
     assert found.times is None
     np.testing.assert_array_equal(found.table, table)
 
 
-def test_whole_numbers_of_an_unknown_unit_are_no_times(frames, tmp_path):
+def test_whole_numbers_in_an_unknown_unit_are_not_taken_for_times(frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     found = read(written(tmp_path / "a.csv", values, times=[1000, 1050, 1100]))
     assert found.times is None
     assert any("rises by 50; its unit is not known" in note for note in found.notes)
 
 
-def test_a_number_that_may_be_cut_off_is_noted(frames, tmp_path):
+def test_a_possibly_truncated_number_is_noted(frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     path = written(tmp_path / "a.csv", values)
     path.write_text(path.read_text("utf-8")[:-8])
     assert any("is it cut off?" in note for note in read(path).notes)
 
 
-def test_a_column_too_many_and_an_array_of_no_file(frames, tmp_path):
+def test_one_column_too_many_and_an_array_without_a_file(frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     with pytest.raises(ValueError, match="There are 2 too many: are there times, counters or states"):
         read(written(tmp_path / "a.csv", np.column_stack([values, np.ones((3, 2))])))
@@ -216,7 +216,7 @@ def test_a_column_too_many_and_an_array_of_no_file(frames, tmp_path):
 
 @pytest.mark.parametrize("last", ["END", "1.5,2.5,x: 3"])
 def test_words_after_the_numbers_are_refused(last, frames, tmp_path):
-    """A word is left out before the numbers of a line, and nowhere else."""
+    """A word is ignored before the numbers of a line, and nowhere else."""
     values, _ = voltages_of(frames, False, "rotating", "all")
     path = written(tmp_path / "a.csv", values)
     path.write_text(path.read_text("utf-8") + last + "\n", "utf-8")
@@ -225,7 +225,7 @@ def test_words_after_the_numbers_are_refused(last, frames, tmp_path):
 
 
 def test_a_protocol_without_reciprocal_channels_stays_as_described(frames):
-    """Nothing speaks against it, whatever another one of as many channels breaks."""
+    """Nothing contradicts it, even if another protocol with the same number of channels breaks reciprocity."""
     values, described = voltages_of(frames, False, "rotating", "half")
     other = adjacent(8, order="fixed").subset(np.arange(20))
     random = np.random.default_rng(0).normal(size=values.shape)
@@ -233,7 +233,8 @@ def test_a_protocol_without_reciprocal_channels_stays_as_described(frames):
 
 
 def test_a_frame_has_the_sign_of_its_reference(frames, tmp_path):
-    """Also where the frame alone has voltages of one sign, and the reference, for its noise, has not."""
+    """This holds even if the frame alone has voltages of one sign while the reference, because of its noise, has
+    not."""
     values, _ = voltages_of(frames, False, "rotating", "all")
     reference = read(written(tmp_path / "reference.csv", -values[:1]), 'polarity = "normal"')
     written(tmp_path / "frame.csv", -values[1:])
@@ -258,7 +259,7 @@ SPOILED = {
 
 
 @pytest.mark.parametrize("how", SPOILED)
-def test_what_cannot_be_read_is_refused(how, frames, tmp_path):
+def test_unreadable_files_are_refused(how, frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     rows = written(tmp_path / "a.csv", values).read_text("utf-8").splitlines()
     (tmp_path / "a.csv").write_text("\n".join(SPOILED[how](rows)), "utf-8")
@@ -278,7 +279,7 @@ def test_hyphens_and_underscores_are_alike():
 
 @pytest.mark.parametrize("form", ["({:.9e}{:+.9e}j)", "{:.9e}{:+.9e}i", "({:.9e}+{:.9e}j)"])
 def test_complex_numbers_in_text(form, frames, tmp_path):
-    """As NumPy, MATLAB and older NumPy write them."""
+    """In the notations of NumPy, MATLAB and older NumPy."""
     values, _ = voltages_of(frames, False, "rotating", "all")
     (tmp_path / "a.txt").write_text("\n".join(" ".join(form.format(v, -0.1 * v) for v in frame) for frame in values))
     found = read(tmp_path / "a.txt", 'component = "complex"')
@@ -286,7 +287,7 @@ def test_complex_numbers_in_text(form, frames, tmp_path):
     np.testing.assert_allclose(read(tmp_path / "a.txt").voltages, values, rtol=1e-8)
 
 
-def test_arrays_as_they_are_printed(frames, tmp_path):
+def test_printed_arrays(frames, tmp_path):
     values, _ = voltages_of(frames, False, "rotating", "all")
     for text in (str(values.tolist()).replace("], ", "],\n"), "\n".join(map(str, values.tolist()))):
         (tmp_path / "a.txt").write_text(text)
@@ -297,8 +298,8 @@ def test_arrays_as_they_are_printed(frames, tmp_path):
 
 
 @pytest.mark.parametrize(("index", "first"), [(True, 0), (False, 0), (False, 1)])
-def test_a_first_line_that_numbers_the_columns_is_no_frame(index, first, frames, tmp_path):
-    """As data frames are saved, with and without their index."""
+def test_a_first_line_of_column_numbers_is_no_frame(index, first, frames, tmp_path):
+    """Data frames written with and without their index."""
     values, _ = voltages_of(frames, False, "rotating", "all")
     lines = [("," if index else "") + ",".join(str(first + k) for k in range(values.shape[1]))]
     lines += [(f"{k}," if index else "") + ",".join(map(repr, frame.tolist())) for k, frame in enumerate(values)]
@@ -315,7 +316,7 @@ def test_json_is_named(frames, tmp_path):
 
 
 def test_titles_between_frames(frames, tmp_path):
-    """As the one at the start, apart from the number; any other word is refused."""
+    """A title like the first one, apart from its number, is accepted; any other word is refused."""
     values, _ = voltages_of(frames, True, "fixed", "all")
     blocks = [
         f"Frame {k}\n" + "\n".join(",".join(f"{v:.9e}" for v in row) for row in frame.reshape(8, 8)) + "\n"

@@ -1,4 +1,4 @@
-"""Contact integrals: exact where they claim to be, convergent elsewhere, differentiable everywhere."""
+"""Contact integrals: exact where stated, convergent elsewhere, differentiable everywhere."""
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ ROUNDING = 1e-12
 
 
 def strip():
-    """A 4 × 1 strip of unit squares, each cut in two: every integral can be done by hand."""
+    """A 4 × 1 strip of unit squares, each divided into two triangles: every integral can be computed by hand."""
     x, y = np.meshgrid(np.arange(5.0), np.arange(2.0))
     points = np.stack([x.ravel(), y.ravel()], axis=1)
     lower = np.arange(4)
@@ -72,7 +72,7 @@ def test_arc_on_whole_edges_equals_facet_electrode():
     lengths = np.asarray(facet_measures(mesh))[3:5]
     arc = BoundaryElectrodes([middle], lengths.sum(), 0.3).contact(mesh)
     exact = FacetElectrodes(mesh, [[3, 4]], 0.3).contact(mesh)
-    # On a circle of equal edges the shared node is the middle of the two.
+    # On a circle of equal edges the shared node is the middle of both edges.
     np.testing.assert_allclose(arc.load, exact.load, atol=1e-9 * float(exact.load.max()))
     np.testing.assert_allclose(
         mass_matrix(arc, mesh.num_points), mass_matrix(exact, mesh.num_points), atol=1e-9 * float(exact.load.max())
@@ -96,22 +96,22 @@ def test_mass_and_load_add_up_to_area_over_impedance(electrodes, mesh, area):
     electrodes = electrodes(mesh)
     contact = electrodes.contact(mesh)
     per_electrode = np.asarray(contact.load).sum(axis=0)
-    # Arcs are exact; windows smear the edge over half a cell, patches bend round the wall.
+    # Arcs are exact; windows smear the edge over half a cell, and patches bend round the wall.
     tolerance = ROUNDING if isinstance(electrodes, BoundaryElectrodes) else 0.03
     np.testing.assert_allclose(per_electrode, area / 3.0, rtol=tolerance)
     total = sum(np.asarray(mass).sum() for mass in contact.mass)
     assert total == pytest.approx(per_electrode.sum(), rel=1e-12)
 
 
-# Discs and patches on faces: tests/electrodes/test_curved_faces.py. What is combined is made of its parts.
+# Discs and patches on faces are tested in test_curved_faces.py. Combined electrodes consist of these kinds.
 SLOW = ("face discs", "patches", "combined")
 
 
 @pytest.mark.parametrize(
     "kind", ["arcs", "sheet discs", "points", *(pytest.param(kind, marks=pytest.mark.slow) for kind in SLOW)]
 )
-def test_contact_of_values_equals_that_of_traced_arrays(kind):
-    """NumPy works out the one, and JAX the other; what is asked of JAX's arrays is JAX's."""
+def test_contact_of_known_arrays_equals_that_of_traced_arrays(kind):
+    """NumPy computes the one and JAX the other. Results for arrays of JAX are arrays of JAX."""
     mesh = box(0.06, 0.06, 0.01, num_points=300) if kind in ("face discs", "patches") else disk(0.05, num_points=200)
     electrodes = {
         "arcs": lambda: BoundaryElectrodes(ring(0.05, 4), 0.02, [1.0, 2.0, 3.0, 4.0]),
@@ -195,7 +195,7 @@ def test_combined_electrodes_keep_their_order_and_impedances():
 
 
 def test_position_gradient_where_an_electrode_slides_over_corners():
-    """Of a disk's polygon: the middle of an electrode often is a node (offset zero)."""
+    """On a disk's polygonal boundary, the middle of an electrode is often a node (offset zero)."""
     mesh, random = disk(0.1, num_points=100), np.random.default_rng(1)
     weight, direction = random.normal(size=(mesh.num_points, 4)), random.normal(size=(4, 2))
 
@@ -213,7 +213,7 @@ def test_position_gradient_where_an_electrode_slides_over_corners():
 
 
 @pytest.mark.slow
-def test_single_precision_is_enough_to_make_a_model():
+def test_single_precision_suffices_for_a_model():
     """Rounding in the covered length must not be taken for an electrode wider than the boundary."""
     with jax.enable_x64(False):
         mesh = disk(0.05, num_points=400)
@@ -227,8 +227,8 @@ def test_single_precision_is_enough_to_make_a_model():
 
 
 @pytest.mark.parametrize("kind", ["sheet", "face"])
-def test_electrodes_that_share_a_cell_are_all_seen(kind):
-    """Twelve discs a fifth of a millimetre apart, on cells as large as they are: as each of them alone."""
+def test_electrodes_that_share_a_cell_all_contribute(kind):
+    """Twelve discs, a fifth of a millimetre apart, on cells as large as themselves: each as if it were alone."""
     mesh = rectangle(0.06, 0.06, cell_size=5e-3)
     places = grid(3 * 6.2e-3, 2 * 6.2e-3, 4, 3)
     if kind == "face":
@@ -243,7 +243,7 @@ def test_electrodes_that_share_a_cell_are_all_seen(kind):
 
 
 @pytest.mark.parametrize("number", [2, 9])
-def test_discs_that_lie_over_each_other_are_named(number):
-    """Also where so many share an area that one seems to lie off the mesh."""
+def test_overlapping_discs_are_named(number):
+    """Even if so many share an area that one seems to lie off the mesh."""
     with pytest.raises(ValueError, match=r"Electrodes 1 and 2 overlap by 0\.006 m"):
         SheetDiscs(np.zeros((number, 2)), 3e-3, 1e-3).check(rectangle(0.06, 0.06, cell_size=2e-3))

@@ -1,4 +1,5 @@
-"""Discs and patches on the curved faces of shells: areas, places, derivatives, and what is on the other side."""
+"""Discs and patches on the curved faces of shells: areas, positions, derivatives, and separation from the other
+face."""
 
 import jax
 import numpy as np
@@ -20,7 +21,7 @@ def spot(radius=RADIUS, height=HEIGHT):
 
 
 def disc_area(radius):
-    """Of what a ball cuts out of the cylinder: |z| < √(r² − 4R² sin²(θ/2)), by Gauss's rule in θ = α sin(πx/2)."""
+    """Area that a ball cuts out of a cylinder, |z| < √(r² − 4R² sin²(θ/2)), by Gauss quadrature in θ = α sin(πx/2)."""
     x, weight = np.polynomial.legendre.leggauss(200)
     widest = 2 * np.arcsin(radius / (2 * RADIUS))
     angle = widest * np.sin(np.pi * x / 2)
@@ -30,21 +31,21 @@ def disc_area(radius):
 
 @pytest.mark.parametrize("ratio", [pytest.param(0.2, marks=pytest.mark.slow), 0.6])
 def test_areas_of_discs_converge(ratio):
-    """Small against the radius of the cylinder, and not so small."""
+    """Discs that are small against the radius of the cylinder, and larger ones."""
     radius, errors = ratio * RADIUS, []
     for cell_size in (0.008, 0.004, 0.002):
         height = 2.4 * radius
         contact = FaceDiscs([spot(height=height)], radius, 1.0).contact(skin(cell_size, height))
         errors.append(abs(float(contact.load.sum()) / disc_area(radius) - 1))
     assert errors[0] < 1e-3
-    assert errors[2] < errors[0] / 4  # of the order of the square of the cell size, or better
+    assert errors[2] < errors[0] / 4  # at least of the order of the square of the cell size
     assert errors[2] < 5e-5
-    # Against a flat disc: how much larger it is across, (r / R)² / 24, and the half of that.
+    # Relative to a flat disc the area is larger by (r / R)² / 24, or half of that.
     assert disc_area(radius) / (np.pi * radius**2) == pytest.approx(1 + ratio**2 / 32, abs=ratio**4 / 50)
 
 
 def test_areas_of_patches_converge():
-    """A plate 30 mm long round the cylinder, seen along its normal."""
+    """A plate 30 mm long round the cylinder, projected along its normal."""
     arc, errors = 0.03, []
     width = 2 * RADIUS * np.sin(arc / (2 * RADIUS))
     for cell_size in (0.008, 0.004, 0.002):
@@ -55,7 +56,7 @@ def test_areas_of_patches_converge():
 
 
 @pytest.mark.parametrize("ratio", [0.2, 0.95])
-def test_none_reaches_through_to_the_other_face(ratio):
+def test_no_disc_reaches_the_other_face(ratio):
     """Discs of up to twelve times the thickness."""
     mesh = skin(0.005, 2.2 * RADIUS)
     inner = np.unique(np.asarray(mesh.facets)[np.asarray(mesh.tags["inner"])])
@@ -70,7 +71,7 @@ def test_none_reaches_through_to_the_other_face(ratio):
 
 
 @pytest.mark.parametrize("kind", ["disc", "patch"])
-def test_places_along_the_surface_by_taylor(kind):
+def test_position_derivatives_by_taylor(kind):
     mesh = skin(0.005, 0.04)
     along = np.array([-np.sin(ANGLE), np.cos(ANGLE), 0.6])
 
@@ -86,11 +87,11 @@ def test_places_along_the_surface_by_taylor(kind):
     rest = [np.abs(np.asarray(moment(step)[0]) - base - step * slope).max() for step in (0.2, 0.1, 0.05)]
     assert rest[0] / rest[1] == pytest.approx(4, rel=0.3)
     assert rest[1] / rest[2] == pytest.approx(4, rel=0.3)
-    # What is moved follows: the middle of what it covers moves as it does, but for what the cells leave of it.
+    # The middle of the covered area moves with the electrode, up to the resolution of the cells.
     np.testing.assert_allclose(slope, 1e-3 * along, atol=1.5e-4)
 
 
-def test_a_batch_in_compiled_code_is_what_numpy_finds_one_by_one():
+def test_a_compiled_batch_equals_numpy():
     mesh = skin(0.008, 0.05)
     radii = np.array([0.008, 0.012, 0.02])
 

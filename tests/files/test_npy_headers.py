@@ -1,4 +1,4 @@
-"""NPY files whose header asks for what no array has are refused, with the reason."""
+"""NPY files whose header is inconsistent are refused, with the reason."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from jeit.files import npy_array
 
 
 def written(path, version, header):
-    """An NPY file of this format and header, without numbers."""
+    """Write an NPY file of this format and header, without data."""
     text = (header + "\n").encode()
     size = len(text).to_bytes(2 if version == (1, 0) else 4, "little")
     path.write_bytes(np.lib.format.magic(*version) + size + text)

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and what is left of processes that were killed."""
+"""Files are written completely or not at all, and remains of killed processes are removed."""
 
 import os
 import subprocess
@@ -17,7 +17,7 @@ with whole_files(Path(sys.argv[1])) as made, written_whole(Path(sys.argv[1]) / "
 """
 
 
-def test_what_a_killed_process_left_is_cleared_by_the_next(tmp_path):
+def test_remains_of_a_killed_process_are_removed_by_the_next(tmp_path):
     (tmp_path / "one").write_text("before")
     subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False)
     assert (tmp_path / "one").read_text() == "before"
@@ -34,7 +34,7 @@ def test_what_a_killed_process_left_is_cleared_by_the_next(tmp_path):
     assert (tmp_path / "one").read_text() == "after"
 
 
-def test_a_file_in_the_making_is_not_cleared_by_another(tmp_path):
+def test_a_file_being_written_is_not_removed_by_another_process(tmp_path):
     with whole_files(tmp_path) as made:
         (made / "two").write_text("two")
         with written_whole(tmp_path / "one") as file:

@@ -1,4 +1,4 @@
-"""Files that a person writes, each key of them replaced, left out and added: read, or one sentence that names a key."""
+"""Hand-written files with keys replaced, removed and added: each is read, or one sentence names the faulty key."""
 
 import copy
 import datetime
@@ -170,7 +170,7 @@ CURVED = PLANE | {
     ],
 }
 
-# What a person may write, and what somebody may who means no good.
+# Values that users may write by mistake, and values that an attacker may write.
 NUMBERS = [0, 1, 2, 3, -1, 7, 1000, 10**6, 2**63, 10**400, -(10**400), b"ff" * 2500]
 REALS = [0.0, -0.0, 0.5, -1.5, 1e-300, 1e308, 30.0, 0.02, math.nan, math.inf, -math.inf]
 TEXTS = ["", "adjacent", "disk", "sheet", "a", "[red]x[/red]", "é\n\t\x00", "x" * 5_000, "../../etc/passwd", "(a+)+$"]
@@ -188,14 +188,14 @@ def values(dates):
 
 
 def places(table, before=()):
-    """Every key and every item of a table, as the steps that lead to it."""
+    """The path of every key and every item of a table."""
     items = table.items() if isinstance(table, dict) else enumerate(table) if isinstance(table, list) else ()
     return [place for step, inner in items for place in ((*before, step), *places(inner, (*before, step)))]
 
 
 @st.composite
 def changed(draw, tables, dates=DATES):
-    """One of the tables with one to three changes, and the keys of it."""
+    """One of the tables with one to three changes, and the set of its keys."""
     table = copy.deepcopy(draw(st.sampled_from([*tables])))
     names = {step for place in places(table) for step in place if isinstance(step, str)}
     for _ in range(draw(st.integers(1, 3))):
@@ -216,13 +216,13 @@ def changed(draw, tables, dates=DATES):
 
 
 def toml(value):
-    """A value as TOML writes it."""
+    """Format a value as TOML."""
     match value:
         case bool():
             return str(value).lower()
         case int():
             return str(value)
-        case bytes():  # a number that Python reads and does not write
+        case bytes():  # an integer too long for Python to format
             return f"0x{value.decode()}"
         case float():
             return repr(value)
@@ -235,8 +235,9 @@ def toml(value):
     return value.isoformat()
 
 
-def told(read):
-    """What is said where a file is refused, None where it is read. Anything but a `ValueError` is raised."""
+def refusal(read):
+    """Return the error message if a file is refused and None if it is read. Any exception but `ValueError` is
+    raised."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         try:
@@ -254,7 +255,7 @@ def check(message, names):
 
 
 def jsoned(value):
-    """A value as JSON writes it; a number that Python does not write, as a one with as many noughts."""
+    """Format a value as JSON; an integer too long for Python is written as a one with 5,000 zeros."""
     if isinstance(value, dict):
         return f"{{{', '.join(f'{json.dumps(key)}: {jsoned(inner)}' for key, inner in value.items())}}}"
     if isinstance(value, list):
@@ -278,50 +279,50 @@ def write(file, table):
 @quick
 def test_descriptions(file, case):
     write(file, case[0])
-    check(told(lambda: load_description(file).protocol(file)), case[1])
+    check(refusal(lambda: load_description(file).protocol(file)), case[1])
 
 
 @given(case=changed([STUDY]))
 @quick
 def test_studies(file, case):
     write(file, case[0])
-    check(told(lambda: read_study(file)), case[1])
+    check(refusal(lambda: read_study(file)), case[1])
 
 
 @given(case=changed([SKIN]))
 @settings(quick, max_examples=60)
 def test_skins(file, case):
     write(file, case[0])
-    check(told(lambda: read_described_skin(file)), case[1])
+    check(refusal(lambda: read_described_skin(file)), case[1])
 
 
 @given(case=changed([PLANE, CURVED], dates=[None]))
 @quick
 def test_calibrations(file, case):
     file.write_text(jsoned(case[0]), "utf-8")
-    check(told(lambda: Calibration.load(file)), case[1] | {"calibration"})
+    check(refusal(lambda: Calibration.load(file)), case[1] | {"calibration"})
 
 
 @pytest.mark.parametrize("name", DESCRIPTIONS)
-def test_descriptions_that_changes_begin_with_are_read(file, name):
+def test_unchanged_descriptions_are_read(file, name):
     write(file, DESCRIPTIONS[name])
     assert load_description(file).protocol(file).num_measurements > 0
 
 
-def test_studies_and_skins_that_changes_begin_with_are_read(file):
+def test_unchanged_studies_and_skins_are_read(file):
     write(file, STUDY)
     assert len(read_study(file).points) == 32
     write(file, SKIN)
     assert read_described_skin(file).model.protocol.num_measurements == 20
 
 
-def test_calibrations_that_changes_begin_with_are_read(file):
+def test_unchanged_calibrations_are_read(file):
     for one in (PLANE, CURVED):
         file.write_text(jsoned(one), "utf-8")
         assert Calibration.load(file).num_microphones == 3
 
 
-def test_tables_know_all_that_there_is():
+def test_tables_cover_all_kinds_and_options():
     assert {*get_args(CalibrationTable.model_fields["decay"].annotation)} == {*DECAYS}
     assert {name for kind in DECAYS.values() for name in kind.parameters} <= {*MicrophoneTable.model_fields}
     assert {*kinds(description_tables.GeometryTable, "shape")} == {*SHAPES}
@@ -336,12 +337,12 @@ def test_tables_know_all_that_there_is():
 
 
 def kinds(tables, key):
-    """Tables of a union by the word that says which."""
+    """The tables of a union by the value of their discriminating key."""
     keyed = [table for table in get_args(tables) if key in table.model_fields]
     return {word: table for table in keyed for word in get_args(table.model_fields[key].annotation)}
 
 
-def test_every_key_is_told_by_its_place():
+def test_faults_are_named_by_their_path():
     with pytest.raises(ValueError, match=r"^a\.json: microphones\[1\]\.a is -1, and must be above 0\. strengths"):
         validated(Small, {"microphones": [{"a": 1}, {"a": -1}], "strengths": 3}, "a.json")
     with pytest.raises(ValueError, match=r"^a\.json: 'a b' is no key of a list; there are microphones, strengths\.$"):
@@ -350,8 +351,8 @@ def test_every_key_is_told_by_its_place():
         validated(Small, {str(key): 1 for key in range(999)}, "a" * 1000)
 
 
-def test_what_there_is_no_room_for_is_named_by_its_key():
-    """Up to ten of them; and the list of all keys makes room for other faults where one is likely meant."""
+def test_faults_beyond_the_length_limit_are_named_by_their_key():
+    """Up to ten are named. The list of all keys is omitted in favour of other faults if a similar key is suggested."""
     eight = {name * 9: 1 for name in "abcdefgh"}
     with pytest.raises(ValueError, match=r"^a\.json: ") as caught:
         validated(Small, {"microphones": [], "strengths": [], **eight}, "a.json")
@@ -359,14 +360,14 @@ def test_what_there_is_no_room_for_is_named_by_its_key():
     assert "more" not in str(caught.value)
     there = ", ".join("x" * 30 for _ in range(10))
     sentences = ["a is missing; give it.", f"b is no key (did you mean 'c'?); there are {there}.", "d is bad."]
-    told = faults_message("a.json", sentences, ["a", "b", "d"])
-    assert told == "a.json: a is missing; give it. b is no key (did you mean 'c'?). d is bad."
+    message = faults_message("a.json", sentences, ["a", "b", "d"])
+    assert message == "a.json: a is missing; give it. b is no key (did you mean 'c'?). d is bad."
     assert faults_message("a.json", [f"{there}."] * 3, ["a", "b", "d"]) == f"a.json: {there}. Wrong too: b, d."
     assert len(faults_message("a.json", [there] * 30, ["k" * 40] * 30)) <= 400
 
 
 class One(Table):
-    """A line of it."""
+    """A row of the table."""
 
     a: Annotated[float, Number(5e-324, math.inf)]
 
@@ -391,8 +392,9 @@ def test_empty_text_is_refused():
         validated(Named, {"word": ""}, "a.json")
 
 
-def test_heavy_things_are_imported_where_they_are_used():
-    """That keeps the import quick, which is a benchmark; pydantic comes with the first file that is read."""
+def test_large_packages_are_imported_on_use():
+    """This keeps the import time, which is a benchmark, short; pydantic is imported with the first file that is
+    read."""
     program = (
         "import sys, jeit\n"
         "print([m for m in ('matplotlib', 'optimistix', 'meshio', 'scipy.io') if m in sys.modules])\n"

@@ -1,4 +1,4 @@
-"""The forward model in decimal numbers of sixty digits: what its voltages are when nothing is rounded."""
+"""The forward model in decimal arithmetic of sixty digits: its voltages without rounding errors."""
 
 from decimal import Decimal, localcontext
 from typing import NamedTuple
@@ -8,13 +8,13 @@ import numpy as np
 from jeit.electrodes.electrodes import Contact
 
 DIGITS = 60
-# Ohm·m² at which an electrode has nothing left of its contact beside one of unit impedance.
+# Contact impedance in ohm·m² of an electrode that is practically open beside one of unit impedance.
 _OPEN = 1e300
 _decimal = np.frompyfunc(lambda number: Decimal(float(number)), 1, 1)
 
 
 class Exact(NamedTuple):
-    """`voltages` (M,), transfer `impedance` (L, L) and `jacobian` (M, m) by the cells' conductivities."""
+    """`voltages` (M,), transfer `impedance` (L, L) and `jacobian` (M, m) with respect to the cells' conductivities."""
 
     voltages: np.ndarray
     impedance: np.ndarray
@@ -22,7 +22,7 @@ class Exact(NamedTuple):
 
 
 def exact(model, conductivity) -> Exact:
-    """Of a model with a conductivity per cell (m,), S/m (2-D: S)."""
+    """Exact results of a model with one conductivity per cell (m,), S/m (2-D: S)."""
     with localcontext() as context:
         context.prec = DIGITS
         fields, impedance, gradient, measure = _of(model, conductivity)
@@ -35,7 +35,7 @@ def exact(model, conductivity) -> Exact:
 
 
 def exact_change(model, before, after) -> np.ndarray:
-    """Of the voltages (M,), from one conductivity per cell (m,) to another, S/m (2-D: S)."""
+    """Exact change of the voltages (M,) from one conductivity per cell (m,) to another, S/m (2-D: S)."""
     with localcontext() as context:
         context.prec = DIGITS
         first, second = (_of(model, one)[1] for one in (before, after))
@@ -84,7 +84,8 @@ def _along(fields, cells, gradient):
 
 
 def _solved(model, cells, gradient, weight):
-    """Potentials (n, L) for a unit current into each electrode that leaves evenly through all, and Z (L, L)."""
+    """Potentials (n, L) for a unit current into each electrode that leaves evenly through all electrodes, and Z (L,
+    L)."""
     electrodes, mesh = model.electrodes, model.mesh
     size, number = mesh.num_points, electrodes.num_electrodes
     matrix = np.full((size + number, size + number), Decimal(0), object)
@@ -118,7 +119,7 @@ def _solved(model, cells, gradient, weight):
 
 
 def _solve(matrix, right):
-    """By elimination without pivoting, which a positive definite matrix allows."""
+    """Solve by elimination without pivoting, which a positive definite matrix permits."""
     matrix, right = matrix.copy(), right.copy()
     size = len(matrix)
     for k in range(size):

@@ -1,4 +1,4 @@
-"""Small models of every kind of electrode, in any unit of length, for arithmetic in which nothing is rounded."""
+"""Small models of every kind of electrode in any unit of length, to compare with exact arithmetic."""
 
 import equinox as eqx
 import jax
@@ -42,7 +42,7 @@ def _patch(unit: float) -> ForwardModel:
 
 @eqx.filter_jit
 def compiled(model, conductivity):
-    """Voltages, and their Jacobian: from the fields, and by the derivative rule. One program for all test files."""
+    """Voltages and their Jacobian, from the fields and by the derivative rule, in one program for all test files."""
     jacobian = model.voltages_and_jacobian(conductivity)[1]
     return model.voltages(conductivity), jacobian, jax.jacrev(model.voltages)(conductivity)
 
@@ -53,7 +53,7 @@ CONTACTS = {"tight": 1e-9, "good": 1e-3, "bad": 1e3, "open": 1e9, "unlike": np.a
 
 
 def with_contacts(model: ForwardModel, factor) -> ForwardModel:
-    """The model with contact impedances that are `factor` times as large, one or one an electrode."""
+    """The model with contact impedances multiplied by `factor`, a scalar or one value per electrode."""
     impedance = np.asarray(model.electrodes.contact_impedance)
     factor = np.broadcast_to(factor if np.ndim(factor) == 0 else factor[: len(impedance)], impedance.shape)
     return model.with_electrodes(model.electrodes.with_contact_impedance(factor * impedance))
@@ -65,7 +65,7 @@ def uneven(model: ForwardModel) -> np.ndarray:
 
 
 def middles(model: ForwardModel) -> np.ndarray:
-    """Of the cells (m, 2), seen from above."""
+    """Midpoints (m, 2) of the cells, seen from above."""
     return np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)].mean(axis=1)[:, :2]
 
 

@@ -72,7 +72,7 @@ def _face():
 def _patch():
     mesh = cylinder(0.1, 0.08, num_points=250)
     middle = float(mesh.points[:, 2].mean())
-    # Not at the angles of nodes: the wall's normal there is that of one facet beside it or of the other.
+    # Not at the angles of nodes, where the normal of the wall depends on the chosen facet.
     electrodes = FacePatches(ring(0.1, 6, height=middle, start_angle=0.03), 0.04, 0.04, 1e-3)
     return ForwardModel(mesh, electrodes, adjacent(6, current=1e-3))
 
@@ -80,5 +80,5 @@ def _patch():
 MODELS = {f.__name__.strip("_"): f for f in (_boundary, _inside, _combined, _point, _node, _facet, _face, _patch)}
 
 
-# Every kind of electrode is tried; the quick suite has one of each way of finding contact integrals.
+# Every kind of electrode is tested; the quick tests have one for each method of contact integration.
 QUICK = ("boundary", "inside", "point")

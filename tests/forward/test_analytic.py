@@ -59,14 +59,14 @@ def on_rim(angles: np.ndarray) -> np.ndarray:
 
 @cache
 def ring_mesh(num_rings: int):
-    """A disk of concentric rings of equal thickness, with six nodes more on each than on the one inside it."""
+    """A disk of concentric rings of equal thickness, each with six nodes more than the next inner one."""
     mesh = disk(RADIUS, num_points=1 + 3 * num_rings * (num_rings + 1))
     assert mesh.num_facets == 6 * num_rings
     return mesh
 
 
 def cells_of(physics: ConductingDisk, mesh) -> np.ndarray | complex:
-    """Conductivity per cell; with an even number of rings the inclusion is made of whole cells."""
+    """Conductivity per cell; with an even number of rings the inclusion consists of whole cells."""
     inside = np.linalg.norm(centroids(mesh), axis=1) < physics.inclusion_ratio * physics.radius
     return np.where(inside, physics.inclusion_conductivity, physics.conductivity)
 
@@ -87,7 +87,7 @@ def exact_arc_voltages(physics: ConductingDisk, contact_impedance=CONTACT_IMPEDA
 
 
 def largest(error: np.ndarray, exact: np.ndarray) -> float:
-    """The worst channel's relative error."""
+    """The relative error of the worst channel."""
     return float(np.max(np.abs(error / exact)))
 
 
@@ -120,7 +120,7 @@ def test_arcs_converge_to_the_series(levels, physics):
 
 @pytest.mark.slow
 def test_driven_arcs_converge_with_a_logarithm():
-    """The whole transfer impedance, driven electrodes included: h² (A log(1/h) + B)."""
+    """The whole transfer impedance including driven electrodes: h² (A log(1/h) + B)."""
     levels, impedance = (16, 32, 48, 64, 96), 10.0 * CONTACT_IMPEDANCE
     exact = arc_transfer_impedance(HOMOGENEOUS, ANGLES, np.full(16, WIDTH), np.full(16, impedance))
     electrodes = BoundaryElectrodes(on_rim(ANGLES), WIDTH, impedance)
@@ -131,7 +131,8 @@ def test_driven_arcs_converge_with_a_logarithm():
             for r in levels
         ]
     )
-    # Plain h² would leave errors / sizes² flat; h^1.85 and less, or any first-order term, bends the line in log(1/h).
+    # Plain h² would leave errors / sizes² constant; h^1.85 and less, or any first-order term, bends the line in
+    # log(1/h).
     line = np.polyfit(-np.log(sizes), errors / sizes**2, 1)
     assert line[0] > 0.0
     assert np.abs(np.polyval(line, -np.log(sizes)) / (errors / sizes**2) - 1.0).max() < 0.01
@@ -149,15 +150,15 @@ def test_points_converge_to_the_logarithm(levels, physics):
         nodes = np.argmin(np.linalg.norm(np.asarray(mesh.points)[:, None] - on_rim(angles), axis=-1), axis=0)
         model = ForwardModel(mesh, NodeElectrodes(nodes), PROTOCOL)
         errors.append(overall(model.voltages(cells_of(physics, mesh)), exact))
-    # The same points found by position, on the last mesh.
+    # The same points, found by position on the last mesh.
     free = ForwardModel(mesh, PointElectrodes(on_rim(angles)), PROTOCOL)
     assert overall(free.voltages(cells_of(physics, mesh)), exact) == pytest.approx(errors[-1], rel=1e-6)
     assert fitted_order(1.0 / np.array(levels), errors) == pytest.approx(2.0, abs=0.15)
     assert errors[1] < 1.5e-3
 
 
-def test_inclusion_is_seen_from_driven_points_too():
-    """What an inclusion adds has no singularity: every entry, the diagonal too, is finite and converges."""
+def test_inclusion_with_driven_points():
+    """The change by an inclusion has no singularity: every entry, the diagonal too, is finite and converges."""
     angles = 2.0 * np.pi * np.arange(16) / 16.0
     centring = np.eye(16) - 1.0 / 16.0
     exact = centring @ point_inclusion_effect(INCLUSION, angles) @ centring
@@ -175,7 +176,7 @@ def test_potentials_inside():
     angles = 2.0 * np.pi * np.arange(16) / 16.0
     mesh = ring_mesh(32)
     model = ForwardModel(mesh, PointElectrodes(on_rim(angles)), PROTOCOL)
-    # Away from the sources the potential is smooth; its reference is free.
+    # Away from the sources the potential is smooth; its reference is arbitrary.
     inner = np.linalg.norm(mesh.points, axis=1) < 0.5 * RADIUS
     potentials = np.asarray(model.potentials(CONDUCTIVITY))[:, inner]
     drive = np.asarray(PROTOCOL.drive)
@@ -191,7 +192,7 @@ def test_potentials_inside():
 )
 @pytest.mark.parametrize("spread", [0.1, 0.02])
 def test_every_voltage_on_a_mesh_graded_to_the_electrodes(num_points, tolerance, spread):
-    """Electrodes anywhere on the rim, their ends known to the mesh as places to refine, not as nodes."""
+    """Electrodes anywhere on the rim; the mesh is refined at their ends, which need not be nodes."""
     angles = ANGLES + 0.07
     half = WIDTH / RADIUS / 2.0
     ends = on_rim(np.concatenate([angles - half, angles + half]))
@@ -203,8 +204,8 @@ def test_every_voltage_on_a_mesh_graded_to_the_electrodes(num_points, tolerance,
 
 
 @pytest.mark.parametrize("num_rings", [20, pytest.param(58, marks=pytest.mark.slow)])
-def test_every_voltage_of_points_on_an_even_mesh(num_rings):
-    """0.5 % at 1,261 nodes and 0.1 % at 10,267, worst channel."""
+def test_every_voltage_of_points_on_a_uniform_mesh(num_rings):
+    """Worst channel: 0.5 % at 1,261 nodes and 0.1 % at 10,267."""
     angles = 2.0 * np.pi * np.arange(6) / 6.0  # six-fold meshes have nodes there
     drive = np.eye(6) - np.roll(np.eye(6), 1, axis=1)
     exact_impedance = point_transfer_impedance(HOMOGENEOUS, angles)
@@ -223,7 +224,7 @@ DISC_IMPEDANCE = RADIUS**2 / CONDUCTIVITY * np.array([0.003, 0.02, 0.01, 0.005, 
 
 @pytest.mark.slow
 def test_disc_windows_converge_to_sharp_discs():
-    """Window and cells shrink together; the sharp discs' own field has no singularity, so the order is 2."""
+    """Window and cells shrink together; the exact field of sharp discs has no singularity, so the order is 2."""
     exact = disc_transfer_impedance(HOMOGENEOUS, DISC_POSITION, DISC_RADIUS, DISC_IMPEDANCE)
     electrodes = SheetDiscs(DISC_POSITION, DISC_RADIUS, DISC_IMPEDANCE)
     protocol = adjacent(5, current=1.0)
@@ -238,7 +239,7 @@ def test_disc_windows_converge_to_sharp_discs():
 
 @pytest.mark.slow
 def test_disc_in_the_middle_and_the_whole_rim():
-    """Two kinds of electrode on one sheet; Bessel functions under the disc."""
+    """Two kinds of electrode on one sheet, with Bessel functions under the disc."""
     radius, impedance, rim = 0.3 * RADIUS, 0.01 * RADIUS**2 / CONDUCTIVITY, 0.2 * RADIUS / CONDUCTIVITY
     exact = centre_to_rim_resistance(HOMOGENEOUS, radius, impedance, rim)
     errors = []
@@ -252,7 +253,7 @@ def test_disc_in_the_middle_and_the_whole_rim():
         voltage = ForwardModel(mesh, electrodes, pair).voltages(CONDUCTIVITY)[0]
         errors.append(abs(voltage / exact - 1.0))
     assert errors[1] < 2e-3
-    assert np.log2(errors[0] / errors[1]) > 1.7  # order 2, up to how the disc's edge falls on the rings
+    assert np.log2(errors[0] / errors[1]) > 1.7  # order 2, up to the position of the disc's edge relative to the rings
 
 
 @pytest.mark.parametrize("conductivity", [0.7, 0.7 + 0.2j], ids=["real", "complex"])

@@ -1,4 +1,4 @@
-"""The forward model on surfaces, shells and solids against their series: order of convergence, and bounds."""
+"""The forward model on surfaces, shells and solids against series solutions: order of convergence, and error bounds."""
 
 import equinox as eqx
 import jax
@@ -21,13 +21,13 @@ from jeit.forward.exact import (
 from jeit.mesh import bend, box, cylinder, layer, rectangle, shell, sphere, tube
 
 CONDUCTIVITY = 2.0
-# So large that current is spread evenly over an electrode, to a millionth.
+# Contact impedance so large that the current density under an electrode is uniform to a millionth.
 CONTACT = 1e4
 RADIUS, HEIGHT = 0.05, 0.08
 
 
 def error(mesh, electrodes, impedance, conductivity=CONDUCTIVITY):
-    """Largest error of adjacent channels on electrodes that are not driven, relative to the largest voltage."""
+    """Largest error of adjacent channels without driven electrodes, relative to the largest voltage."""
     pattern = protocol.adjacent(electrodes.num_electrodes)
     found = np.asarray(ForwardModel(mesh, electrodes, pattern).voltages(conductivity))
     measured = np.asarray(pattern.measurement)[np.asarray(pattern.measurement_index)]
@@ -48,12 +48,12 @@ def nodes_at(mesh, places):
 
 
 def icosahedron():
-    """Corners (12, 3) of one in the unit sphere: nodes of every mesh of `sphere`."""
+    """Corners (12, 3) of an icosahedron in the unit sphere: nodes of every mesh of `sphere`."""
     return np.asarray(sphere(1.0, num_points=12).points)
 
 
 def on_wall():
-    """Angles, heights and places of six patches on the wall of a cylinder, in two rings."""
+    """Angles, heights and positions of six patches on the wall of a cylinder, in two rings."""
     angles = 2 * np.pi * np.arange(6) / 6 + 0.2
     heights = np.where(np.arange(6) % 2, 0.055, 0.025)
     return angles, heights, np.stack([RADIUS * np.cos(angles), RADIUS * np.sin(angles), heights], axis=1)
@@ -162,8 +162,8 @@ def test_a_box_between_plates_with_contact_impedance_is_exact():
         assert abs(float(found[0])) == pytest.approx(plate_resistance(length, area, 0.5, 0.01), rel=1e-10)
 
 
-def test_a_shell_that_is_bent_less_and_less_is_flat():
-    """What bending changes of a thick skin falls with 1 / R: its outer face is longer than its inner one."""
+def test_a_shell_of_decreasing_curvature_becomes_flat():
+    """The effect of bending a thick skin decreases with 1 / R: its outer face is longer than its inner one."""
     sheet = rectangle(0.1, 0.06, num_points=150)
     nodes, pattern = NodeElectrodes([150, 170, 190, 210, 230, 250]), protocol.adjacent(6)
     flat = np.asarray(ForwardModel(layer(sheet, 0.008, 1), nodes, pattern).voltages(1.0))
@@ -187,7 +187,7 @@ def skin():
 
 @pytest.fixture(scope="module")
 def of_steps(skin):
-    """Voltages, where electrodes and nodes have moved and conductivities are others, and a step with no such changes.
+    """Voltages after steps of electrodes, nodes and conductivities, and after a step without such changes.
 
     One program for all three.
     """

@@ -1,6 +1,6 @@
-"""The derivative rule: against plain autodiff through the solve, against differences, and as an operator.
+"""The derivative rule: against automatic differentiation through the solve, against differences, and as an operator.
 
-Linear maps are compared where they are applied to one random vector: two that differ anywhere differ there.
+Linear maps are compared by their products with one random vector, in which any difference appears.
 """
 
 import equinox as eqx
@@ -29,7 +29,8 @@ def model(request):
     params=["boundary", *(pytest.param(one, marks=pytest.mark.slow) for one in ("point", "face"))], scope="module"
 )
 def known(request):
-    """A model for programs that get its electrodes' integrals: with contacts or without, of a sheet or a solid."""
+    """A model whose compiled programs receive the electrodes' integrals: with or without contacts, of a sheet or a
+    solid."""
     return MODELS[request.param]()
 
 
@@ -50,10 +51,12 @@ def directions(known):
 
 @pytest.fixture(scope="module")
 def derivatives(known, directions):
-    """Everything about a conductivity by its name, from one program for all conductivities: each takes long to compile.
+    """All derivatives at a conductivity by name, from one program for all conductivities, because each takes long to
+    compile.
 
-    The voltages' derivative along a first direction, how it changes along a second, and the weighted channels'; the
-    last by plain autodiff through the solve, too, and the fields and transfer impedance that this solve gives.
+    The derivative of the voltages along a first direction, its change along a second, and that of the weighted
+    channels. The last is also computed by automatic differentiation through the solve, with the fields and transfer
+    impedance of this solve.
     """
     protocol, (first, second, weights) = known.protocol, directions
 
@@ -82,12 +85,12 @@ def derivatives(known, directions):
     return lambda conductivity: jax.tree.map(np.asarray, found(conductivity))
 
 
-def test_rule_equals_autodiff_through_the_solve(known, directions, derivatives):
+def test_rule_equals_automatic_differentiation_through_the_solve(known, directions, derivatives):
     jacobian = np.asarray(known.jacobian(uneven(known)))
     assert _relative(directions[-1] @ jacobian, derivatives(uneven(known))["pulled plainly"]) < 1e-9
 
 
-def test_compiled_fields_are_the_solution(known, derivatives):
+def test_compiled_fields_solve_the_system(known, derivatives):
     conductivity, found = uneven(known), derivatives(uneven(known))
     potentials = np.asarray(known.potentials(conductivity))
     assert potentials.shape == (known.protocol.num_drives, known.mesh.num_points)
@@ -96,7 +99,7 @@ def test_compiled_fields_are_the_solution(known, derivatives):
 
 
 def test_forward_and_reverse_mode_equal_the_jacobian(known, directions, derivatives):
-    """So they are adjoint to each other, too."""
+    """So the two modes are adjoint to each other, too."""
     (first, _, weights), found = directions, derivatives(uneven(known))
     pushed, pulled, jacobian = found["pushed"], found["pulled"], np.asarray(known.jacobian(uneven(known)))
     assert _relative(pushed, jacobian @ first) < 1e-12
@@ -123,7 +126,7 @@ def test_jacobian_is_second_order_accurate(model):
     assert abs(order - 2) < 0.05
 
 
-def test_changes_of_some_cells_need_no_whole_jacobian(model):
+def test_changes_of_some_cells_do_not_need_the_whole_jacobian(model):
     rng = np.random.default_rng(SEED)
     cells = np.flatnonzero(rng.random(model.mesh.num_cells) < 0.2)
     changes = [
@@ -156,14 +159,14 @@ FIELDS = ("position", "width", "radius", "height", "contact_impedance")
 
 @pytest.mark.parametrize("model", models(["boundary", "inside"]), indirect=True, scope="module")
 def test_gradients_of_electrodes_and_nodes_against_central_differences(model):
-    """In every field of the electrodes, and in the mesh's nodes, one after the other.
+    """For every array of the electrodes, and for the mesh's nodes.
 
-    One program for all of them, which takes a batch; each of it is compared with what it is alone.
+    One program for all of them takes a batch, and each member is compared with its separate result.
     """
     conductivity, electrodes, places = uneven(model), model.electrodes, {}
     if not isinstance(electrodes, CombinedElectrodes):
         places = {one: ("electrodes", one) for one in FIELDS if hasattr(electrodes, one)}
-    # Electrodes that slide on a moving boundary are covered by their own positions.
+    # Electrodes that slide on a moving boundary are tested with their own positions.
     if not isinstance(electrodes, FacePatches | BoundaryElectrodes | PointElectrodes):
         places["points"] = ("mesh", "points")
     values = {one: np.asarray(getattr(getattr(model, part), field)) for one, (part, field) in places.items()}
@@ -173,7 +176,7 @@ def test_gradients_of_electrodes_and_nodes_against_central_differences(model):
         return eqx.tree_at(
             lambda one: [getattr(getattr(one, part), field) for part, field in places.values()],
             model,
-            [values[one] for one in places],  # a compiled function gets them in another order
+            [values[one] for one in places],  # a compiled function receives them in another order
         )
 
     @jax.jit
@@ -193,14 +196,14 @@ def test_gradients_of_electrodes_and_nodes_against_central_differences(model):
         found, derivative = map(np.asarray, along(stacked, way))
         for one, values_of_one in zip(found, batch, strict=True):
             assert _relative(one, changed(values_of_one).voltages(conductivity)) < 1e-12, field
-        # Fourth-order central difference: the rule, not the difference, is what is judged.
+        # Fourth-order central differences, whose error is below that of the rule.
         _, ahead, behind, far_ahead, far_behind = found
         difference = (8 * (ahead - behind) - (far_ahead - far_behind)) / 12e-3
         assert _relative(difference, derivative[0]) < 1e-5, field
 
 
 def test_voltages_scale_with_current_and_resistance(model):
-    """A constant phase, too, divides every voltage, where there is no contact impedance to share it with."""
+    """A constant phase also divides every voltage, if there is no contact impedance."""
     conductivity, doubled = uneven(model), model
     if not model.electrodes.is_point:
         impedance = np.asarray(model.electrodes.contact_impedance)

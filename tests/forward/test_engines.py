@@ -1,6 +1,6 @@
-"""Two engines, one formula: what NumPy answers at once is what the compiled program answers, to rounding.
+"""Results of NumPy and of compiled programs agree to rounding.
 
-For conductivities of every shape and type, whose Jacobians are beside those of plain autodiff; alone and in batches.
+For conductivities of every shape and type, with Jacobians from automatic differentiation, alone and in batches.
 """
 
 import equinox as eqx
@@ -22,8 +22,8 @@ from jeit_solvers.engines import empty_for_jax, on_device
 QUANTITIES = ("voltages", "transfer_impedance", "potentials", "fields", "voltages_and_jacobian")
 
 
-# Programs of known electrodes get their integrals: with contacts or without, of a sheet or a solid, all else is alike.
-# Of other kinds, test_derivatives has the compiled integrals beside NumPy's.
+# Programs of known electrodes receive their integrals: with or without contacts, of a sheet or a solid; all else is
+# alike. For other kinds, test_derivatives compares the compiled integrals with NumPy's.
 @pytest.fixture(
     params=["boundary", *(pytest.param(one, marks=pytest.mark.slow) for one in ("point", "face"))], scope="module"
 )
@@ -36,7 +36,7 @@ def uneven(size):
 
 
 def assert_same(found, expected, tolerance=1e-12):
-    """To so much of the largest number of each array."""
+    """Compare arrays to this fraction of the largest value of each."""
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         assert isinstance(one, jax.Array)
         assert one.dtype == other.dtype
@@ -44,7 +44,7 @@ def assert_same(found, expected, tolerance=1e-12):
 
 
 def test_numpy_and_compiled_code_agree(model):
-    """One at a time, and in a batch: one program for all quantities."""
+    """One at a time and in a batch, with one program for all quantities."""
     batch = uneven(model.mesh.num_cells) * np.array([[0.5], [1.0], [2.0]])
 
     def everything(conductivity):
@@ -101,7 +101,7 @@ def parts():
     return Disk(0.1).mesh(num_points=60), BoundaryElectrodes(ring(0.1, 8), 0.02, 1e-3), adjacent(8)
 
 
-def test_what_has_values_is_not_compiled(parts, caplog):
+def test_known_values_are_not_compiled(parts, caplog):
     with jax.log_compiles(), caplog.at_level("WARNING"):
         model = ForwardModel(*parts)
         model.voltages_and_jacobian(1.0)
@@ -112,13 +112,13 @@ def test_what_has_values_is_not_compiled(parts, caplog):
     assert "Compiling" in caplog.text, "what is compiled is in the log"
 
 
-def test_a_solver_that_is_asked_for_is_used(parts):
+def test_a_requested_solver_is_used(parts):
     rough = ForwardModel(*parts, solver=ConjugateGradient(tolerance=1e-6)).voltages(1.0)
     exact = ForwardModel(*parts).voltages(1.0)
     assert 1e-9 < np.abs(rough - exact).max() / np.abs(exact).max() < 1e-3
 
 
-def test_a_large_jacobian_is_filled_on_all_cores(parts, monkeypatch):
+def test_a_large_jacobian_is_computed_on_all_cores(parts, monkeypatch):
     model = ForwardModel(*parts)
     expected = np.asarray(model.jacobian(1.0))
     monkeypatch.setattr(forward_model, "_BLOCK_ENTRIES", 200)
@@ -127,7 +127,7 @@ def test_a_large_jacobian_is_filled_on_all_cores(parts, monkeypatch):
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="the device has a memory of its own")
-def test_jax_takes_over_memory_that_was_made_for_it():
+def test_jax_uses_the_memory_of_the_result():
     made = empty_for_jax((300, 500), np.dtype(float))
     made[:] = 1
     assert on_device(made).unsafe_buffer_pointer() == made.ctypes.data
@@ -135,7 +135,7 @@ def test_jax_takes_over_memory_that_was_made_for_it():
 
 @pytest.fixture(scope="module")
 def by_multigrid(parts):
-    """A model with good contacts and bad ones, solved directly in compiled programs, and by multigrid."""
+    """A model with good and bad contacts, solved directly in compiled programs, and by multigrid."""
     pytest.importorskip("pyamg", reason="PyAMG, of the extra `large`, is not installed")
     mesh, electrodes, protocol = parts
     electrodes = electrodes.with_contact_impedance(np.geomspace(1e-6, 1.0, 8))
@@ -163,8 +163,8 @@ def test_multigrid_gives_the_same_derivatives_of_everything(parts, by_multigrid)
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-8 * np.abs(other).max())
 
 
-def test_other_electrodes_are_not_taken_for_the_same(parts):
-    """Contact integrals and the last models are kept; what has changed is worked out anew."""
+def test_other_electrodes_do_not_reuse_cached_results(parts):
+    """Contact integrals and the last models are cached; changed ones are computed again."""
     model = ForwardModel(*parts)
     first = model.voltages(1.0)
     other = model.with_electrodes(BoundaryElectrodes(ring(0.1, 8, start_angle=0.1), 0.02, 2e-3))
@@ -175,8 +175,8 @@ def test_other_electrodes_are_not_taken_for_the_same(parts):
     np.testing.assert_allclose(again.voltages(1.0), first, rtol=1e-9)  # a sheet has no scale of its own
 
 
-def test_integrals_that_a_program_asked_for_first_serve_outside_it(parts):
-    """Of electrodes with values they are worked out once, in NumPy, and belong to no program."""
+def test_integrals_first_computed_in_a_program_are_reused_outside_it(parts):
+    """Integrals of known electrodes are computed once, in NumPy, and do not belong to a program."""
     model = ForwardModel(*parts, solver="cholesky")
     conductivity = np.linspace(1.0, 2.0, model.mesh.num_cells)
     assert jax.eval_shape(lambda values: model.voltages(values), conductivity).shape == (40,)
@@ -185,13 +185,13 @@ def test_integrals_that_a_program_asked_for_first_serve_outside_it(parts):
 
 
 class InJaxAlone(BoundaryElectrodes):
-    """Electrodes of a user who knows nothing of engines."""
+    """User-defined electrodes that are written in JAX alone."""
 
     def contact(self, mesh):
         return super().contact(jax.tree.map(jnp.asarray, mesh))
 
 
-def test_electrodes_written_in_jax_alone_serve(parts):
+def test_electrodes_written_in_jax_alone(parts):
     mesh, electrodes, protocol = parts
     own = InJaxAlone(electrodes.position, electrodes.width, electrodes.contact_impedance)
     expected = ForwardModel(*parts).voltages(1.5)
@@ -199,7 +199,7 @@ def test_electrodes_written_in_jax_alone_serve(parts):
 
 
 def test_arrays_of_users_are_copied(parts):
-    """An acquisition loop may write into its buffer again, and JAX would share aligned memory."""
+    """An acquisition loop may overwrite its buffer, and JAX would share aligned memory."""
     mesh, electrodes, protocol = parts
     raw = np.empty(128, np.uint8)
     start = -raw.ctypes.data % 64
@@ -213,7 +213,7 @@ def test_arrays_of_users_are_copied(parts):
 
 
 @pytest.mark.parametrize("kind", [">f8", np.longdouble, int])
-def test_numbers_of_any_kind_are_conductivities(parts, kind):
+def test_conductivities_of_any_numeric_type(parts, kind):
     model = ForwardModel(*parts)
     values = np.arange(1, model.mesh.num_cells + 1).astype(kind)
     expected = model.voltages(values.astype(float))
@@ -224,7 +224,7 @@ def test_numbers_of_any_kind_are_conductivities(parts, kind):
 
 
 @pytest.mark.slow
-def test_a_model_may_be_made_inside_jit_of_a_known_mesh(parts):
+def test_a_model_is_made_inside_jit_of_a_known_mesh(parts):
     mesh, electrodes, protocol = parts
 
     @jax.jit
@@ -237,7 +237,7 @@ def test_a_model_may_be_made_inside_jit_of_a_known_mesh(parts):
     )
 
 
-def test_a_model_may_be_made_while_jit_traces(parts):
+def test_a_model_is_made_while_jit_traces(parts):
     mesh, electrodes, protocol = parts
     found = jax.eval_shape(
         lambda position: ForwardModel(mesh, BoundaryElectrodes(position, 0.02, 1e-3), protocol).transfer_impedance(1.0),

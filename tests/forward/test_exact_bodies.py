@@ -1,4 +1,5 @@
-"""Series for spheres, cylinders, boxes and curved sheets: against special functions, each other, and their limits."""
+"""Series solutions for spheres, cylinders, boxes and curved sheets: against special functions, each other, and
+limits."""
 
 import numpy as np
 import pytest
@@ -39,15 +40,15 @@ def test_modes_of_a_cylinder_by_bessel_functions(inner):
             value = iv(n, k * 0.05) - share * kv(n, k * 0.05)
             slope = k * (ivp(n, k * 0.05) - share * kvp(n, k * 0.05))
             assert found[n, m] == pytest.approx(value / slope, rel=1e-11)
-    # High orders do not overflow, and see nothing of the axis: F = r^n.
+    # High orders do not overflow and are not influenced by the axis: F = r^n.
     high = body.response(900, 3)
     assert np.isfinite(high).all()
     assert high[899, 1] == pytest.approx(0.05 / np.hypot(899, np.pi / 0.08 * 0.05), rel=2e-3)
 
 
 def test_a_thin_cylinder_is_a_sleeve():
-    """Potentials between small patches far from each other: of the thickness, relative to the radius, and of the
-    square of the patches' size."""
+    """Potentials between small distant patches, to the order of the relative thickness and of the square of the
+    patches' size."""
     errors = []
     for thickness in (2e-3, 1e-3, 5e-4):
         body = ConductingCylinder(0.05 + thickness / 2, 0.08, 3.0, 0.05 - thickness / 2)
@@ -77,7 +78,7 @@ def test_a_sleeve_against_its_fourier_series():
 
 
 def test_a_wide_sleeve_is_a_plane():
-    """Points near each other on a sleeve as wide as a room: −log(distance)/(2πσ)."""
+    """Points near each other on a very wide sleeve: −log(distance)/(2πσ)."""
     places = np.array([[0.0, 0.0], [0.02, 0.01], [-0.01, 0.03], [0.015, -0.02]])
     errors = []
     for radius in (1.0, 2.0, 4.0):
@@ -89,7 +90,7 @@ def test_a_wide_sleeve_is_a_plane():
 
 
 def test_a_sphere_by_its_differential_equation():
-    """The potential of two points has no divergence: the mean round a small circle is the value in its middle."""
+    """The potential of two points is harmonic: the mean over a small circle equals the value at its centre."""
     feeds = directions(2)
     middle = directions(5, seed=3)
     helper = np.eye(3)[np.abs(middle).argmin(axis=1)]
@@ -107,7 +108,7 @@ def test_a_sphere_by_its_differential_equation():
 
     around = np.array([potential(each).mean() for each in circle])
     np.testing.assert_allclose(around, potential(middle), atol=1e-12)
-    # One ampere goes through a circle round the source: 2π sin(γ) σ ∂u/∂γ.
+    # One ampere flows through a circle round the source: 2π sin(γ) σ ∂u/∂γ.
     ahead, behind = (
         potential(feeds[:1] * np.cos(angle) + np.sin(angle) * np.cross(feeds[0], [0.0, 0, 1])[None])
         for angle in (0.011, 0.009)
@@ -133,7 +134,7 @@ def test_a_thin_ball_is_a_sheet():
     assert channel(cap_impedance(body, faces, 0.01, 3000)) == pytest.approx(channel(sheet), rel=1e-3)
 
 
-def test_half_a_ball_each():
+def test_two_hemispherical_caps():
     """Caps that cover a hemisphere each: w_n of the Legendre series by quadrature of P_n."""
     nodes, weights = np.polynomial.legendre.leggauss(300)
     n = np.arange(1, 200)
@@ -150,8 +151,9 @@ def test_whole_faces_of_a_box_are_plates():
     assert between == pytest.approx(plate_resistance(0.06, 0.02, 0.5, 0.0), rel=1e-12)
 
 
-def test_a_box_does_not_mind_which_way_round():
-    """Two patches on the lower face and two on the upper one; turned over; turned by a quarter; and in its series."""
+def test_results_are_invariant_to_rotations_of_a_box():
+    """Two patches on the lower face and two on the upper one: turned over, turned by a quarter, and by the box's own
+    series."""
     places = np.array([[0.05, 0.03, 0], [0.15, 0.06, 0.06], [0.12, 0.02, 0], [0.07, 0.08, 0.06]])
     size, patch = (0.2, 0.1, 0.06), (0.02, 0.03)
     found = face_patch_impedance(size, places, patch, 0.5)

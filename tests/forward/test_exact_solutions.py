@@ -1,4 +1,5 @@
-"""The solutions checked against each other, their limits, and an ordinary differential equation."""
+"""The closed-form solutions checked against each other, against limits, and against an ordinary differential
+equation."""
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def test_logarithm_moments_by_quadrature():
 @pytest.mark.parametrize(
     "disk", [ConductingDisk(), ConductingDisk(2.0, 0.5 + 0.2j, 0.6, 3.0 - 1.0j)], ids=["homogeneous", "inclusion"]
 )
-def test_arcs_converge_in_the_polynomials_degree(disk):
+def test_arcs_converge_with_the_polynomial_degree(disk):
     widths = np.array([0.2, 0.3, 0.25, 0.4, 0.1]) * disk.radius
     impedance = np.array([0.01, 0.1, 0.03, 0.5, 0.02])
     best = arc_transfer_impedance(disk, ANGLES, widths, impedance, order=96)
@@ -53,7 +54,7 @@ def test_arcs_converge_in_the_polynomials_degree(disk):
     assert relative(best, best.T) < 1e-12
 
 
-def test_narrow_arcs_are_points():
+def test_narrow_arcs_approach_points():
     narrow = arc_transfer_impedance(INCLUSION, ANGLES, np.full(5, 1e-3), np.full(5, 1e-3), order=12)
     drive, measurement = np.array([1.0, -1.0, 0, 0, 0]), np.array([0, 0, 1.0, 0, -1.0])
     points = point_transfer_impedance(INCLUSION, ANGLES)
@@ -67,7 +68,7 @@ def test_resistive_contacts_carry_uniform_current():
     assert relative(arc_transfer_impedance(ConductingDisk(), ANGLES, widths, impedance, order=8), layers) < 1e-5  # 1/z
 
 
-def test_inclusion_that_is_none_and_inclusion_that_insulates():
+def test_inclusion_of_equal_conductivity_and_insulating_inclusion():
     assert np.abs(point_inclusion_effect(ConductingDisk(1.0, 2.0, 0.5, 2.0), ANGLES)).max() < 1e-15
     # An insulating core leaves an annulus: modes k have ND eigenvalue (1 + ρ^{2k})/(1 − ρ^{2k})/k.
     annulus = ConductingDisk(1.0, 1.0, 0.5, 0.0)
@@ -76,7 +77,7 @@ def test_inclusion_that_is_none_and_inclusion_that_insulates():
     assert annulus.inclusion_kernel(np.array([1.3]))[0] == pytest.approx(extra.item(), rel=1e-14)
 
 
-def test_point_potentials_meet_the_rim():
+def test_point_potentials_at_the_rim():
     current = np.array([1.0, -2.0, 0.5, 0.0, 0.5])
     rim = np.array([0.4, 4.0])
     disk = ConductingDisk(0.1, 3.0)
@@ -107,7 +108,7 @@ def test_disc_contact_against_the_radial_equation():
     assert disc_contact_resistance(conductivity, radius, 1e4) == pytest.approx(uniform, rel=1e-5)
 
 
-def test_discs_converge_scale_and_shrink_to_points():
+def test_discs_converge_scale_and_approach_points():
     positions = np.array([[0.0, 0.0], [0.5, 0.1], [-0.4, 0.3], [-0.1, -0.6]])
     radii = np.array([0.1, 0.15, 0.12, 0.2])
     impedance = np.array([0.003, 0.02, 0.01, 0.005])
@@ -128,7 +129,7 @@ def test_discs_converge_scale_and_shrink_to_points():
     assert measurement @ tiny @ drive == pytest.approx(expected, rel=1e-6)
 
 
-def test_centre_to_rim_is_the_sum_of_its_layers():
+def test_centre_to_rim_resistance_is_the_sum_of_its_layers():
     # Sheet between radii b and a: log(a/b)/(2πσ).
     disk = ConductingDisk(0.1, 2.0)
     total = centre_to_rim_resistance(disk, 0.02, 1e-4, 0.05)

@@ -1,4 +1,4 @@
-"""Conductivities, contacts and sizes of any order of magnitude: right beside arithmetic in which nothing is rounded."""
+"""Conductivities, contact impedances and sizes of any order of magnitude, compared with exact arithmetic."""
 
 from contextlib import nullcontext
 from typing import NamedTuple
@@ -20,7 +20,7 @@ UNITS = {"micrometres": 1e-5, "a power of two": 2.0**-17, "kilometres": 1e4}
 
 
 class Case(NamedTuple):
-    """A kind of electrode, and whether compiled code is judged beside NumPy: a program takes seconds to compile."""
+    """A kind of electrode, and whether compiled code is tested beside NumPy, which takes seconds to compile."""
 
     kind: str
     compiled: bool = True
@@ -46,7 +46,7 @@ def model(case):
 
 @pytest.fixture(scope="module")
 def worst(case):
-    """Error of the voltages and the Jacobians of both engines, and of Z; each relative to its largest."""
+    """Errors of the voltages and Jacobians of both engines and of Z, each relative to the largest value."""
 
     def of(model, conductivity):
         expected = exact(model, conductivity)
@@ -64,7 +64,7 @@ def worst(case):
 
 @pytest.mark.parametrize("contacts", CONTACTS)
 def test_contacts_of_any_impedance(model, worst, contacts):
-    """All but short-circuited, all but open, or some the one and some the other."""
+    """Almost short-circuited, almost open, or some of each."""
     if model.electrodes.is_point:
         return
     assert worst(with_contacts(model, CONTACTS[contacts]), uneven(model)) < 1e-10
@@ -72,7 +72,8 @@ def test_contacts_of_any_impedance(model, worst, contacts):
 
 @pytest.mark.parametrize(("contacts", "most"), [("tight", 1e-4), ("good", 1e-7), ("open", 1e-8), ("unlike", 1e-4)])
 def test_conjugate_gradients_with_contacts_of_any_impedance(case, model, contacts, most):
-    """They stop at a residual: where loads enter by entries a billion times the others, one that counts these too."""
+    """Their stopping rule is the residual. Where the load enters by entries a billion times the others, the residual
+    must weight all equations."""
     if case.kind != "boundary":
         return
     model = with_contacts(model, CONTACTS[contacts])
@@ -82,7 +83,7 @@ def test_conjugate_gradients_with_contacts_of_any_impedance(case, model, contact
 
 @pytest.mark.parametrize("level", [1e-12, 1e12])
 def test_conductivities_of_any_level(model, worst, level):
-    """At the same contact impedances, which are as good as none then, or all that there is."""
+    """With constant contact impedances, which are then negligible or dominant."""
     assert worst(model, level * uneven(model)) < 1e-10
 
 
@@ -104,7 +105,8 @@ def test_neighbouring_cells_of_any_contrast(model, worst):
 
 @pytest.mark.parametrize("unit", UNITS)
 def test_the_unit_of_length_does_not_matter(case, model, unit):
-    """Voltages of a body so many times as large, at σ and z that go with it: the same in a sheet, fewer in a solid."""
+    """Voltages of a scaled body with scaled σ and z: equal in a sheet, inversely proportional to the length in a
+    solid."""
     large = pytest.warns(UserWarning, match="m is large") if UNITS[unit] > 1 else nullcontext()
     with large:
         other = KINDS[case.kind](UNITS[unit])
@@ -136,7 +138,7 @@ def _image_and_fit(model, level):
 
 @pytest.fixture(scope="module", params=["boundary", pytest.param("face", marks=pytest.mark.slow)])
 def touches(request):
-    """A model, and touches of it."""
+    """A model and its touches."""
     model = KINDS[request.param](1.0)
     places = np.array([[0.0, 0.01], [-0.02, -0.01], [0.03, 0.02]])
     cells = np.array([np.argsort(np.linalg.norm(middles(model) - place, axis=1))[:6] for place in places])
@@ -145,7 +147,7 @@ def touches(request):
 
 
 def changes_of(model, touched):
-    """Of the voltages by every touch."""
+    """Changes of the voltages by every touch."""
     expected, conductivity = [], uneven(model)
     for some, by in zip(np.asarray(touched.cells), np.asarray(touched.change), strict=True):
         factor = np.ones(model.mesh.num_cells)
@@ -155,7 +157,7 @@ def changes_of(model, touched):
 
 
 @pytest.mark.parametrize("contacts", ["tight", "open", "unlike"])
-def test_touches_are_exact_whatever_the_contacts(touches, contacts):
+def test_touches_are_exact_for_any_contacts(touches, contacts):
     model, touched = with_contacts(touches[0], CONTACTS[contacts]), touches[1]
     found = np.asarray(touch_changes(model, uneven(model), touched))
     assert max(map(miss, found, changes_of(model, touched))) < 1e-8
@@ -163,8 +165,8 @@ def test_touches_are_exact_whatever_the_contacts(touches, contacts):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("contacts", ["tight", "open", "unlike"])
-def test_touches_of_a_known_skin_are_exact_whatever_the_contacts(touches, contacts):
-    """With a model in NumPy, whose every operation would be compiled for itself otherwise."""
+def test_touches_of_a_known_skin_are_exact_for_any_contacts(touches, contacts):
+    """With a model in NumPy, of which JAX would compile every operation."""
     model, touched = on_host(with_contacts(touches[0], CONTACTS[contacts])), touches[1]
     known = RestingSkin.create(model, uneven(model), np.ones(model.mesh.num_points, bool))
     assert known is not None
@@ -172,8 +174,8 @@ def test_touches_of_a_known_skin_are_exact_whatever_the_contacts(touches, contac
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_what_is_not_a_number_is_refused_or_stays_none(case, model, bad):
-    """Where values can be seen it is refused; in compiled code every voltage is NaN, and no number is made up."""
+def test_values_that_are_not_numbers_are_refused_or_give_nan(case, model, bad):
+    """Known values are refused; in compiled code every voltage is NaN."""
     conductivity = uneven(model)
     conductivity[3] = bad
     with pytest.raises(ValueError, match="NaN or infinite"):
@@ -182,5 +184,5 @@ def test_what_is_not_a_number_is_refused_or_stays_none(case, model, bad):
         assert all(np.isnan(found).all() for found in compiled(model, jnp.asarray(conductivity)))
 
 
-def test_a_conductivity_below_zero_is_not_a_number_in_compiled_code(case, model):
+def test_a_negative_conductivity_gives_nan_in_compiled_code(case, model):
     assert not case.compiled or np.isnan(compiled(model, jnp.asarray(-uneven(model)))[0]).all()

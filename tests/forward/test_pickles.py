@@ -1,4 +1,4 @@
-"""Models, reconstructions, imagers and skins that are pickled (by Dask, too) or copied: the same bits."""
+"""Models, reconstructions, imagers and skins give the same bits after pickling (by Dask, too) or copying."""
 
 import copy
 import pickle
@@ -26,7 +26,7 @@ WAYS = {
 
 
 def assert_same_bits(original, use):
-    """Before it has been used, with all that it keeps empty, and after."""
+    """Before first use, with empty caches, and afterwards."""
     fresh = {way: change(original) for way, change in WAYS.items()}
     expected = jax.tree.map(np.asarray, use(original))
     for found in (*map(use, fresh.values()), *(use(change(original)) for change in WAYS.values())):
@@ -43,7 +43,7 @@ def test_models(kind):
 
 
 def assert_equal(original):
-    """All that it holds, without its being used."""
+    """Compare all fields without using the object."""
     for change in WAYS.values():
         again = change(original)
         assert jax.tree.structure(again) == jax.tree.structure(original), "and compiled code takes it for the same"
@@ -92,8 +92,8 @@ sys.stdout.buffer.write(np.asarray(model.voltages(conductivity)).tobytes())
 """
 
 
-def test_another_process_finds_the_same():
-    """As Dask's workers do: they hash otherwise, and know nothing of this one."""
+def test_another_process_computes_the_same():
+    """As in Dask's workers, with another hash seed and without any state of this process."""
     model = KINDS["boundary"](1.0)
     given = pickle.dumps((model, uneven(model)))
     done = subprocess.run([sys.executable, "-c", ANOTHER], input=given, capture_output=True, timeout=120)

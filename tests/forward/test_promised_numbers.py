@@ -1,6 +1,6 @@
-"""What docs/reference/versions.md promises within a major version: voltages to 1e-9, linear images to 1e-6.
+"""Numbers that docs/reference/versions.md promises within a major version: voltages to 1e-9, linear images to 1e-6.
 
-On a mesh made here, so that no mesh generator takes part; the numbers are those of version 1.0.
+The mesh is made here, so that no mesh generator takes part; the numbers are those of version 1.0.
 """
 
 import numpy as np

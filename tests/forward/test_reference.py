@@ -1,6 +1,6 @@
-"""Another toolkit's numbers on the same meshes: voltages, potentials, Jacobians, images.
+"""Another toolkit's voltages, potentials, Jacobians and images on the same meshes.
 
-The numbers are EIDORS 3.11's; see the README beside them for conventions.
+The numbers are those of EIDORS 3.11; see the README beside them for conventions.
 """
 
 from functools import cache
@@ -22,7 +22,7 @@ from jeit.mesh import Mesh
 from jeit.mesh.geometry import interior_facets
 from jeit.protocol import from_channels
 
-QUICK = ["circ2d_cem_576", "cyl3d_pem_768"]  # both electrode models, both dimensions; the others run in CI
+QUICK = ["circ2d_cem_576", "cyl3d_pem_768"]  # both electrode models in both dimensions; the others run in CI
 SLOW = [
     "circ2d_pem_576",
     "circ2d_pem_576_opposite",
@@ -31,13 +31,13 @@ SLOW = [
     "cyl3d_cem_netgen",
 ]
 CASES = [*QUICK, *(pytest.param(case, marks=pytest.mark.slow) for case in SLOW)]
-# Two direct solvers differ by the condition number, 1e3 to 1e4 here, times rounding.
+# Two direct solvers differ by the condition number, here 1e3 to 1e4, times rounding.
 SOLVE = 1e-11
 
 
 @cache
 def load(path: Path) -> dict:
-    """The arrays of one reference file, dense, column vectors flat."""
+    """The arrays of one reference file as dense arrays; column vectors are flattened."""
     arrays = {}
     for key, value in scipy.io.loadmat(path, spmatrix=False).items():
         if not key.startswith("__"):
@@ -48,7 +48,7 @@ def load(path: Path) -> dict:
 
 @cache
 def build(path: Path) -> tuple[dict, ForwardModel, list[np.ndarray]]:
-    """A case's arrays, the forward model on its mesh, and its electrodes' nodes."""
+    """The arrays of a case, the forward model on its mesh, and the nodes of its electrodes."""
     arrays = load(path)
     mesh = Mesh.create(arrays["nodes"], arrays["elems"].astype(int) - 1)
     table = arrays["elec_nodes"].reshape(arrays["stim"].shape[0], -1).astype(int)
@@ -63,7 +63,7 @@ def build(path: Path) -> tuple[dict, ForwardModel, list[np.ndarray]]:
 
 @pytest.fixture(params=CASES)
 def reference(request, reference_folder):
-    """One case after another: arrays, forward model, nodes of the electrodes."""
+    """Each case in turn: arrays, forward model, and nodes of the electrodes."""
     return build(reference_folder / f"{request.param}.mat")
 
 
@@ -82,15 +82,15 @@ def test_voltages(reference, conductivity, voltages):
 
 
 def test_voltages_of_a_tensor(reference):
-    """`v_tensor` belongs to the tensor times `sigma_i`."""
+    """`v_tensor` holds the voltages of the tensor times `sigma_i`."""
     arrays, model, _ = reference
     tensors = arrays["sigma_i"][:, None, None] * arrays["tensor"]
     assert relative(model.voltages(tensors), arrays["v_tensor"]) < SOLVE
 
 
 @pytest.mark.parametrize("case", ["circ2d_cem_576", pytest.param("disk2d_cem_distmesh", marks=pytest.mark.slow)])
-def test_arcs_that_happen_to_cover_whole_edges(reference_folder, case):
-    """Electrodes free of the mesh, given by position and width, meet the reference's electrodes exactly."""
+def test_arcs_that_cover_whole_edges(reference_folder, case):
+    """Arcs given by position and width equal the reference's electrodes exactly."""
     arrays, model, nodes = build(reference_folder / f"{case}.mat")
     facets, points = np.asarray(model.mesh.facets), np.asarray(model.mesh.points)
     position, width = [], []
@@ -127,9 +127,9 @@ def test_jacobian(reference, state):
 
 @pytest.mark.slow
 def test_jacobian_of_electrodes_that_move_with_their_nodes(reference):
-    """`J_movement_h`, all x then all y: each electrode shifts the nodes it stands on, and the mesh with them.
+    """`J_movement_h`, all x then all y: each electrode moves the nodes that it covers, and the mesh with them.
 
-    Both are applied to one random vector, where they differ if they differ anywhere.
+    Both are compared by their products with one random vector.
     """
     arrays, model, nodes = reference
     owner = np.zeros((model.mesh.num_points, len(nodes)))
@@ -145,8 +145,8 @@ def test_jacobian_of_electrodes_that_move_with_their_nodes(reference):
     assert relative(derivative, arrays["J_movement_h"] @ way.T.ravel()) < SOLVE
 
 
-def test_fields_balance_the_reference_system_matrix(reference):
-    """Nodes first, then electrodes if they are complete: matrix · (u, U) is the current that enters."""
+def test_fields_solve_the_reference_system(reference):
+    """Nodes first, then complete electrodes: matrix · (u, U) is the current that enters."""
     arrays, model, _ = reference
     nodes = np.asarray(model.potentials(arrays["sigma_h"]))
     drive = np.asarray(model.protocol.drive)
@@ -171,7 +171,7 @@ def test_priors(reference, prior, name):
 
 
 def test_total_variation_rows(reference):
-    """Every row is a shared face's measure times (1, −1); the rows' order and sign are free."""
+    """Every row is the measure of a shared face times (1, −1); the order and sign of the rows are arbitrary."""
     arrays, model, _ = reference
     pairs, shared = interior_facets(model.mesh)
     corners = np.asarray(model.mesh.points)[shared]
@@ -194,7 +194,7 @@ def test_one_step_images(reference, prior, name, tolerance):
 
 
 def test_absolute_image_by_gauss_newton(reference):
-    """The minimiser of ½‖v(σ) − v‖² + ½λ²‖σ − 1‖²: plain Gauss-Newton steps with the model's Jacobian."""
+    """The minimiser of ½‖v(σ) − v‖² + ½λ²‖σ − 1‖², by plain Gauss-Newton steps with the model's Jacobian."""
     arrays, model, _ = reference
     if "sigma_abs_gn_tikhonov" not in arrays:
         pytest.skip("the reference has no absolute image of this case")
@@ -203,7 +203,7 @@ def test_absolute_image_by_gauss_newton(reference):
     for _ in range(30):
         voltages, jacobian = map(np.asarray, model.voltages_and_jacobian(conductivity))
         gradient = jacobian.T @ (voltages - arrays["v_i"]) + weight * (conductivity - 1.0)
-        # Data space: M channels are fewer than m cells.
+        # Data space, because M channels are fewer than m cells.
         gram = jacobian @ jacobian.T + weight * np.eye(len(voltages))
         step = (gradient - jacobian.T @ np.linalg.solve(gram, jacobian @ gradient)) / weight
         conductivity = conductivity - step
@@ -213,11 +213,11 @@ def test_absolute_image_by_gauss_newton(reference):
 
 
 def test_disk_between_two_points_of_its_rim(reference_folder):
-    """`analytic2d`: its homogeneous column is the Fourier series of our logarithm, cut at 512 points.
+    """`analytic2d`: its homogeneous column is the Fourier series of the logarithm here, truncated at 512 points.
 
-    Its potentials carry a factor 2π, the current being given per unit angle over 2π. The cut series converges
-    to the logarithm like 1/(256 distance)². The concentric inclusion of its second column adds a smooth series that
-    no cut disturbs.
+    Its potentials have a factor of 2π, because its current is given per unit angle over 2π. The truncated series
+    converges to the logarithm like 1/(256 distance)². The concentric inclusion of its second column adds a smooth
+    series that is not affected by the truncation.
     """
     arrays = load(reference_folder / "analytic2d.mat")
     angles = 2.0 * np.pi * np.arange(512) / 512

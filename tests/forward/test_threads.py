@@ -1,4 +1,4 @@
-"""One model used from eight threads at once: what each of them finds is what one thread finds, bit for bit."""
+"""One model used from eight threads at once gives the results of one thread, bit for bit."""
 
 import threading
 from collections.abc import Callable
@@ -16,7 +16,7 @@ THREADS = 8
 
 
 def assert_as_alone(shared: Callable[[int], Any], alone: Callable[[int], Any], turns: int = THREADS) -> None:
-    """`shared` has been asked for nothing yet: all that it keeps is made while eight threads ask for it at once."""
+    """`shared` is unused so far, so that all its caches are filled while eight threads use it at once."""
     gate = threading.Barrier(THREADS)
 
     def work(thread: int) -> dict[int, Any]:
@@ -42,7 +42,7 @@ def conductivities(make):
 
 
 @pytest.mark.parametrize("quantity", ["voltages", "voltages_and_jacobian", "transfer_impedance", "fields"])
-def test_a_model_at_once(make, conductivities, quantity):
+def test_one_model(make, conductivities, quantity):
     shared, alone = (getattr(make(), quantity) for _ in range(2))
     assert_as_alone(lambda k: shared(conductivities[k]), lambda k: alone(conductivities[k]))
 

@@ -1,4 +1,5 @@
-"""Commands on files that are wrong: what a user sees of them, as `readers` has what a program sees."""
+"""Commands on invalid files, as `Reader` objects: what a command prints, where `readers` checks what a function
+raises."""
 
 import contextlib
 import io
@@ -16,12 +17,15 @@ COMMANDS: dict[str, Reader] = {}
 
 
 class Fault(Exception):
-    """Not as a command ends."""
+    """A command ended in another way than by success or one line of error."""
 
 
 def _run(*arguments: str) -> Callable[[Path], None]:
-    """A command whose {folder} is that of the file, and {output} another. Raises `ValueError` with what it says, and
-    `Fault` where it is none of a user's concern, longer than a line, or leaves files."""
+    """A command in which {folder} is the folder of the file and {output} another.
+
+    It raises `ValueError` with the printed error, and `Fault` if the error is internal, longer than a line, or leaves
+    files.
+    """
 
     def use(path: Path) -> None:
         with tempfile.TemporaryDirectory() as place, io.StringIO() as out, io.StringIO() as err:
@@ -34,7 +38,7 @@ def _run(*arguments: str) -> Callable[[Path], None]:
                 return
             if status not in (1, 2) or len(lines) != 1 or "should not have happened" in lines[0]:
                 raise Fault(f"{status}: {' / '.join(lines)}")
-            if [*Path(place).iterdir()] and "none could be imaged" not in lines[0]:  # a stream says so of every frame
+            if [*Path(place).iterdir()] and "none could be imaged" not in lines[0]:  # the note of a stream
                 raise Fault(f"left {sorted(map(str, output.rglob('*')))}")
             raise ValueError(lines[0])
 
@@ -52,7 +56,7 @@ def _command(name: str, kind: str, *arguments: str, also: Callable[[Path], objec
 
 
 def _touched(folder: Path) -> None:
-    """A table of a tank, and one of it with a body in it."""
+    """Write a table of a tank, and one with a body in it."""
     from jeit.data import load_description
 
     (folder / "a.toml").write_text(
@@ -70,26 +74,28 @@ def _touched(folder: Path) -> None:
 
 
 def _nine_microphones(folder: Path) -> None:
-    """A second of noise, in which nine microphones hear a tap as they were calibrated: what has changed since then is
-    looked for by a compiled program, and seldom here."""
+    """Write a second of noise with a tap, recorded by nine microphones as calibrated.
+
+    A compiled program searches for changes since the calibration, and is seldom needed here.
+    """
     from microphone_arrays import array, hear
 
     READERS["calibration"].make(folder)
     rng, strength = np.random.default_rng(0), np.sqrt(hear(array(9), [[0.02, 0.01]])[0])
-    heard = 1e-3 * rng.normal(size=(8000, 9))
-    heard[3000:3400] += 0.05 * rng.normal(size=(400, 1)) * strength / strength.max()
-    scipy.io.wavfile.write(folder / "a.wav", 8000, heard.astype("f4"))
+    samples = 1e-3 * rng.normal(size=(8000, 9))
+    samples[3000:3400] += 0.05 * rng.normal(size=(400, 1)) * strength / strength.max()
+    scipy.io.wavfile.write(folder / "a.wav", 8000, samples.astype("f4"))
 
 
 def _tapped(folder: Path) -> None:
-    """A tap, and what listens to it."""
+    """Write a tap and a listener."""
     READERS["listener"].make(folder)
     tap = struck(np.random.default_rng(5), "metal")
     scipy.io.wavfile.write(folder / "a.wav", 44_100, np.asarray(tap.samples).T.astype("f4"))
 
 
 def _healthy(folder: Path) -> None:
-    """A minute of one skin, and one in which a channel dies."""
+    """Write a minute of one skin, and one in which a channel fails."""
     rng = np.random.default_rng(0)
     frames = 1 + rng.random(40) + 1e-3 * rng.normal(size=(240, 40))
     np.savez(folder / "whole.npz", frames=frames, seconds=np.arange(240) / 4)

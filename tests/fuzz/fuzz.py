@@ -1,6 +1,6 @@
-"""Change files at random, read them, and count what came of it: `python tests/fuzz/fuzz.py --inputs 100000`.
+"""Change files at random, read them, and count the outcomes: `python tests/fuzz/fuzz.py --inputs 100000`.
 
-Every input is told by its reader and number, from which it is made anew: `--reader study --first 31 --inputs 1`.
+Every input is identified by its reader and number, which reproduce it: `--reader study --first 31 --inputs 1`.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from readers import Reader
 
 
 def changed_files(reader: Reader, number: int) -> dict[str, bytes]:
-    """Input `number` of a reader: its sound files, one of them changed, mostly that which it is asked for."""
+    """Input `number` of a reader: its valid files, one of them changed, in most cases the main file."""
     random = Random(f"{reader.name} {number}")
     files = dict(reader.files)
     others = sorted(files)
@@ -32,7 +32,7 @@ def changed_files(reader: Reader, number: int) -> dict[str, bytes]:
 
 
 def tried(reader: Reader, numbers: range, seconds: float = 60.0) -> Iterator[tuple[int, Outcome]]:
-    """What came of each of these inputs."""
+    """The outcome of each of these inputs."""
     for number in numbers:
         with tempfile.TemporaryDirectory() as folder:
             for name, content in changed_files(reader, number).items():
@@ -48,7 +48,7 @@ def tried(reader: Reader, numbers: range, seconds: float = 60.0) -> Iterator[tup
 
 
 def main() -> int:
-    """Print a table of counts, and every fault; 1 where there is any."""
+    """Print a table of counts and every fault; return 1 if there is any."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--inputs", type=int, default=2000, help="of all readers together")
     parser.add_argument("--reader", choices=[*READERS], action="append")
@@ -67,7 +67,7 @@ def main() -> int:
             counts["faulty" if came.faulty else came.kind] += 1
             slowest = max(slowest, came.seconds)
             if came.faulty:
-                faults.append(f"{reader.name} {number}: {came.kind}: {came.said}")
+                faults.append(f"{reader.name} {number}: {came.kind}: {came.message}")
         row = [each, counts["refused"], counts["accepted"], counts["faulty"]]
         print(f"{reader.name:26}" + "".join(f"{one:>{8 + (place in (1, 2))}}" for place, one in enumerate(row)), end="")
         print(f"{slowest:>7.1f} s", flush=True)

@@ -1,4 +1,4 @@
-"""Files made wrong: bytes, text, tables and archives, changed at random as broken disks, editors and enemies do."""
+"""Random changes of files: bytes, text, tables and archives, as damaged disks, editors or attackers make them."""
 
 import datetime
 import io
@@ -25,7 +25,7 @@ VALUES = (
 
 
 def mutated(name: str, content: bytes, random: Random) -> bytes:
-    """The `content` of a file of this `name`, with one to three changes of what suits its kind."""
+    """The `content` of a file of this `name` with one to three changes suited to its kind."""
     for _ in range(random.choice((1, 1, 2, 3))):
         kinds = [_bytes]
         if name.endswith((".toml", ".json")):
@@ -43,7 +43,7 @@ def mutated(name: str, content: bytes, random: Random) -> bytes:
 
 
 def _bytes(content: bytes, random: Random) -> bytes:
-    """Bits turned, numbers made extreme, parts lost, doubled, exchanged; cut short."""
+    """Flip bits, insert extreme numbers, remove, duplicate, exchange or truncate parts."""
     size = max(len(content), 1)
     start = random.randrange(size) if random.random() < 0.6 else random.randrange(min(size, 512))
     end = min(size, start + random.choice((1, 2, 4, 8, 64, 4096)))
@@ -69,7 +69,7 @@ def _bytes(content: bytes, random: Random) -> bytes:
 
 
 def _text(content: bytes, random: Random) -> bytes:
-    """Lines lost, doubled, exchanged, repeated; words and numbers replaced."""
+    """Remove, duplicate, exchange and repeat lines; replace words and numbers."""
     text = content.decode("utf-8", "surrogateescape")
     lines = text.splitlines(keepends=True) or [""]
     at, other = random.randrange(len(lines)), random.randrange(len(lines))
@@ -93,7 +93,7 @@ def _text(content: bytes, random: Random) -> bytes:
 
 
 def _pieces(line: str) -> list[tuple[int, int]]:
-    """Where words and numbers stand in a line."""
+    """Positions of words and numbers in a line."""
     found, start = [], None
     for index, letter in enumerate(line + "\n"):
         if letter.isalnum() or letter in ".-+_":
@@ -105,7 +105,7 @@ def _pieces(line: str) -> list[tuple[int, int]]:
 
 
 def _table(content: bytes, random: Random) -> bytes:
-    """A value of a TOML or JSON file replaced, taken away, renamed, or put where none was."""
+    """Replace, remove, rename or insert a value of a TOML or JSON file."""
     text = content.decode("utf-8", "replace")
     try:
         table, write = (json.loads(text), _json) if text.lstrip()[:1] == "{" else (tomllib.loads(text), _toml)
@@ -144,7 +144,7 @@ def _json(table) -> str:
 
 
 def _toml(table) -> str:
-    """Everything inline, below the top."""
+    """Format everything inline below the top level."""
     return "".join(f"{_key(key)} = {_inline(value)}\n" for key, value in table.items())
 
 
@@ -163,7 +163,7 @@ def _inline(value) -> str:
 
 
 def _archive(content: bytes, random: Random) -> bytes:
-    """A member changed, lost, renamed, doubled or added, in an archive that is sound."""
+    """Change, remove, rename, duplicate or insert a member of a valid archive."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = [[one.filename, archive.read(one)] for one in archive.infolist()]
@@ -195,7 +195,7 @@ def _archive(content: bytes, random: Random) -> bytes:
 
 
 def _npy(content: bytes, random: Random) -> bytes:
-    """Another header before the same numbers."""
+    """Put another header before the same data."""
     dtypes = ("<f8", "|O", "<U1000000", "|V8", "<c16", "|b1", "<M8[s]", "<i2", ">f4", "|S5", "x")
     shapes = ("()", "(0,)", "(10,)", "(-1,)", "(10000000000,)", "(3, 4)", "(2, 0, 5)", "(1,)*9", "'a'", f"({10**30},)")
     head = f"{{'descr': '{random.choice(dtypes)}', 'fortran_order': {random.choice(('True', 'False', '3'))}, "
@@ -204,7 +204,7 @@ def _npy(content: bytes, random: Random) -> bytes:
 
 
 def _packed(content: bytes, random: Random) -> bytes:
-    """A MATLAB file's element unpacked, changed, and packed again."""
+    """Unpack, change and pack an element of a MATLAB file."""
     place, made, elements = 128, content[:128], []
     while place + 8 <= len(content):
         kind, size = struct.unpack_from("<II", content, place)
@@ -224,6 +224,6 @@ def _packed(content: bytes, random: Random) -> bytes:
 
 
 def _head(content: bytes, random: Random) -> bytes:
-    """The JSON head of a network's file changed."""
+    """Change the JSON header of a network's file."""
     magic, head, rest = content.split(b"\n", 2) if content.count(b"\n") > 1 else (content, b"{}", b"")
     return magic + b"\n" + _table(head, random).replace(b"\n", b" ") + b"\n" + rest

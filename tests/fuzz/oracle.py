@@ -1,4 +1,4 @@
-"""What may come of a file: it is taken, or one clear error says why not; soon, in little memory, and nothing else."""
+"""Permitted outcomes for a file: it is accepted, or one clear error says why not, within limits of time and memory."""
 
 import resource
 import signal
@@ -10,20 +10,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 LONGEST, SECONDS, MEMORY = 400, 60, 2 * 10**9
-# Errors that say what is wrong with a file, and what is not installed.
+# Errors that describe what is wrong with a file, or what is not installed.
 CLEAR = (ValueError, FileNotFoundError, ImportError)
 
 
 class Hung(BaseException):
-    """It took too long; no `except Exception` holds it up."""
+    """The time limit was exceeded. This is no `Exception`, so that no handler catches it."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one file: "accepted", "refused", or the fault, and what was said."""
+    """The outcome for one file: "accepted", "refused", or the kind of fault, with the message."""
 
     kind: str
-    said: str
+    message: str
     seconds: float
 
     @property
@@ -32,25 +32,25 @@ class Outcome:
 
 
 def outcome(use: Callable[[], object], seconds: float = SECONDS) -> Outcome:
-    """Of using a file, within limits of time and address space."""
+    """Use a file within limits of time and address space, and return the outcome."""
     start = time.perf_counter()
     try:
         with _limits(seconds), warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)
             use()
-        kind, said = "accepted", ""
+        kind, message = "accepted", ""
     except Hung:
-        kind, said = "hung", "".join(traceback.format_exc(limit=-3))
+        kind, message = "hung", "".join(traceback.format_exc(limit=-3))
     except CLEAR as error:
-        said = str(error)
+        message = str(error)
         foreign = type(error) not in (ValueError, FileNotFoundError, ImportError, UnicodeError)
         foreign &= not type(error).__module__.startswith("jeit")
-        kind = "refused" if said and len(said) <= LONGEST and not foreign else "unclear"
-        said = f"{type(error).__name__} ({len(said)}): {said[:LONGEST]}"
+        kind = "refused" if message and len(message) <= LONGEST and not foreign else "unclear"
+        message = f"{type(error).__name__} ({len(message)}): {message[:LONGEST]}"
     except (Exception, RecursionError) as error:
         kind = type(error).__name__
-        said = f"{str(error)[:200]} | {_where(error)}"
-    return Outcome(kind, said, time.perf_counter() - start)
+        message = f"{str(error)[:200]} | {_where(error)}"
+    return Outcome(kind, message, time.perf_counter() - start)
 
 
 def _where(error: BaseException) -> str:
@@ -67,7 +67,7 @@ def _limits(seconds: float):
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     with open("/proc/self/statm") as file:
         taken = int(file.read().split()[0]) * resource.getpagesize()
-    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # again, where it was raised where nothing can be
+    signal.setitimer(signal.ITIMER_REAL, seconds, 1.0)  # repeat it, in case the first is raised where it is ignored
     resource.setrlimit(resource.RLIMIT_AS, (taken + MEMORY, hard))
     try:
         yield

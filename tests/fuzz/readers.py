@@ -1,4 +1,4 @@
-"""Every kind of file that jeit reads: a small sound one, and what reads it."""
+"""Every kind of file that jeit reads: a small valid file, and the function that reads it."""
 
 import sys
 from collections.abc import Callable
@@ -53,7 +53,7 @@ from jeit.touch.networks.unrolled import Unrolled
 
 @dataclass(frozen=True)
 class Reader:
-    """What one kind of file is made by and read by; `main`, its file in the folder that `make` fills."""
+    """How one kind of file is written and read; `main` is its file in the folder that `make` fills."""
 
     name: str
     main: str
@@ -62,7 +62,7 @@ class Reader:
 
     @property
     def files(self) -> dict[str, bytes]:
-        """A sound file of the kind and what lies beside it, by their names in a folder."""
+        """A valid file of the kind and the files beside it, by their names in a folder."""
         return _files(self.name)
 
 
@@ -214,8 +214,8 @@ def _patterns(folder):
     held = {"current_patterns": current, "frame_voltage": voltages - voltages.mean(axis=0)}
     scipy.io.savemat(folder / "a.mat", held, do_compression=True)
     driven = BODY.replace('kind = "adjacent"\ncurrent = 1e-3', 'kind = "measured"')
-    said = driven.replace('frame_names = ["a", "b"]', 'keys = ["frame_voltage"]\nframe_rate = 5.0')
-    (folder / "a.toml").write_text(said)
+    description = driven.replace('frame_names = ["a", "b"]', 'keys = ["frame_voltage"]\nframe_rate = 5.0')
+    (folder / "a.toml").write_text(description)
 
 
 def _instrument(name, suffix, number, make):
@@ -355,7 +355,7 @@ def _curved_study(folder):
 
 @_reader("store of a study", "a.zarr", lambda path: study_progress(read_study(path.parent / "a.toml"), path))
 def _store(folder):
-    # One point, as each file of it is spoilt in turn.
+    # One point, because each of its files is changed in turn.
     (folder / "a.toml").write_text(SMALL.replace(', "perimeter-8"', ""))
     run_study(read_study(folder / "a.toml"), folder / "a.zarr")
 

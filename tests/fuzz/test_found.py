@@ -1,4 +1,4 @@
-"""Files that once hung, took gigabytes, ended in errors of other packages, or were written through: each named."""
+"""Files that once hung, took gigabytes, raised errors of other packages, or overwrote other files, each by name."""
 
 import io
 import json
@@ -21,11 +21,11 @@ from jeit.mesh import read as read_mesh
 from jeit.report.folder import results
 from jeit.report.growing import GrowingTable
 
-ZEROS = 3000  # million, of a bomb
+ZEROS = 3000  # million, of a decompression bomb
 
 
 def bomb(beginning: bytes) -> bytes:
-    """A raw deflate stream of `beginning` and gigabytes of zeros, some megabytes long."""
+    """A raw deflate stream of `beginning` and gigabytes of zeros, a few megabytes long."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     head = packer.compress(beginning) + packer.flush(zlib.Z_FULL_FLUSH)
     block = packer.compress(bytes(2**20)) + packer.flush(zlib.Z_FULL_FLUSH)
@@ -33,7 +33,7 @@ def bomb(beginning: bytes) -> bytes:
 
 
 def zipped(members: dict[str, bytes], bombs: dict[str, bytes]) -> bytes:
-    """An archive of members, and of bombs that begin so."""
+    """An archive of members, and of bombs with these beginnings."""
     made = io.BytesIO()
     with zipfile.ZipFile(made, "w") as archive:
         for name, content in {**members, **dict.fromkeys(bombs, b"")}.items():
@@ -60,7 +60,7 @@ def npy_head(shape: str, dtype: str = "<f8") -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(head)) + head.encode()
 
 
-def sound_members(name: str) -> dict[str, bytes]:
+def valid_members(name: str) -> dict[str, bytes]:
     with zipfile.ZipFile(io.BytesIO(READERS[name].files["a.npz"])) as archive:
         return {one: archive.read(one) for one in archive.namelist()}
 
@@ -71,7 +71,7 @@ def mat_bomb(content: bytes) -> bytes:
 
 
 def element(name: str, shape: tuple[int, ...], stored: bytes, size: int) -> bytes:
-    """What format 5 says of an array of doubles, of `size` bytes whatever is stored."""
+    """The format-5 header of an array of doubles, stating `size` bytes whatever is stored."""
     flags, letters = struct.pack("<IIII", 6, 8, 6, 0), name.encode().ljust(-(-len(name) // 8) * 8, b"\0")
     lengths = struct.pack(f"<II{len(shape)}i", 5, 4 * len(shape), *shape)
     lengths += bytes(-len(lengths) % 8)
@@ -80,14 +80,14 @@ def element(name: str, shape: tuple[int, ...], stored: bytes, size: int) -> byte
 
 
 def mat_with(extra: bytes) -> bytes:
-    sound = READERS["eidors"].files["a.mat"]
-    return sound + struct.pack("<II", 15, len(extra)) + extra
+    valid = READERS["eidors"].files["a.mat"]
+    return valid + struct.pack("<II", 15, len(extra)) + extra
 
 
 def svg(old: str, new: str) -> bytes:
-    sound = READERS["layout, svg"].files["a.svg"].decode()
-    assert old in sound
-    return sound.replace(old, new, 1).encode()
+    valid = READERS["layout, svg"].files["a.svg"].decode()
+    assert old in valid
+    return valid.replace(old, new, 1).encode()
 
 
 def outlined(path: str) -> bytes:
@@ -101,16 +101,16 @@ def circles(number: int) -> bytes:
 
 
 def dxf(old: str, new: str) -> bytes:
-    sound = READERS["layout, dxf"].files["a.dxf"].decode()
-    assert old in sound
-    return sound.replace(old, new).encode()
+    valid = READERS["layout, dxf"].files["a.dxf"].decode()
+    assert old in valid
+    return valid.replace(old, new).encode()
 
 
 def flac_of_hours() -> bytes:
-    """STREAMINFO says 2³⁵ samples."""
-    sound = bytearray(READERS["sound, flac"].files["a.flac"])
-    sound[21] |= 0x08
-    return bytes(sound)
+    """STREAMINFO states 2³⁵ samples."""
+    valid = bytearray(READERS["sound, flac"].files["a.flac"])
+    valid[21] |= 0x08
+    return bytes(valid)
 
 
 def network_with(**head) -> bytes:
@@ -118,28 +118,28 @@ def network_with(**head) -> bytes:
     return magic + b"\n" + json.dumps(json.loads(own) | head).encode() + b"\n" + rest
 
 
-# By name: the reader, its file, what is said; None where it is to be taken.
+# By name: the reader, its file, and the expected error; None if it is accepted.
 FOUND = {
     "a bomb in an array of an NPZ file": (
         "taps",
         lambda: zipped(
-            {name: one for name, one in sound_members("taps").items() if name != "intensity.npy"},
+            {name: one for name, one in valid_members("taps").items() if name != "intensity.npy"},
             {"intensity.npy": npy_head("(9, 43690666)")},
         ),
         "JEIT_FILE_GB=7",
     ),
-    "a bomb in a member that nobody needs": (
-        "taps", lambda: zipped(sound_members("taps"), {"other.npy": npy_head("(393216000,)")}), None,
+    "a bomb in an unused member": (
+        "taps", lambda: zipped(valid_members("taps"), {"other.npy": npy_head("(393216000,)")}), None,
     ),
-    "a header that says more than there is": (
+    "a header that states more data than there are": (
         "sound, npz",
-        lambda: zipped({**sound_members("sound, npz"), "samples.npy": npy_head("(2, 99)")}, {}),
+        lambda: zipped({**valid_members("sound, npz"), "samples.npy": npy_head("(2, 99)")}, {}),
         "says 1584 bytes of numbers, and has 128",
     ),
     "bytes that become numbers of eight": (
         "sound, npz",
         lambda: zipped(
-            {name: one for name, one in sound_members("sound, npz").items() if name != "samples.npy"},
+            {name: one for name, one in valid_members("sound, npz").items() if name != "samples.npy"},
             {"samples.npy": npy_head("(2, 100000000)", "|i1")},
         ),
         "GB in memory",
@@ -149,7 +149,7 @@ FOUND = {
     ),
     "letters beyond all scripts": (
         "table, npz",
-        lambda: zipped({**sound_members("table, npz"), "notes.npy": npy_head("(1,)", "<U1") + b"\xff" * 4}, {}),
+        lambda: zipped({**valid_members("table, npz"), "notes.npy": npy_head("(1,)", "<U1") + b"\xff" * 4}, {}),
         "no letter",
     ),
     "a bomb in a MATLAB variable": (
@@ -174,7 +174,7 @@ FOUND = {
     "a field of two hundred thousand letters": (
         "layout, csv", lambda: READERS["layout, csv"].files["a.csv"] + b"1," * 3 + b"x" * 200_000, "no row of a table",
     ),
-    "an encoding that there is not": (
+    "an unknown encoding": (
         "layout, svg", lambda: svg("encoding='utf-8'", "encoding='klingon'"), "not an SVG drawing",
     ),
     "a drawing cut short": ("layout, dxf", lambda: READERS["layout, dxf"].files["a.dxf"][:700], "not a DXF drawing"),
@@ -185,38 +185,38 @@ FOUND = {
 
 
 @pytest.mark.parametrize("name", FOUND)
-def test_found(name, tmp_path):
-    kind, make, said = FOUND[name]
+def test_past_faults(name, tmp_path):
+    kind, make, message = FOUND[name]
     reader = READERS[kind]
     for other, content in reader.files.items():
         (tmp_path / other).write_bytes(content)
     (tmp_path / reader.main).write_bytes(make())
     start = time.process_time()
     came = outcome(lambda: reader.use(tmp_path), seconds=20)
-    assert came.kind == ("accepted" if said is None else "refused"), came.said
-    assert said is None or said in came.said
+    assert came.kind == ("accepted" if message is None else "refused"), came.message
+    assert message is None or message in came.message
     assert time.process_time() - start < 10
 
 
 def test_indices_beyond_a_sparse_matrix(tmp_path):
-    """SciPy's reader would write to memory that is not the matrix's."""
+    """SciPy's reader would write outside of the matrix's memory."""
     import scipy.sparse
 
     scipy.io.savemat(tmp_path / "a.mat", {"a": scipy.sparse.csc_matrix(np.diag([1.0, 2.0, 3.0]))}, do_compression=False)
-    sound = (tmp_path / "a.mat").read_bytes()
+    valid = (tmp_path / "a.mat").read_bytes()
     rows = struct.pack("<3i", 0, 1, 2)
-    assert rows in sound
-    (tmp_path / "a.mat").write_bytes(sound.replace(rows, struct.pack("<3i", 0, 1, 10**9), 1))
+    assert rows in valid
+    (tmp_path / "a.mat").write_bytes(valid.replace(rows, struct.pack("<3i", 0, 1, 10**9), 1))
     with pytest.raises(ValueError, match="readable"):
         matlab.load(tmp_path / "a.mat", "a")
 
 
 @pytest.mark.parametrize("text", ["[/]", "[bold", "[link=x]", "a\x1b[31mb"])
-def test_text_of_files_is_no_markup(text, tmp_path, capsys):
+def test_text_of_files_is_printed_without_markup(text, tmp_path, capsys):
     for other, content in READERS["table, csv"].files.items():
         (tmp_path / other).write_bytes(content)
-    told = (tmp_path / "a.toml").read_text().replace('"of Friday"', json.dumps(text))
-    (tmp_path / "a.toml").write_text(told.replace('"a", "b"', f"{json.dumps(text)}, 'b'"))
+    description = (tmp_path / "a.toml").read_text().replace('"of Friday"', json.dumps(text))
+    (tmp_path / "a.toml").write_text(description.replace('"a", "b"', f"{json.dumps(text)}, 'b'"))
     assert main(["info", str(tmp_path / "a.csv")]) == 0
     assert text.replace("\x1b", "") in capsys.readouterr().out.replace("\x1b", "")
 
@@ -224,10 +224,10 @@ def test_text_of_files_is_no_markup(text, tmp_path, capsys):
 def test_a_long_error_is_one_short_line(tmp_path, capsys):
     (tmp_path / "a.csv").write_text("x" * 100_000)
     assert main(["info", str(tmp_path / f"{'a' * 200}.csv"), "--description", "\x1b" + "b" * 3000]) == 1
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1
-    assert len(said) <= 400
-    assert "\x1b" not in said
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert len(message) <= 400
+    assert "\x1b" not in message
 
 
 def test_a_link_is_replaced_and_not_followed(tmp_path):
@@ -241,7 +241,7 @@ def test_a_link_is_replaced_and_not_followed(tmp_path):
     assert not (tmp_path / "out" / "report.json").is_symlink()
 
 
-def test_all_files_or_none(tmp_path):
+def test_all_files_are_written_or_none(tmp_path):
     (tmp_path / "a").write_text("before")
 
     def fail_at_the_last():
@@ -255,8 +255,8 @@ def test_all_files_or_none(tmp_path):
     assert (tmp_path / "a").read_text() == "before"
 
 
-def test_a_file_given_is_not_written_over(tmp_path, capsys):
-    """Where a stream's table has the name of its input."""
+def test_an_input_file_is_not_overwritten(tmp_path, capsys):
+    """The table of a stream would have the name of its input."""
     for other, content in READERS["table, csv"].files.items():
         (tmp_path / other.replace("a.", "frames.")).write_bytes(content)
     before = (tmp_path / "frames.csv").read_bytes()
@@ -266,8 +266,8 @@ def test_a_file_given_is_not_written_over(tmp_path, capsys):
     assert (tmp_path / "frames.csv").read_bytes() == before
 
 
-def test_a_table_replaces_what_is_at_its_place(tmp_path):
-    """A hard link, whose other name would be written through, and a pipe, which would be waited for."""
+def test_a_table_replaces_an_existing_link_or_pipe(tmp_path):
+    """A hard link, whose other name would be overwritten, and a pipe, on which writing would wait."""
     (tmp_path / "mine").write_text("precious")
     (tmp_path / "link").hardlink_to(tmp_path / "mine")
     os.mkfifo(tmp_path / "pipe")
@@ -291,7 +291,7 @@ def test_a_chunk_that_unpacks_to_gigabytes(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("name", "content", "message"),
     [
         (
             "a.vtk",
@@ -301,9 +301,9 @@ def test_a_chunk_that_unpacks_to_gigabytes(tmp_path):
         ("a.inp", b"*NODE\n1,0,0,0\n*NSET,NSET=a,GENERATE\n1,2000000000,1\n", "GENERATE"),
     ],
 )
-def test_meshes_of_a_few_letters(tmp_path, name, content, said):
+def test_small_mesh_files_of_huge_meshes(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         read_mesh(tmp_path / name)
 
 
@@ -313,14 +313,14 @@ def test_a_key_of_forty_thousand_parts(tmp_path):
         read_toml(tmp_path / "a.toml")
 
 
-def test_a_name_that_is_no_text(tmp_path, capsys):
+def test_a_file_name_that_is_not_valid_text(tmp_path, capsys):
     for other, content in READERS["table, csv"].files.items():
         (tmp_path / other.replace("a.", "b\udcff.")).write_bytes(content)
     assert main(["info", str(tmp_path / "b\udcff.csv")]) == 0
     assert "\\udcff" in capsys.readouterr().out
 
 
-def test_a_head_of_text_that_unpacks_to_many_times_its_size(tmp_path):
+def test_a_text_header_that_unpacks_to_many_times_its_size(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.skops", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("schema.json", b"[]," * 6_000_000)
     with pytest.raises(ValueError, match=r"schema\.json. in it has 18000000 bytes of text"):
@@ -334,8 +334,8 @@ def test_transforms_too_large(tmp_path):
         read_layout(tmp_path / "a.svg")
 
 
-def test_an_output_of_an_earlier_run_is_no_input(tmp_path):
-    """Only what is read may not be written over."""
+def test_an_output_of_an_earlier_run_is_not_an_input(tmp_path):
+    """Only files that are read must not be overwritten."""
     (tmp_path / "report.json").write_text("{}")
     command = remembering_files(lambda **_: make_folder(tmp_path, ("report.json",)))
     command(output=tmp_path / "report.json", data="elsewhere")

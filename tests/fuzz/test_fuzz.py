@@ -1,4 +1,5 @@
-"""Two thousand files made wrong at random, half of them quickly: each is taken, or refused clearly; nothing is left."""
+"""Two thousand randomly changed files, half of them in the quick tests: each is accepted or clearly refused, without
+remains."""
 
 import pytest
 from commands import COMMANDS, READERS
@@ -7,13 +8,13 @@ from oracle import outcome
 
 FILES = [name for name in READERS if name not in COMMANDS]
 EACH = -(-2000 // len(FILES))
-# Quickly fewer of those that take a while each.
+# The quick tests have fewer inputs of the slow readers.
 QUICKLY = {name: EACH // 8 if name in ("store of a study", "skin, curved") else EACH // 2 for name in FILES}
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", FILES)
-def test_a_sound_file_is_taken(name, tmp_path):
+def test_valid_files_are_accepted(name, tmp_path):
     for one, content in READERS[name].files.items():
         (tmp_path / one).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / one).write_bytes(content)
@@ -21,31 +22,31 @@ def test_a_sound_file_is_taken(name, tmp_path):
 
 
 def faults(name: str, numbers: range) -> list[str]:
-    """Of these inputs."""
-    return [f"{at}: {one.kind}: {one.said}" for at, one in tried(READERS[name], numbers) if one.faulty]
+    """The faults among these inputs."""
+    return [f"{at}: {one.kind}: {one.message}" for at, one in tried(READERS[name], numbers) if one.faulty]
 
 
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", FILES)
-def test_no_input_makes_a_fault(name):
+def test_no_input_causes_a_fault(name):
     assert faults(name, range(QUICKLY[name])) == []
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", FILES)
-def test_no_other_input_makes_a_fault(name):
+def test_no_further_input_causes_a_fault(name):
     assert faults(name, range(QUICKLY[name], EACH)) == []
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("name", COMMANDS)
-def test_no_input_makes_a_command_fail_otherwise(name):
+def test_commands_fail_with_one_line(name):
     assert faults(name, range(20)) == []
 
 
-def test_an_input_is_told_by_its_number():
+def test_an_input_is_reproduced_by_its_number():
     reader = READERS["layout, csv"]
     assert changed_files(reader, 3) == changed_files(reader, 3) != changed_files(reader, 4)
 
@@ -68,5 +69,5 @@ def _hang():
         (lambda: bytearray(5 * 10**9), "MemoryError"),
     ],
 )
-def test_the_oracle_sees_faults(use, kind):
+def test_the_oracle_detects_faults(use, kind):
     assert outcome(use, seconds=0.2).kind == kind

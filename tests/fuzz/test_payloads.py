@@ -1,4 +1,4 @@
-"""Files in which something waits to be executed: for every reader it never is."""
+"""Files that contain code to be executed: no reader executes it."""
 
 import contextlib
 import io
@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from readers import READERS
 
-# Commands that take seconds, and read nothing but what other readers do.
+# Commands that take seconds and read nothing that the other readers do not.
 READ_ANYWAY = ("jeit study status", "jeit touch predict")
 KEPT = sorted(name for name, one in READERS.items() if one.main.endswith(".npz"))
 
 
 class Touch:
-    """Makes a file when it is unpickled."""
+    """Creates a file when it is unpickled."""
 
     def __init__(self, path):
         self.path = path
@@ -37,7 +37,7 @@ def use(reader, files, folder):
     return reader.use(folder)
 
 
-def test_the_payload_would_run(ran):
+def test_the_payload_is_executed_by_pickle(ran):
     pickle.loads(pickle.dumps(Touch(ran)))
     assert ran.exists()
 
@@ -46,8 +46,8 @@ def test_the_payload_would_run(ran):
 @pytest.mark.parametrize(
     "name", [pytest.param(one, marks=pytest.mark.slow) if one in READ_ANYWAY else one for one in READERS]
 )
-def test_a_pickle_in_its_place(name, tmp_path, ran):
-    """Of every file of the kind in turn, under its name."""
+def test_a_pickle_in_place_of_a_file(name, tmp_path, ran):
+    """In place of every file of the kind in turn, under its name."""
     reader = READERS[name]
     for place, planted in enumerate(reader.files):
         files = reader.files | {planted: pickle.dumps(Touch(ran))}
@@ -58,7 +58,7 @@ def test_a_pickle_in_its_place(name, tmp_path, ran):
 
 @pytest.mark.parametrize("name", KEPT)
 def test_arrays_of_objects(name, tmp_path, ran):
-    """In place of each array, in an archive that is sound."""
+    """In place of each array of a valid archive."""
     reader = READERS[name]
     with zipfile.ZipFile(io.BytesIO(reader.files[reader.main])) as archive:
         members = {one: archive.read(one) for one in archive.namelist()}
@@ -83,12 +83,12 @@ def test_an_npy_of_objects(tmp_path, ran):
     assert not ran.exists()
 
 
-def test_entities_and_scripts_of_a_drawing(tmp_path):
+def test_entities_and_scripts_in_a_drawing(tmp_path):
     (tmp_path / "secret").write_text("12")
-    sound = READERS["layout, svg"].files["a.svg"].decode()
+    valid = READERS["layout, svg"].files["a.svg"].decode()
     entity = f'<!DOCTYPE svg [<!ENTITY e SYSTEM "{(tmp_path / "secret").as_uri()}">]>'
-    declared = sound.replace("?>", f"?>{entity}", 1).replace('id="LABELS"', 'id="LABELS" class="&e;"')
+    declared = valid.replace("?>", f"?>{entity}", 1).replace('id="LABELS"', 'id="LABELS" class="&e;"')
     with pytest.raises(ValueError, match="DOCTYPE"):
         use(READERS["layout, svg"], {"a.svg": declared.encode()}, tmp_path / "entity")
-    script = sound.replace("</svg>", "<script>alert(1)</script></svg>")
+    script = valid.replace("</svg>", "<script>alert(1)</script></svg>")
     assert use(READERS["layout, svg"], {"a.svg": script.encode()}, tmp_path / "script").num_electrodes == 8

@@ -1,4 +1,4 @@
-"""Planes and surfaces through solids: areas, volumes and places against what is known."""
+"""Sections and isosurfaces of solids: areas, volumes and positions against known values."""
 
 import numpy as np
 import pytest
@@ -22,9 +22,9 @@ def tank():
         (Plane.at("z", BOX[2] / 2), BOX[0] * BOX[1]),
         (Plane.at("x", 0.013), BOX[1] * BOX[2]),
         (Plane.at("y", -0.1), BOX[0] * BOX[2]),
-        # Across the diagonal of two axes the cut is longer by the inverse cosine.
+        # A section across the diagonal of two axes is longer by the inverse cosine.
         (Plane.through((0, 0, 0.085), (1, 0, 1)), np.sqrt(2) * BOX[2] * BOX[1]),
-        # Along walls, seen from either side: the cells behind them are cut, once.
+        # Along walls, seen from either side: the cells behind the wall are cut, once.
         (Plane.at("z", BOX[2]), BOX[0] * BOX[1]),
         (Plane.at("z", 0.0), BOX[0] * BOX[1]),
         (Plane.at("y", BOX[1] / 2), BOX[0] * BOX[2]),
@@ -34,15 +34,15 @@ def test_a_cut_has_the_area_of_the_section(tank, plane, area):
     assert cut_by_plane(tank, plane).area == pytest.approx(area, rel=1e-12)
 
 
-def test_a_cut_through_nodes_takes_every_cell_once(tank):
-    """A layered mesh has all nodes of a layer in one plane."""
+def test_a_cut_through_nodes_contains_every_cell_once(tank):
+    """In a layered mesh, all nodes of a layer lie in one plane."""
     z = np.unique(np.round(np.asarray(tank.points)[:, 2], 12))[3]
     cut = cut_by_plane(tank, Plane.at("z", float(z)))
     assert cut.area == pytest.approx(BOX[0] * BOX[1], rel=1e-12)
     assert len(set(cut.cell.tolist())) == len(cut.cell)
 
 
-def test_a_cut_shows_the_cell_that_is_there(tank):
+def test_a_cut_shows_the_cells_in_its_plane(tank):
     plane = Plane.at("x", 0.0123)
     cut = cut_by_plane(tank, plane)
     middle = cut.polygons[:, :3].mean(axis=1)
@@ -66,14 +66,14 @@ def test_a_section_of_a_cylinder_is_its_polygon():
 
 
 @pytest.mark.parametrize(("axis", "right", "up"), [("x", "y", "z"), ("y", "x", "z"), ("z", "x", "y")])
-def test_pages_have_the_other_axes_to_the_right_and_up(axis, right, up):
+def test_pages_show_the_other_axes_to_the_right_and_up(axis, right, up):
     plane, unit = Plane.at(axis, 0.1), dict(zip("xyz", np.eye(3), strict=True))
     np.testing.assert_array_equal(plane.right, unit[right])
     np.testing.assert_array_equal(plane.up, unit[up])
     assert plane.name == f"{axis} = 100 mm"
 
 
-def test_planes_across_any_direction_have_pages_at_right_angles():
+def test_pages_of_any_plane_are_orthonormal():
     plane = Plane.through((0.01, 0, 0.02), (1, 2, -3))
     page = np.stack([plane.right, plane.up, plane.toward])
     np.testing.assert_allclose(page @ page.T, np.eye(3), atol=1e-15)
@@ -83,7 +83,7 @@ def test_planes_across_any_direction_have_pages_at_right_angles():
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda: Plane.at("w", 0.1), "axis must be"),
         (lambda: Plane.at("z", np.nan), "value must be"),
@@ -95,17 +95,17 @@ def test_planes_across_any_direction_have_pages_at_right_angles():
         (lambda: cut_by_plane(box(0.1, 0.1, 0.1, num_points=100), "z"), "plane must be a Plane"),
     ],
 )
-def test_planes_that_cannot_be(make, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_planes(make, message):
+    with pytest.raises(ValueError, match=message):
         make()
 
 
 def ball(tank, radius, middle):
-    """A function of the nodes whose level 1 is a ball."""
+    """A function of the nodes whose isosurface at level 1 is a sphere."""
     return 1 + (radius - np.linalg.norm(np.asarray(tank.points) - middle, axis=1)) / radius
 
 
-def test_the_volume_within_converges_to_that_of_a_ball():
+def test_enclosed_volume_converges_to_that_of_a_ball():
     error, sizes = [], [0.02, 0.01]
     for size in sizes:
         tank = box(0.1, 0.1, 0.1, cell_size=size)
@@ -118,7 +118,7 @@ def test_the_volume_within_converges_to_that_of_a_ball():
 
 
 def closed(surface):
-    """Whether every edge has a triangle on either side, turned the same way."""
+    """Whether every edge has a triangle on either side, with the same orientation."""
     triangles = surface.triangles
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     there = {tuple(edge) for edge in edges.tolist()}
@@ -126,7 +126,7 @@ def closed(surface):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_surfaces_are_closed_and_turned_outward_at_the_wall_too(tank, sign):
+def test_surfaces_are_closed_and_oriented_outward_at_the_wall_too(tank, sign):
     for middle in ([0.01, 0.02, 0.08], [0.085, 0, 0.1], [0.085, 0.1275, 0.17]):
         share = 0.5 ** sum(abs(abs(m) - w) < 1e-9 for m, w in zip(middle, [0.085, 0.1275, 0.17], strict=True))
         surface = isosurface_of(tank, sign * ball(tank, 0.05, middle), sign * 1.0)
@@ -140,7 +140,7 @@ def test_linear_values_are_cut_exactly(tank):
     assert above.enclosed == pytest.approx(BOX[0] * BOX[1] * (BOX[2] - 0.05), rel=1e-12)
 
 
-def test_an_image_that_does_not_get_there_has_no_surface(tank):
+def test_an_image_below_the_level_has_no_surface(tank):
     assert len(isosurface_of(tank, np.zeros(tank.num_cells), 1.0).triangles) == 0
     assert isosurface_of(tank, np.zeros(tank.num_cells), 1.0).enclosed == 0
 
@@ -151,24 +151,24 @@ def test_cells_are_averaged_by_their_volume(tank):
     node = 100
     round_it = (np.asarray(tank.cells) == node).any(axis=1)
     assert at_nodes[node] == pytest.approx(np.average(slope[round_it], weights=weight[round_it]), rel=1e-12)
-    # What is the same everywhere stays what it is.
+    # Constant values stay constant.
     np.testing.assert_allclose(node_values(tank, np.full(tank.num_cells, 2.5)), 2.5, rtol=1e-13)
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "message"),
     [(np.zeros(3), "values has shape"), (None, "complex"), ("nan", "finite")],
 )
-def test_values_that_cannot_be(tank, values, said):
+def test_invalid_values(tank, values, message):
     made = {None: np.zeros(tank.num_cells, complex), "nan": np.full(tank.num_cells, np.nan)}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         node_values(tank, made[values] if values is None or isinstance(values, str) else values)
     with pytest.raises(ValueError, match="level must be"):
         isosurface_of(tank, np.zeros(tank.num_cells), 0.0)
 
 
-def test_every_way_of_passing_a_tetrahedron():
-    """Polygons of all sixteen signs of four nodes against the areas they have in the unit tetrahedron."""
+def test_every_section_of_a_tetrahedron():
+    """Polygons for all sixteen combinations of signs at four nodes, against their areas in the unit tetrahedron."""
     points, cell = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2, 3]])
     for number in range(16):
         signs = np.array([1.0 if number >> k & 1 else -1.0 for k in range(4)])
@@ -180,7 +180,7 @@ def test_every_way_of_passing_a_tetrahedron():
         corners = pieces.at_corners(points)[0]
         edges = np.diff(corners, axis=0, append=corners[:1])
         lengths = np.linalg.norm(edges, axis=1)
-        # Half way along edges: half as large as the facet opposite one node, a parallelogram between two pairs.
+        # Half way along edges: half the size of the facet opposite to one node, and a parallelogram between two pairs.
         assert (lengths < 1e-12).sum() == (0 if above == 2 else 1)
         if above == 2:
             np.testing.assert_allclose(edges[0], -edges[2], atol=1e-12)

@@ -1,4 +1,4 @@
-"""Figures of merit: images drawn by hand, whose figures are known; and another toolkit's images with its figures."""
+"""Figures of merit of synthetic images with known values, and of another toolkit's images with its values."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ X, Y = np.meshgrid(AXIS, -AXIS)
 RADIUS = 0.02
 AREA = np.pi * RADIUS**2
 FIELDS = ("amplitude_response", "position_error", "resolution", "shape_deformation", "ringing")
-# Areas are sums of pixels: a staircase round a disc of forty pixels' radius is right to a few parts in a thousand.
+# Areas are sums of pixels: a staircase round a disc of forty pixels' radius is accurate to a few parts in a thousand.
 STAIRCASE = 5e-3
 
 
@@ -49,7 +49,7 @@ def test_a_perfect_image_anywhere():
     np.testing.assert_allclose(found.body_radius, BODY, rtol=1e-3)
 
 
-def test_position_error_is_positive_when_imaged_too_near_to_the_centre():
+def test_position_error_is_positive_for_images_too_near_to_the_centre():
     inwards, outwards = merit(disc(0.03, 0.04), (0.036, 0.048)), merit(disc(0.03, 0.04), (0.024, 0.032))
     assert float(inwards.position_error) == pytest.approx(0.01, abs=0.1 * PIXEL)
     assert float(outwards.position_error) == pytest.approx(-0.01, abs=0.1 * PIXEL)
@@ -58,17 +58,17 @@ def test_position_error_is_positive_when_imaged_too_near_to_the_centre():
 
 
 @pytest.mark.parametrize(("halo", "radius"), [(0.2, 1), (0.3, 2)])
-def test_the_set_is_what_exceeds_a_quarter(halo, radius):
+def test_the_region_above_a_quarter_of_the_maximum(halo, radius):
     found = merit(disc() + halo * (disc(radius=2 * RADIUS) - disc()))
     assert float(found.resolution) == pytest.approx(radius * RADIUS / BODY, rel=STAIRCASE)
     assert float(found.amplitude_response) == pytest.approx(1 + 3 * halo, rel=STAIRCASE)
 
 
 @pytest.mark.parametrize("ratio", [2.0, 4.0])
-def test_an_ellipse_is_deformed(ratio):
+def test_shape_deformation_of_an_ellipse(ratio):
     """In polar coordinates the ellipse lies outside the circle of its area where tan²θ < 1 / ratio.
 
-    There ½∫(r² - ab) dθ gives the share (2/π)(atan √ratio - atan √(1/ratio)).
+    There ½∫(r² - ab) dθ gives the fraction (2/π)(atan √ratio - atan √(1/ratio)).
     """
     long, short = RADIUS * np.sqrt(ratio), RADIUS / np.sqrt(ratio)
     found = merit(image(1.0 * ((X / long) ** 2 + (Y / short) ** 2 <= 1)))
@@ -77,31 +77,32 @@ def test_an_ellipse_is_deformed(ratio):
     assert float(found.resolution) == pytest.approx(RADIUS / BODY, rel=STAIRCASE)
 
 
-def test_a_ring_of_the_wrong_sign_rings():
+def test_ringing_by_a_ring_of_the_opposite_sign():
     ring = disc(radius=2 * RADIUS) - disc(radius=1.5 * RADIUS)
     found = merit(disc() - 0.1 * ring)
     assert float(found.ringing) == pytest.approx(0.1 * (4 - 2.25), rel=STAIRCASE)
     assert float(found.amplitude_response) == pytest.approx(1 - 0.175, rel=STAIRCASE)
-    # Too much of the right sign, too weak for the set, is no ringing.
+    # Excess of the same sign that stays below the threshold is not ringing.
     assert float(merit(disc() + 0.1 * ring).ringing) == 0
 
 
 def test_a_hole_deforms_but_does_not_ring():
-    """A quarter of the disc is missing in its middle: C ends at √¾ radii, and a third of what is left lies outside."""
+    """A quarter of the disc is missing in its middle: the circle C has √¾ of the radius, and a third of the region lies
+    outside."""
     found = merit(disc() - 1.1 * disc(radius=RADIUS / 2))
     assert float(found.shape_deformation) == pytest.approx(1 / 3, rel=0.02)
     assert float(found.ringing) == 0
 
 
-def test_a_resistive_target_counts_like_a_conductive_one():
+def test_resistive_and_conductive_targets_are_equivalent():
     raster = disc(0.03, 0.0) - 0.1 * (disc(0.03, 0.0, 2 * RADIUS) - disc(0.03, 0.0))
     one, other = merit(raster, (0.03, 0.0)), merit(-0.5 * raster, (0.03, 0.0), change=-0.5)
     for field in FIELDS:
         np.testing.assert_allclose(getattr(other, field), getattr(one, field), rtol=1e-12)
 
 
-def test_any_outline_is_measured_from_its_centre():
-    """A rectangle of 0.2 by 0.1 m off the middle of a raster of oblong pixels, itself away from the origin."""
+def test_positions_are_relative_to_the_centre_of_the_outline():
+    """A rectangle of 0.2 by 0.1 m, off the middle of a raster of oblong pixels that is itself away from the origin."""
     x, y = np.meshgrid(1 + (np.arange(150) + 0.5) * 2e-3, 2 + 0.2 - (np.arange(200) + 0.5) * 1e-3)
     inside = (np.abs(x - 1.14) < 0.1) & (np.abs(y - 2.12) < 0.05)
     shown = (x - 1.14 - 0.048) ** 2 + (y - 2.12 - 0.014) ** 2 < RADIUS**2
@@ -115,7 +116,7 @@ def test_any_outline_is_measured_from_its_centre():
     assert float(found.amplitude_response) == pytest.approx(1, rel=0.01)
 
 
-def test_images_that_show_no_target():
+def test_images_without_a_target():
     between = disc(-0.06) + disc(0.06) - 0.5 * disc()
     found = merit(np.stack([disc(), image(0.0), -disc(), between]), np.zeros((4, 2)))
     for field in FIELDS[1:]:
@@ -139,8 +140,9 @@ def test_vmap_and_jit_equal_a_loop():
             np.testing.assert_allclose(getattr(mapped, field)[k], getattr(alone, field), rtol=1e-12, atol=1e-15)
 
 
-def test_another_toolkits_images(reference_folder):
-    """Its pixels' centres span the extent, ours lie half a pixel inside it; its ringing is about Q instead of C."""
+def test_images_of_another_toolkit(reference_folder):
+    """Its pixels' centres span the extent, those here lie half a pixel inside it; its ringing is about Q instead of
+    C."""
     numbers = scipy.io.loadmat(reference_folder / "greit.mat", spmatrix=False)
     expected = dict(zip(FIELDS, numbers["figures_of_merit"], strict=False))
     edge = 32 / 31
@@ -148,7 +150,7 @@ def test_another_toolkits_images(reference_folder):
     found = figures_of_merit(raster, (-edge, edge, -edge, edge), position, area=1.0)
     response = found.amplitude_response / found.amplitude_response[0]
     np.testing.assert_allclose(response, expected["amplitude_response"], rtol=1e-9)
-    # Theirs is from the origin; the pixels of the body have their centre of gravity near it.
+    # Its position is relative to the origin; the centroid of the body's pixels is near it.
     np.testing.assert_allclose(found.position_error, expected["position_error"], atol=1e-3)
     np.testing.assert_allclose(found.resolution, expected["resolution"], rtol=1e-9)
     np.testing.assert_allclose(found.ringing, expected["ringing"], atol=0.02)

@@ -1,4 +1,4 @@
-"""Inclusions: sign, centroid and area of known blobs; artefacts left out."""
+"""Detection of inclusions: sign, centroid and area of known bodies, and rejection of artefacts."""
 
 import numpy as np
 import pytest
@@ -19,12 +19,12 @@ def test_two_bumps_of_either_sign():
     assert [inclusion.kind for inclusion in found] == ["conductive", "resistive"]
     np.testing.assert_allclose(found[0].centroid, [0.04, 0.02], atol=2e-3)
     np.testing.assert_allclose(found[1].centroid, [-0.05, -0.01], atol=2e-3)
-    # Half height of a Gaussian bump is a disc of area 2π ln 2 · width².
+    # The half height of a Gaussian is a disc of area 2π ln 2 · width².
     assert found[0].area == pytest.approx(2 * np.pi * np.log(2) * 0.015**2, rel=0.1)
     assert found[1].peak == pytest.approx(-0.6, rel=0.05)
 
 
-def test_radius_is_that_of_a_disk_or_a_ball():
+def test_equivalent_radius_of_a_disk_and_a_ball():
     assert Inclusion(1, (0.0, 0.0), np.pi * 0.02**2, 1.0).radius == pytest.approx(0.02)
     solid = box(0.2, 0.2, 0.2, num_points=3000)
     offset = np.linalg.norm(np.asarray(centroids(solid)) - [0.02, 0.0, 0.1], axis=1)
@@ -32,7 +32,7 @@ def test_radius_is_that_of_a_disk_or_a_ball():
     assert found.radius == pytest.approx(0.05, rel=0.05)
 
 
-def test_touching_bumps_are_told_apart_and_a_shoulder_is_not():
+def test_touching_bumps_are_separated_but_a_shoulder_is_not():
     apart = find_inclusions(MESH, bump(0.025, 0) + 0.7 * bump(-0.025, 0))
     assert len(apart) == 2
     shoulder = find_inclusions(MESH, bump(0.012, 0) + 0.7 * bump(-0.012, 0))
@@ -45,7 +45,7 @@ def test_weak_peaks_and_specks_are_artefacts():
     assert len(find_inclusions(MESH, bump(0.04, 0) + 0.1 * bump(-0.04, 0) + speck)) == 1
 
 
-def test_no_change_has_no_inclusions():
+def test_a_zero_image_has_no_inclusions():
     assert find_inclusions(MESH, np.zeros(MESH.num_cells)) == []
 
 
@@ -54,8 +54,8 @@ def ball(mesh, middle, radius):
 
 
 @pytest.mark.parametrize("refined", [False, True])
-def test_balls_of_a_solid_have_their_volume_wherever_the_mesh_is_fine(refined):
-    """Cells of other sizes in one half change neither the volume nor the centre: both are weighted by volume."""
+def test_volume_and_centre_of_balls_do_not_depend_on_the_mesh(refined):
+    """Different cell sizes in the two halves change neither the volume nor the centre, which are weighted by volume."""
     refine = [Refine([[0.05, 0.0]], cell_size=0.006, distance=0.04)] if refined else None
     tank = box(0.17, 0.255, 0.17, cell_size=0.012, refine=refine)
     middles, radius = np.array([[0.03, -0.05, 0.1], [-0.03, 0.06, 0.06]]), 0.03
@@ -69,16 +69,16 @@ def test_balls_of_a_solid_have_their_volume_wherever_the_mesh_is_fine(refined):
         np.testing.assert_allclose(one.centroid, middle, atol=2e-3)
 
 
-def test_a_ball_at_the_wall_has_what_is_inside_of_it():
+def test_only_the_inner_part_of_a_ball_at_the_wall_counts():
     tank = box(0.17, 0.255, 0.17, cell_size=0.01)
     (found,) = find_inclusions(tank, 1e-3 * ball(tank, [0.085, 0, 0.085], 0.04))
     assert found.area == pytest.approx(2 / 3 * np.pi * 0.04**3, rel=0.1)
-    # The centre of gravity of half a ball is 3/8 of its radius off the flat side.
+    # The centroid of half a ball is 3/8 of its radius from the flat side.
     np.testing.assert_allclose(found.centroid, [0.085 - 0.015, 0, 0.085], atol=2e-3)
 
 
-def test_a_column_in_a_solid_is_one():
-    """Tetrahedra of a ridge touch higher ones at their nodes; across facets the way down was a step at every layer."""
+def test_a_column_in_a_solid_is_one_inclusion():
+    """Tetrahedra of a ridge touch higher ones at nodes only; paths across facets had a step at every layer."""
     tank = box(0.2, 0.2, 0.2, cell_size=0.03)
     away = np.linalg.norm(np.asarray(centroids(tank))[:, :2] - [0.04, 0.02], axis=1)
     (found,) = find_inclusions(tank, -np.exp(-((away / 0.025) ** 2) / 2))
@@ -86,15 +86,15 @@ def test_a_column_in_a_solid_is_one():
     assert found.area == pytest.approx(2 * np.pi * np.log(2) * 0.025**2 * 0.2, rel=0.15)
 
 
-def test_balls_in_a_solid_are_told_apart():
+def test_two_balls_in_a_solid_are_separated():
     tank = box(0.2, 0.2, 0.2, cell_size=0.012)
     from_middles = [np.linalg.norm(np.asarray(centroids(tank)) - [x, 0, 0.1], axis=1) for x in (-0.035, 0.035)]
     image = sum(np.exp(-((away / 0.02) ** 2) / 2) for away in from_middles)
     assert len(find_inclusions(tank, image)) == 2
 
 
-def test_the_least_size_in_a_solid_is_a_ball_of_an_eighth_of_its_width():
-    """A ball of a seventh of the tank's width is 0.0018 of its volume: no artefact."""
+def test_minimum_size_in_a_solid_is_a_ball_of_an_eighth_of_its_width():
+    """A ball of a seventh of the tank's width has 0.0018 of its volume and is no artefact."""
     tank = box(0.1, 0.1, 0.1, cell_size=0.005)
     image = 1e-3 * ball(tank, [0, 0, 0.05], 0.0075)
     assert len(find_inclusions(tank, image)) == 1
@@ -102,7 +102,7 @@ def test_the_least_size_in_a_solid_is_a_ball_of_an_eighth_of_its_width():
     assert find_inclusions(tank, 1e-3 * ball(tank, [0, 0, 0.05], 0.003)) == []
 
 
-def test_on_a_surface_in_space_what_is_found_has_an_area():
+def test_inclusions_on_a_surface_in_space_have_an_area():
     mesh = rectangle(0.1, 0.1, num_points=900)
     points, bend = np.asarray(mesh.points), 0.06
     rolled = np.stack([bend * np.sin(points[:, 0] / bend), points[:, 1], bend * np.cos(points[:, 0] / bend)], axis=1)

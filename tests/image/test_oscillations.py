@@ -1,4 +1,4 @@
-"""Amplitude, phase and frequency of what oscillates, and the regions in which it does."""
+"""Amplitude, phase and frequency of oscillations in image series, and the regions in which they occur."""
 
 import numpy as np
 import pytest
@@ -15,15 +15,15 @@ def wave(frequency, amplitude=2.0, phase=0.7, times=TIMES):
 
 @pytest.mark.parametrize("window", ["hann", "none"])
 @pytest.mark.parametrize("frequency", [0.25, 0.333, 1.234, 9.7])
-def test_a_lone_oscillation_is_found_exactly(window, frequency):
-    """Of no whole number of periods, on a mean and a drift."""
+def test_a_single_oscillation_is_estimated_exactly(window, frequency):
+    """Not a whole number of periods, with an offset and a drift."""
     found = oscillation(wave(frequency) + 5 - 0.3 * TIMES, TIMES, frequency, window=window)
     assert found.amplitude == pytest.approx(2, rel=1e-9)
     assert found.phase == pytest.approx(0.7, abs=1e-9)
     assert found.resolution == pytest.approx({"hann": 2, "none": 1}[window] / 19.95)
 
 
-def test_uneven_times_and_frames_left_out():
+def test_uneven_times_and_missing_frames():
     random = np.random.default_rng(0)
     times = np.sort(random.uniform(0, 20, 300))
     values = np.stack([wave(0.4, times=times), wave(0.4, 1.0, -2.0, times)], axis=1)
@@ -38,11 +38,11 @@ def test_whole_periods_without_a_window_are_the_discrete_fourier_transform():
     values -= np.polyval(np.polyfit(TIMES, values, 1), TIMES)
     found = oscillation(values, TIMES, 3.0, window="none")
     term = np.fft.rfft(values)[60] * 2 / 400
-    # The drift is no more orthogonal to a sine than one over the number of periods.
+    # The drift is orthogonal to a sine only up to one over the number of periods.
     assert found.amplitude * np.exp(1j * found.phase) == pytest.approx(term, rel=1e-2)
 
 
-def test_the_strongest_of_a_band_is_found():
+def test_the_strongest_oscillation_of_a_band():
     random = np.random.default_rng(2)
     values = np.stack([wave(0.31, 1.0), wave(1.2, 0.5), wave(0.31, 0.3, 2.0)], axis=1)
     noisy = values + 0.1 * random.normal(size=values.shape)
@@ -50,10 +50,10 @@ def test_the_strongest_of_a_band_is_found():
     assert slow.frequency == pytest.approx(0.31, abs=1e-3)
     assert quick.frequency == pytest.approx(1.2, abs=2e-3)
     np.testing.assert_allclose(slow.amplitude[[0, 2]], [1, 0.3], atol=4 * slow.noise[0])
-    assert slow.noise[2] == pytest.approx(0.1 * np.sqrt(2 / 400 * 1.94), rel=0.2)  # 1.94: what Hann's window costs
+    assert slow.noise[2] == pytest.approx(0.1 * np.sqrt(2 / 400 * 1.94), rel=0.2)  # 1.94 is the loss of the Hann window
 
 
-def test_noise_of_an_amplitude_is_what_repeats_scatter_by():
+def test_noise_of_an_amplitude_is_the_scatter_of_repetitions():
     random = np.random.default_rng(3)
     found = oscillation(wave(2.0)[:, None] + random.normal(size=(400, 500)), TIMES, 2.0)
     assert found.amplitude.std() == pytest.approx(found.noise.mean(), rel=0.1)
@@ -98,7 +98,7 @@ def test_regions(mesh):
     assert place[right, 0].min() > -1e-3
 
 
-def test_a_mean_weighs_cells_by_their_size(mesh):
+def test_means_are_weighted_by_cell_size(mesh):
     size, place = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     changes = np.stack([place[:, 0], 1 + 0 * place[:, 0], np.full(len(size), np.nan)])
     series = ImageSeries(mesh, changes, np.array([0.0, 0.1, 0.3]))

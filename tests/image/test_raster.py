@@ -21,14 +21,14 @@ def test_row_zero_is_at_the_top_and_column_zero_at_the_left():
     assert pixel[0, 0, 0] < pixel[0, -1, 0]
 
 
-def test_pixels_outside_are_nan_and_the_area_inside_is_right():
+def test_pixels_outside_are_nan_and_the_area_inside_is_correct():
     mesh = disk(0.1, num_points=800)
     raster = Raster.create(mesh)
     assert raster.extent == pytest.approx((-0.1, 0.1, -0.1, 0.1))
     values = np.asarray(raster.sample(np.ones(mesh.num_cells)))
     assert values.shape == (256, 256)
     assert np.isnan(values[0, 0])
-    # A pixel is 0.6 % of the diameter: the staircase at the edge averages out.
+    # A pixel is 0.6 % of the diameter, and the staircase at the edge averages out.
     assert np.isfinite(values).sum() * raster.pixel_area == pytest.approx(float(measures(mesh).sum()), rel=2e-3)
 
 

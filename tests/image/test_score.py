@@ -1,4 +1,4 @@
-"""The challenge's score against its definition, written out with convolutions."""
+"""The challenge's score against its definition with explicit convolutions."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Segmentation of rasters into background, resistive and conductive."""
+"""Segmentation of rasters into background, resistive and conductive regions."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ INSIDE = X**2 + Y**2 < 1
 
 
 def blob(x, y, radius, blur=0.05):
-    """A disc whose edge is half way at `radius`."""
+    """A disc whose edge has half the height at `radius`."""
     return 0.5 - 0.5 * np.tanh((np.hypot(X - x, Y - y) - radius) / (2 * blur))
 
 
@@ -32,7 +32,7 @@ def test_weak_signs_and_small_islands_are_artefacts():
     assert not labels[(X < -0.3)].any()
 
 
-def test_an_image_of_nothing_is_background():
+def test_a_zero_image_is_background():
     assert not segment(np.where(INSIDE, 0.0, np.nan)).any()
 
 

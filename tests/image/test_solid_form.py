@@ -1,11 +1,11 @@
-"""Ellipsoids and columns as surfaces: closed, outward, of their volume, wherever they point."""
+"""Ellipsoids and columns as surfaces: closed, oriented outward, of the exact volume, in any orientation."""
 
 import numpy as np
 import pytest
 
 from jeit.image import Inclusion, SolidForm
 
-# Half axes of 30, 20 and 10 mm, turned; in either hand.
+# Half axes of 30, 20 and 10 mm, rotated, as a right-handed and a left-handed system.
 TURNED, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
 AXES = np.diag([0.03, 0.02, 0.01]) @ TURNED
 
@@ -29,7 +29,7 @@ def test_a_column_is_closed_and_outward(hand):
     assert surface.points[:, 2].max() == pytest.approx(0.1)
 
 
-def test_inclusions_know_columns():
+def test_inclusions_recognise_columns():
     form = SolidForm((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True)
     assert Inclusion(1, (0.0, 0.0, 0.0), 1.0, 1.0, form=form).is_column
     assert not Inclusion(1, (0.0, 0.0, 0.0), 1.0, 1.0).is_column

@@ -1,4 +1,4 @@
-"""A box with sixteen discs on its walls and a ball, or a column, in it: shared by tests of ellipsoids."""
+"""A box with sixteen discs on its walls and a ball or a column in it, for tests of ellipsoids."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ def model(num_points):
 
 
 def sharp(num_points, along=3):
-    """A model whose mesh is cut along the ball, or the column along two axes, and which of its cells lie inside."""
+    """A model whose mesh is cut along the ball, or the column along two axes, and the mask of the cells inside."""
 
     def outside(points):
         return np.linalg.norm((points - BALL)[..., :along], axis=-1) - RADIUS
@@ -43,7 +43,7 @@ def sharp(num_points, along=3):
 
 
 def shape_problem(given):
-    """Of the voltages of the bath alone."""
+    """A shape problem for the voltages of the bath alone."""
     number: Any = given.protocol.num_measurements
     every, noise = jnp.ones(number, bool), jnp.full(number, 1e-6)
     small, data = independent_data(given, given.voltages(BATH), every, noise, at_once=True)  # pyright: ignore

@@ -1,4 +1,4 @@
-"""Gradients of functions of several arrays by name against finite differences: shared by tests of images."""
+"""Gradients of functions of several named arrays against finite differences, for tests of images."""
 
 from typing import Any
 
@@ -13,8 +13,10 @@ from jeit_solvers import Status
 
 
 class Known(AbstractSolver):
-    """Ends where it is given to end, within bounds if there are any: the derivatives of a reconstruction without the
-    loop that finds it, which takes seconds to compile."""
+    """A solver that returns a given solution, and accepts bounds if `between` is true.
+
+    It provides the derivatives of a reconstruction without the iteration, which takes seconds to compile.
+    """
 
     name = "known"
     coefficients: Any
@@ -31,8 +33,10 @@ class Known(AbstractSolver):
 
 
 def assert_gradient(function, theta, size, *, equal=1e-8, compiled=False):
-    """Reverse mode against differences of what is answered at once, or `compiled`; and the value, which is to be
-    `equal`, unless that is None: nothing is answered at once then."""
+    """Check reverse mode against differences of the uncompiled or `compiled` function, and its value.
+
+    The value must equal the uncompiled result to the relative tolerance `equal`; None if there is no such result.
+    """
     theta = {name: np.asarray(value, float) for name, value in theta.items()}
     program = jax.jit(jax.value_and_grad(function))
     value, gradient = program(theta)
@@ -42,8 +46,8 @@ def assert_gradient(function, theta, size, *, equal=1e-8, compiled=False):
 
 
 def assert_gradient_of_minimum(image, theta, size, solver, *, between=False):
-    """Likewise of a number that `image(theta, solver)` gives beside a reconstruction, without the solver's loop in what
-    is compiled; `between` bounds, if it has any."""
+    """Check a number that `image(theta, solver)` returns beside a reconstruction, without compiling the solver's
+    iteration; `between` bounds, if it has any."""
     theta = {name: np.asarray(value, float) for name, value in theta.items()}
     found, number = image(theta, solver)
     program = jax.jit(jax.value_and_grad(lambda theta, ended: image(theta, Known(ended, between))[1]))
@@ -53,11 +57,11 @@ def assert_gradient_of_minimum(image, theta, size, solver, *, between=False):
 
 
 def assert_slopes(answer, theta, gradient, size):
-    """Against central differences of fourth order. Large steps bend and small ones are rounded: one of six has to agree
-    to 1e-5.
+    """Check against fourth-order central differences; one of six step sizes must agree to 1e-5.
 
-    Steps go up wherever they go, each number by a share of its own: along others the parts of a slope may all but
-    cancel, and differences are of rounding. `size` has what is small beside each number; without one it is itself."""
+    Each number is changed in proportion to its own size, because the terms of other directional derivatives may almost
+    cancel. `size` replaces the size of small arrays; without it, the array itself is used.
+    """
     random = np.random.default_rng(11)
     for name, at in theta.items():
         direction = np.abs(random.normal(size=at.shape) * size.get(name, at)) * np.sign(gradient[name])

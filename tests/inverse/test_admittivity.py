@@ -1,5 +1,5 @@
-"""Complex admittivity σ + iωε: calibrated and imaged, from voltages of an independent solver: quadratic elements on
-another, finer mesh, by SciPy. And two frequencies of one body."""
+"""Complex admittivity σ + iωε: calibration and images from voltages of an independent solver (quadratic elements on
+another, finer mesh, with SciPy), and images from two frequencies."""
 
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ RADIUS = 0.1
 PROTOCOL = adjacent(16, current=1e-3)
 DOMAIN, ELECTRODES = Disk(RADIUS), PointElectrodes(ring(RADIUS, 16))
 BACKGROUND = 1e-3 + 0.3e-3j
-# Where, its radius, and how much more of each part: one conducts more, one less, one holds more charge alone.
+# Position, radius, and relative change of each part of the bodies: one more conductive, one less, one more permittive.
 DISCS = ((0.05, 0.0, 0.02, 0.5e-3 + 0j), (-0.03, 0.04, 0.02, 0.3e-3j), (-0.02, -0.05, 0.02, -0.4e-3 - 0.15e-3j))
 
 
@@ -44,7 +44,7 @@ def _nearest(points):
 
 
 def quadratic_voltages(mesh, admittivity) -> Any:
-    """(M,) volts by P2 triangles, integrated by the midpoints of edges, between vertices of the mesh for electrodes."""
+    """Voltages (M,) in volts by P2 triangles with edge-midpoint quadrature, between mesh vertices as electrodes."""
     points, cells = np.asarray(mesh.points), np.asarray(mesh.cells)
     pairs = cells[:, [[0, 1], [1, 2], [2, 0]]]
     edges, number = np.unique(np.sort(pairs, axis=2).reshape(-1, 2), axis=0, return_inverse=True)
@@ -75,7 +75,7 @@ def quadratic_voltages(mesh, admittivity) -> Any:
 
 @pytest.fixture(scope="module")
 def fine():
-    """With a vertex at every electrode."""
+    """A mesh with a vertex at every electrode."""
     mesh = DOMAIN.mesh(num_points=3000)
     points = np.array(mesh.points)
     points[_nearest(points)] = ELECTRODES.position
@@ -84,7 +84,7 @@ def fine():
 
 @pytest.fixture(scope="module")
 def frames(fine) -> Any:
-    """Voltages of the empty body and of that with discs, with 0.1 % noise in each part."""
+    """Voltages of the empty body and of the body with discs, with 0.1 % noise in each part."""
     random, found = np.random.default_rng(3), []
     for admittivity in (body(fine, ()), body(fine)):
         voltages = quadratic_voltages(fine, admittivity)
@@ -94,7 +94,7 @@ def frames(fine) -> Any:
 
 
 def measured(voltages, name="frame"):
-    """As if read from a file."""
+    """A measurement as if read from a file."""
     values = jnp.asarray(voltages)[None]
     return Measurement(values, np.ones(values.shape, bool), PROTOCOL, name=name, domain=DOMAIN, electrodes=ELECTRODES)
 
@@ -113,8 +113,8 @@ def test_background_of_both_parts(frames):
 
 
 @pytest.mark.parametrize("prior", [Noser(), Laplace(), Tikhonov(), Gaussian(0.02)], ids=lambda p: type(p).__name__)
-def test_image_is_the_minimum_over_both_parts(prior):
-    """Against the real problem of twice the size, real and imaginary parts on top of each other."""
+def test_image_minimises_the_objective_over_both_parts(prior):
+    """Against the real problem of twice the size, with stacked real and imaginary parts."""
     model = ForwardModel(DOMAIN.mesh(num_points=150), ELECTRODES, PROTOCOL)
     voltages = np.asarray(model.voltages(BACKGROUND))
     noise: Any = 0.01 * abs(voltages)
@@ -143,12 +143,12 @@ def test_rules_take_complex_data(frames):
     noise: Any = 1e-3 * abs(frames[0])
     found = compare_rules(model, BACKGROUND, difference=frames[1] - frames[0], noise=noise, prior=Gaussian(0.02))
     assert all(np.isfinite(choice.hyperparameter) for choice in found.values())
-    # 0.1 % in each part of two frames: √2 of it, and the model's own errors
+    # 0.1 % in each part of two frames gives √2 times 0.1 %, plus model errors
     assert found["discrepancy"].criterion[0] < 5
 
 
 def amounts(mesh, image, part):
-    """Integral of a part of the image round every disc, over what is there in truth."""
+    """Integral of a part of the image round every disc, relative to the true one."""
     centre, area = np.asarray(centroids(mesh)), np.asarray(measures(mesh))
     found = []
     for x, y, radius, _ in DISCS:
@@ -158,7 +158,7 @@ def amounts(mesh, image, part):
 
 
 def test_both_parts_of_an_image(frames, tmp_path):
-    """Places, signs and sizes: what there is in one part does not show in the other."""
+    """Positions, signs and sizes: a change of one part does not appear in the other."""
     found = image_difference(measured(frames[1]), measured(frames[0]), ImagingSettings(num_points=1200))
     assert found.is_complex
     truth = np.array([disc[3] for disc in DISCS])
@@ -178,8 +178,8 @@ def test_both_parts_of_an_image(frames, tmp_path):
 
 
 def test_two_frequencies_of_one_body(fine):
-    """A disc that conducts at the second frequency as no other part does, in a body that changes by a fifth as a whole,
-    and in which another disc, of the same contrast at both, is not to be seen."""
+    """One disc conducts at the second frequency only. The whole body changes by a fifth, and another disc has equal
+    contrast at both frequencies, so that neither appears."""
     alike = (-0.04, 0.03, 0.02)
     first = body(fine, [(*alike, -0.5e-3), (0.05, 0.0, 0.02, 0.0)], 1e-3)
     second = body(fine, [(*alike, -0.6e-3), (0.05, 0.0, 0.02, 0.5e-3 + 0.2e-3j)], 1.2e-3)
@@ -201,7 +201,7 @@ def test_two_frequencies_of_one_body(fine):
     assert np.median(np.real(plain.image.change)) > 2 * abs(np.median(change.real))
 
 
-def test_frequencies_that_have_nothing_in_common(frames):
+def test_frequencies_that_do_not_match(frames):
     with pytest.raises(ValueError, match="nothing in common"):
         image_frequencies(measured(-frames[1]), measured(frames[0]))
 
@@ -212,9 +212,9 @@ def test_iterative_methods_refuse_complex_voltages(frames):
 
 
 @pytest.mark.slow
-def test_a_measured_tank_holds_no_contrast_of_susceptivity(data_folder, tmp_path):
-    """The small tank's imaginary part is a phase that all voltages have alike, of the instrument: relative to the
-    background, the change is real but for a fifth, and rods are where they are in the real part alone."""
+def test_a_measured_tank_shows_no_contrast_of_permittivity(data_folder, tmp_path):
+    """The imaginary part of the small tank is a phase of the instrument, common to all voltages. Relative to the
+    background, the change is real within a fifth, and rods are at the positions of the real part alone."""
     description = Path(jeit.data.__file__).with_name("tank6cm.toml").read_text("utf-8")
     (tmp_path / "complex.toml").write_text(description.replace('component = "real"', 'component = "complex"'), "utf-8")
     (file,) = (data_folder / "tank6cm" / "electrode01_metal").glob("*.csv")

@@ -1,4 +1,4 @@
-"""Reconstruction between bounds."""
+"""Reconstruction with bounds on the conductivity."""
 
 import equinox as eqx
 import jax
@@ -25,12 +25,12 @@ from jeit.protocol import adjacent
 
 @pytest.fixture(scope="module")
 def model():
-    """Of six electrodes and 25 nodes: what keeps bounds is compiled for seconds."""
+    """Six electrodes and 25 nodes, because bounded solvers take seconds to compile."""
     return ForwardModel(Disk(0.1).mesh(num_points=25), BoundaryElectrodes(ring(0.1, 6), 0.012, 1e-3), adjacent(6))
 
 
 def disturbed(model, inside):
-    """The voltages of a body of three times the rest, and their noise."""
+    """The voltages of a body with a threefold conductivity in a part, and their noise."""
     voltages = model.voltages(jnp.where(inside, 3.0, 1.0))
     return voltages, 1e-2 * jnp.abs(voltages)
 
@@ -41,8 +41,10 @@ def frame(model):
 
 
 def between(model, frame, solver, prior, bounds, link=None):
-    """A reconstruction, mostly of a kind that another test has compiled: kinds are solvers, with their settings, priors
-    and links, not bounds."""
+    """A reconstruction of a kind that another test has compiled.
+
+    A kind is a solver with its settings, prior and link; bounds do not change it.
+    """
     own = {"bounds": bounds} | ({} if link is None else {"link": link})
     options = {} if isinstance(prior, TotalVariation) else {"hyperparameter": 1.0}
     return reconstruct(
@@ -61,7 +63,7 @@ def between(model, frame, solver, prior, bounds, link=None):
     ],
 )
 def test_bounds_hold_and_are_reached(solver, prior, model, frame):
-    """With the Laplace prior: see test_solver_table.py."""
+    """With the Laplace prior; see test_solver_table.py for others."""
     result = between(model, frame, solver, prior, (0.95, 1.6))
     values = np.asarray(result.conductivity)
     assert values.min() >= 0.95 * (1 - 1e-12)
@@ -71,7 +73,7 @@ def test_bounds_hold_and_are_reached(solver, prior, model, frame):
 
 
 @pytest.mark.slow
-def test_bounds_alone_choose_a_bounded_solver(model, frame):
+def test_bounds_select_a_bounded_solver(model, frame):
     alone = between(model, frame, None, Noser(), (0.9, 2.0))
     chosen = between(model, frame, LBFGSB(), Noser(), (0.9, 2.0))
     assert alone.iterations == chosen.iterations > 2
@@ -109,7 +111,7 @@ def test_bad_input(change, message, model, frame):
 
 @pytest.mark.parametrize(("link", "ends"), [(Linear(), (0.0, 1.5)), (Log(), (-np.inf, np.log(1.5)))])
 def test_bounds_on_the_link_s_scale(link, ends):
-    """Zero is outside what the logarithm can take, and no bound at all there; conductivity itself stays above it."""
+    """Zero is outside of the logarithm's range and is no bound there; conductivity itself stays above it."""
     background = np.array([0.5, 1.0])
     lower, upper = (
         np.asarray(end) + np.asarray(link.estimate(background))
@@ -122,14 +124,14 @@ def test_bounds_on_the_link_s_scale(link, ends):
 
 @pytest.mark.parametrize("link", [pytest.param(Linear(), marks=pytest.mark.slow), Log()], ids=["linear", "log"])
 def test_lower_bound_of_zero(link, model, frame):
-    """Zero is outside what the logarithm can take, and no bound at all there."""
+    """Zero is outside of the logarithm's range and is no bound there."""
     result = between(model, frame, ProjectedGradient(), Noser(), (0.0, 1.5), link)
     assert (np.asarray(result.conductivity) > 0).all()
 
 
 @pytest.mark.slow
-def test_too_few_steps_are_said_so_and_the_gradient_of_the_cost(model, frame):
-    """What the bounded solvers descend along, by finite differences, short of the minimum."""
+def test_too_few_steps_are_reported_and_gradient_of_the_cost(model, frame):
+    """The gradient used by the bounded solvers, against finite differences, away from the minimum."""
     result = between(model, frame, ProjectedGradient(max_steps=2), Noser(), (0.9, 2.0))
     assert float(result.conductivity.max()) <= 2.0 * (1 + 1e-12)
     assert result.status == "step limit"

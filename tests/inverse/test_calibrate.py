@@ -1,4 +1,4 @@
-"""Calibration: what was put in comes out; a frame it cannot explain says so."""
+"""Calibration: known parameters are recovered, and a frame that cannot be explained gives a note."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,19 +46,19 @@ def test_point_electrodes_have_only_a_conductivity_to_fit():
     assert float(result.conductivity) == pytest.approx(2.0, rel=1e-8)
 
 
-def test_noise_ends_up_in_the_misfit(model):
+def test_noise_appears_in_the_misfit(model):
     voltages = model.voltages(0.5)
     noise = np.random.default_rng(0).normal(size=voltages.shape)
     noise *= 0.02 * float(jnp.linalg.norm(voltages)) / np.linalg.norm(noise)
     result = calibrate(model, voltages + noise)
     assert float(result.misfit) == pytest.approx(0.02, rel=0.1)
     assert result.note == ""
-    spoilt = calibrate(model, voltages + 12 * noise)
-    assert "misses 2" in spoilt.note
-    assert "width of the electrodes" in spoilt.note
+    noisy = calibrate(model, voltages + 12 * noise)
+    assert "misses 2" in noisy.note
+    assert "width of the electrodes" in noisy.note
 
 
-def test_a_misfit_is_explained_by_what_the_body_is(model):
+def test_note_on_the_misfit_depends_on_the_body(model):
     places = ring(0.1, 8, height=0.02)
     solid = ForwardModel(cylinder(0.1, 0.05, num_points=300), PointElectrodes(places), PROTOCOL)
     notes = []
@@ -72,8 +72,8 @@ def test_a_misfit_is_explained_by_what_the_body_is(model):
     assert "sheet" not in solid
 
 
-def test_every_impedance_is_recovered_and_told_apart(model):
-    """Contact sensitivities are the derivatives they say: with wrong ones the fit would not arrive here."""
+def test_every_impedance_is_recovered_separately(model):
+    """Sensitivities to contact impedances are exact derivatives; otherwise the fit would not converge here."""
     impedance = np.geomspace(5e-4, 2e-2, 8)
     truth = model.with_electrodes(model.electrodes.with_contact_impedance(impedance))
     result = calibrate(truth, truth.voltages(0.3), contact="each")
@@ -110,13 +110,13 @@ def test_contact_sensitivity_against_differences(model):
     ],
     ids=["half a step", "no step", "huge", "tiny", "text"],
 )
-def test_bad_arguments(model, change, message):
+def test_invalid_arguments(model, change, message):
     with pytest.raises(ValueError, match=message):
         calibrate(model, **change(np.array(model.voltages(1.0))))
 
 
-def test_impedances_that_no_channel_tells_are_not_told_apart(model):
-    """Without driven electrodes in the channels, noise alone decides on contact impedances."""
+def test_impedances_without_information_are_not_separated(model):
+    """Without channels on driven electrodes, contact impedances would be determined by noise alone."""
     protocol = skip(8, 1, current=1e-3)
     blind = ForwardModel(MESH, model.electrodes, protocol.subset(~protocol.channels_on_driven_electrodes()))
     voltages = np.array(blind.voltages(0.3))

@@ -1,4 +1,5 @@
-"""Independent channels: what they rebuild, how many they are, and that least squares on them lose nothing."""
+"""Independent channels: they determine all channels, their number is known, and least squares on them are
+equivalent."""
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +19,12 @@ PROTOCOLS = {
 
 
 def _chosen(*quick):
-    """All protocols, of which the quick suite takes these."""
+    """All protocols, of which the quick tests use these."""
     return [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in PROTOCOLS]
 
 
 def voltages_of_a_body(protocol, key=0):
-    """Of a random symmetric transfer impedance whose rows sum to zero: all that any body can be."""
+    """Voltages of a random symmetric transfer impedance whose rows sum to zero, which is the general case."""
     root = jax.random.normal(jax.random.key(key), (protocol.num_electrodes, protocol.num_electrodes))
     root = root - root.mean(axis=0)
     impedance = root.T @ root
@@ -43,7 +44,7 @@ def test_all_channels_from_the_independent_ones(name):
 
 
 @pytest.mark.parametrize("name", _chosen("adjacent", "with driven electrodes"))
-def test_least_squares_on_them_is_that_on_all(name):
+def test_least_squares_on_them_equal_those_on_all_channels(name):
     """½‖(Tu - y)/noise‖² = ½(u - ŷ)ᵀG(u - ŷ) + rest/2 at any u."""
     protocol, _ = PROTOCOLS[name]
     channels = IndependentChannels.create(protocol)

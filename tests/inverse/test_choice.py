@@ -1,4 +1,4 @@
-"""Rules for the hyperparameter against explicit matrices, known corners and draws of noise; and what they say of it."""
+"""Rules for the hyperparameter against explicit matrices, known corners and simulated noise, and their reports."""
 
 from functools import partial
 
@@ -19,7 +19,7 @@ from jeit.protocol import adjacent
 
 PRIORS = {"noser": Noser(), "laplace": Laplace()}
 CHANNELS = 40  # of 8 electrodes
-SPREAD = (1e-3, 1e-2, 0.1, 1.0)  # of the largest singular value: hyperparameters to look at
+SPREAD = (1e-3, 1e-2, 0.1, 1.0)  # candidates relative to the largest singular value
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,8 @@ def model():
 
 @pytest.fixture(scope="module")
 def frame(model):
-    """Difference of an inclusion on another mesh, with noise of 1 % of its root mean square; and that noise."""
+    """Difference voltages of an inclusion on another mesh, with noise of 1 % of their root mean square, and that
+    noise."""
     fine = ForwardModel(disk(0.1, num_points=600), model.electrodes, model.protocol)
     inside = jnp.linalg.norm(centroids(fine.mesh) - jnp.array([0.05, 0.02]), axis=1) < 0.025
     change = np.asarray(fine.voltages(jnp.where(inside, 1.2, 1.0)) - fine.voltages(1.0))
@@ -56,12 +57,12 @@ def explicit(linear, model, hyperparameter):
 
 
 def some(choice):
-    """Numbers of a few candidates, small to large."""
+    """Indices of a few candidates, small to large."""
     largest = float(choice.candidates[-1]) / 10
     return [int(np.argmin(np.abs(np.log(np.asarray(choice.candidates) / (part * largest))))) for part in SPREAD]
 
 
-def test_curves_and_gcv_are_their_definitions(linear, model, data):
+def test_curves_and_gcv_equal_their_definitions(linear, model, data):
     choice = RULES["gcv"](linear.spectrum, data, model.mesh)
     for index in some(choice):
         matrix, jacobian, precision = explicit(linear, model, float(choice.candidates[index]))
@@ -89,8 +90,8 @@ def test_discrepancy_leaves_exactly_the_noise(linear, model, data):
 
 
 def test_l_curve_turns_at_its_known_corner():
-    """Two components, one in reach and one out of it: the corner lies where the residual is the second, all of it, and
-    the penalty that of the first alone."""
+    """Two components, of which the data determine one. At the corner the residual is all of the second, and the penalty
+    that of the first alone."""
     strong, weak = 1.0, 1e-6
     spectrum = spectrum_of([strong, weak, 0.0])
     choice = choose(spectrum, "l-curve", jnp.array([1.0, 1e-3, 0.0]))
@@ -101,9 +102,9 @@ def test_l_curve_turns_at_its_known_corner():
     assert not choice.edge
 
 
-def test_curvature_is_that_of_the_curve(linear, model, data):
-    """Against differences along the curve; also regression: zero eigenvalues, as adjacent channels always have, made
-    the curvature NaN and the choice the smallest candidate."""
+def test_curvature_of_the_l_curve(linear, model, data):
+    """Against differences along the curve. Regression: zero eigenvalues, which adjacent channels always have, made the
+    curvature NaN and the choice the smallest candidate."""
     assert (np.asarray(linear.spectrum.eigenvalues) < 1e-12 * float(linear.spectrum.eigenvalues.max())).any()
     choice = choose(linear.spectrum, "l-curve", data)
     step = np.log(choice.candidates[1] / choice.candidates[0])
@@ -111,13 +112,13 @@ def test_curvature_is_that_of_the_curve(linear, model, data):
     dx, dy = (np.gradient(a, step)[1:-1] for a in (x, y))
     ddx, ddy = (np.diff(a, 2) / step**2 for a in (x, y))
     bend = (dx * ddy - dy * ddx) / (dx**2 + dy**2) ** 1.5
-    # Differences over a step of 8 % of λ are good to the square of that, and the curve is bent sharply.
+    # Differences over a step of 8 % of λ are accurate to its square, and the curve is sharply bent.
     np.testing.assert_allclose(choice.criterion[1:-1], bend, atol=0.03 * np.abs(bend).max())
     assert not choice.edge
 
 
 def test_noise_figure_is_the_ratio_of_explicit_traces(linear, model, data):
-    """√(SNR of the data / SNR of the image), the signal drawn from the prior, outside of its null space."""
+    """√(SNR of the data / SNR of the image), with signals drawn from the prior outside of its null space."""
     choice = RULES["noise-figure"](linear.spectrum, None, model.mesh)
     spectrum = linear.spectrum
     outer = np.asarray(spectrum.basis * spectrum.eigenvalues) @ np.asarray(spectrum.basis).T
@@ -132,7 +133,7 @@ def test_noise_figure_is_the_ratio_of_explicit_traces(linear, model, data):
 
 
 def test_noise_figure_does_not_depend_on_the_order_of_cells(model):
-    """Regression: with a null space, the covariance that grounds cell 0 was measured instead of the image."""
+    """Regression: for priors with a null space, the grounding of cell 0 had influenced the result."""
     order = np.random.default_rng(0).permutation(model.mesh.num_cells)
     shuffled = Mesh(model.mesh.points, model.mesh.cells[order], model.mesh.facets, model.mesh.tags)
     other = ForwardModel(shuffled, model.electrodes, model.protocol)
@@ -141,7 +142,7 @@ def test_noise_figure_does_not_depend_on_the_order_of_cells(model):
 
 
 def test_blur_radius_is_that_of_explicit_point_spreads(linear, model):
-    """Against R J_t of the definition, and its half-amplitude area in draws of noise."""
+    """Against R J_t of the definition, and its half-amplitude area with simulated noise."""
     mesh, spectrum = model.mesh, linear.spectrum
     targets, area = spread_cells(mesh, 6), np.asarray(measures(mesh))
     largest = float(jnp.sqrt(spectrum.eigenvalues.max()))
@@ -155,7 +156,7 @@ def test_blur_radius_is_that_of_explicit_point_spreads(linear, model):
             signal = signal * 2.0 / np.sqrt(np.mean(signal**2))
             image = matrix @ signal
             covered = area @ (image[:, None] + matrix @ draws >= image[target] / 2)
-            # The mean over 400 draws of an area: its own scatter is the tolerance, or a hundredth where there is none.
+            # The mean over 400 draws of an area: the tolerance is its scatter, or a hundredth if there is none.
             expected = np.mean(covered) / area.sum()
             error = 5 * np.std(covered) / np.sqrt(400) / area.sum()
             assert radius[k, t] ** 2 == pytest.approx(expected, abs=error + 1e-3)
@@ -168,14 +169,14 @@ def test_best_resolution_is_the_least_mean_blur(linear, model, data):
     np.testing.assert_allclose(choice.criterion, expected)
     assert choice.hyperparameter == choice.candidates[np.argmin(expected)]
     assert not choice.edge
-    # The less noise, the less smoothing.
+    # Less noise requires less regularisation.
     quiet = best_resolution(linear.spectrum, data, model.mesh, signal_to_noise=30.0)
     assert quiet.hyperparameter < choice.hyperparameter
     assert quiet.criterion.min() < choice.criterion.min()
 
 
 @pytest.mark.parametrize("mesh", [disk(0.1, num_points=500), box(0.2, 0.1, 0.1, num_points=400)], ids=["disk", "box"])
-def test_targets_are_spread_through_the_body(mesh):
+def test_targets_are_distributed_over_the_body(mesh):
     targets = spread_cells(mesh, 30)
     assert 20 <= targets.size <= 40
     place = np.asarray(centroids(mesh))
@@ -193,7 +194,7 @@ EDGES = {
 
 
 @pytest.mark.parametrize(("rule", "options", "edge"), EDGES.values(), ids=EDGES.keys())
-def test_a_choice_at_the_edge_says_so(rule, options, edge, model, frame):
+def test_a_choice_at_the_edge_is_reported(rule, options, edge, model, frame):
     result = one_step(model, 1.0, hyperparameter=partial(RULES[rule], **options), difference=frame[0], noise=frame[1])
     assert result.choice is not None
     assert result.choice.edge == edge
@@ -202,7 +203,7 @@ def test_a_choice_at_the_edge_says_so(rule, options, edge, model, frame):
     assert result.choice.hyperparameter == result.choice.candidates[{"smallest": 0, "largest": -1}[edge]]
 
 
-def test_one_call_compares_all_rules_and_each_is_what_one_step_uses(model, frame):
+def test_all_rules_compared_in_one_call_equal_those_of_one_step(model, frame):
     difference, noise = frame
     compared = compare_rules(model, 1.0, difference=difference, noise=noise)
     assert list(compared) == list(RULES)
@@ -213,7 +214,7 @@ def test_one_call_compares_all_rules_and_each_is_what_one_step_uses(model, frame
         assert choice.rule == image.rule == rule
         assert choice.candidates.shape == choice.criterion.shape == choice.residual.shape == choice.penalty.shape
         assert choice.read(choice.residual) > 0
-    # A choice is as good as its name.
+    # A choice can be used like its rule's name.
     image = one_step(model, 1.0, hyperparameter=compared["gcv"], noise=noise)
     expected = one_step(model, 1.0, hyperparameter="gcv", difference=difference, noise=noise)
     np.testing.assert_array_equal(image.weights, expected.weights)
@@ -267,7 +268,8 @@ def test_bad_input_is_refused(call, words, model, frame):
 
 @pytest.mark.slow
 def test_rules_on_a_measured_tank(data_folder):
-    """A metal rod beside electrode 1: discrepancy, told of the noise but not of the model's error, ends at the edge."""
+    """A metal rod beside electrode 1. With the known noise, which excludes model errors, discrepancy ends at the
+    edge."""
     from jeit.data import read
     from jeit.imaging import ImagingSettings, compare_on_data
 
@@ -285,7 +287,7 @@ def test_rules_on_a_measured_tank(data_folder):
 
 
 def spectrum_of(eigenvalues):
-    """Of a diagonal problem with these eigenvalues and the identity as prior."""
+    """Spectrum of a diagonal problem with these eigenvalues and the identity as prior."""
     jacobian = jnp.diag(jnp.sqrt(jnp.asarray(eigenvalues)))
     return Spectrum.create(jacobian, jacobian.T, jnp.zeros((len(eigenvalues), 0)))
 

@@ -1,4 +1,4 @@
-"""Bodies in a solid as ellipsoids: derivatives, geometry, and what is found in a box solved on another mesh."""
+"""Bodies in a solid as ellipsoids: derivatives, geometry, and estimates in a box solved on another mesh."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ from jeit.inverse.shapes.problem import Fit, ShapeProblem
 from jeit.mesh import box, measures
 from jeit.protocol import opposite
 
-# Of fits that are only looked at where they are.
+# Placeholder for the rows of fits, which these tests do not use.
 ROWS: Any = None
 
 
@@ -28,7 +28,7 @@ def coarse():
 
 @pytest.fixture(scope="module")
 def fine():
-    """A model whose mesh is cut along the ball, which of its cells lie inside, and its voltages of the bath."""
+    """A model whose mesh is cut along the ball, the mask of cells inside, and the model's voltages of the bath."""
     cut_along, held = sharp(4000)
     return cut_along, held, np.asarray(cut_along.voltages(BATH))
 
@@ -39,7 +39,7 @@ def ellipsoids(coarse):
     return Ellipsoids.create(coarse.mesh, EllipsoidPrior(), start, [1, -1, 1])
 
 
-def test_derivatives_are_those_of_finite_differences(ellipsoids, coarse):
+def test_derivatives_equal_finite_differences(ellipsoids, coarse):
     rng = np.random.default_rng(0)
     point = ellipsoids.of_radii([0.03, 0.02, 0.03]) + 0.3 * rng.normal(size=31)
     ellipsoids, point = ellipsoids.otherwise([2], point)
@@ -75,8 +75,8 @@ def test_bodies_of_one_material_have_the_contrast_of_the_first(ellipsoids, coars
     np.testing.assert_allclose(jacobian() @ along, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-3)
 
 
-def test_bodies_that_become_of_one_material_keep_their_effect(ellipsoids):
-    """Volume times (ρ - 1) / (ρ + 2), of a column (ρ - 1) / (ρ + 1)."""
+def test_bodies_keep_their_effect_when_they_become_one_material(ellipsoids):
+    """The effect is volume times (ρ - 1) / (ρ + 2), of a column (ρ - 1) / (ρ + 1)."""
     point = ellipsoids.of_radii([0.02, 0.02, 0.02])
     point[[5, 25]] = 0.6, -0.6  # contrasts of the first and the last
     ellipsoids, point = ellipsoids.otherwise([2], point)
@@ -90,7 +90,7 @@ def test_bodies_that_become_of_one_material_keep_their_effect(ellipsoids):
         np.testing.assert_allclose(*effect)
 
 
-def test_the_kind_of_bodies_may_be_known(coarse):
+def test_the_kind_of_bodies_can_be_given(coarse):
     with pytest.raises(ValueError, match=r"kinds must be one of either, ellipsoids, columns; .* mean 'columns'"):
         EllipsoidPrior(kinds="colums")
     bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(kinds="columns"), [[0.0, 0.0, 0.05]], [1])
@@ -103,13 +103,13 @@ def test_the_kind_of_bodies_may_be_known(coarse):
     ]
 
 
-@pytest.mark.parametrize(("worse", "told"), [(3.0, False), (5.0, True)])
-def test_the_range_of_bodies_of_one_material_is_of_each_for_itself_too(ellipsoids, worse, told):
+@pytest.mark.parametrize(("worse", "decided"), [(3.0, False), (5.0, True)])
+def test_the_deviation_of_a_common_contrast_includes_that_of_separate_ones(ellipsoids, worse, decided):
     same, point = ellipsoids.of_one_material(1, ellipsoids.of_radii([0.02, 0.02, 0.02]))
     spread, contrast = EllipsoidPrior().contrast_spread, EllipsoidPrior().contrast
 
-    class Told:
-        """Each for itself is `worse`, has three times the deviation, and the last twice the contrast."""
+    class Evidence:
+        """Separate contrasts are `worse`, have three times the deviation, and the last is twice the common one."""
 
         def surprise(self, fit):
             return fit.bodies.odds + (0.0 if fit.bodies.alike.any() else worse)
@@ -117,20 +117,20 @@ def test_the_range_of_bodies_of_one_material_is_of_each_for_itself_too(ellipsoid
         def deviations(self, fit):
             return np.full(len(fit.coefficients), 0.1 if fit.bodies.alike.any() else 0.3)
 
-    problem: Any = Told()
+    problem: Any = Evidence()
     moved = point.copy()
     moved[25] = np.log(2) / spread
     one, each = Fit(same, point, 1.0, ROWS), Fit(ellipsoids, moved, 1.0, ROWS)
     found = ellipsoid.contrast_deviations(problem, one, each)
     slope = spread * contrast
     wide = [0.3 * slope, 0.3 * slope, contrast + 0.3 * 2 * slope]
-    np.testing.assert_allclose(found, np.hypot([0.1 * slope] * 3 if told else wide, 0.1))
+    np.testing.assert_allclose(found, np.hypot([0.1 * slope] * 3 if decided else wide, 0.1))
 
 
-def test_an_ellipsoid_knows_its_volume_its_middle_and_what_it_holds(ellipsoids):
+def test_volume_centroid_and_interior_of_an_ellipsoid(ellipsoids):
     rng = np.random.default_rng(1)
     point = ellipsoids.of_radii([0.02, 0.02, 0.02])
-    point[6:11] = 0.8 * rng.normal(size=5)  # the stretches of the first
+    point[6:11] = 0.8 * rng.normal(size=5)  # stretches of the first body
     body = ellipsoids.body(0, point)
     length = np.linalg.norm(body.axes, axis=1)
     assert np.all(np.diff(length) < 0)
@@ -143,9 +143,9 @@ def test_an_ellipsoid_knows_its_volume_its_middle_and_what_it_holds(ellipsoids):
     assert not body.holds(body.centre + 1.01 * body.axes).any()
 
 
-def test_a_column_stands_through_the_whole_height(ellipsoids):
+def test_a_column_extends_through_the_whole_height(ellipsoids):
     point = ellipsoids.of_radii([0.02, 0.02, 0.02])
-    point[[4, 6, 7, 8, 9]] = [1.0, 0.8, 0.5, -0.6, 0.3]  # radius and stretches of the first
+    point[[4, 6, 7, 8, 9]] = [1.0, 0.8, 0.5, -0.6, 0.3]  # radius and stretches of the first body
     before = ellipsoids.body(0, point).volume
     columns, point = ellipsoids.otherwise([0], point)
     body = columns.body(0, point)
@@ -164,7 +164,7 @@ def test_a_column_stands_through_the_whole_height(ellipsoids):
     np.testing.assert_allclose(np.abs(columns.axis(0, columns.rows(point)[0], 0) @ body.axes[1]), length[1], rtol=1e-6)
 
 
-def test_a_column_is_an_ellipsoid_again_of_its_volume(ellipsoids):
+def test_a_column_becomes_an_ellipsoid_of_its_volume(ellipsoids):
     point = ellipsoids.of_radii([0.02, 0.02, 0.02])
     columns, upright = ellipsoids.otherwise([0, 1], point)
     again, back = columns.otherwise([0, 1], upright)
@@ -174,7 +174,7 @@ def test_a_column_is_an_ellipsoid_again_of_its_volume(ellipsoids):
 
 
 def test_a_ball_over_the_wall_ends_there(coarse):
-    """Its middle on the wall: half the volume, its centroid 3/8 of the radius inside."""
+    """The centre of the ball is on the wall: half the volume, and its centroid 3/8 of the radius inside."""
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), [[0.05, 0.0, 0.05]], [1])
     body = balls.body(0, balls.of_radii([0.03]))
     np.testing.assert_allclose(body.volume, 2 * np.pi / 3 * 0.03**3, rtol=0.02)
@@ -182,9 +182,9 @@ def test_a_ball_over_the_wall_ends_there(coarse):
 
 
 @pytest.mark.slow
-def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, fine, monkeypatch):
-    """On a mesh fewer, and on coarser ones, than by default: with those, of a resistive ball, in
-    test_fitted_ellipsoids.py."""
+def test_a_ball_is_distinguished_from_a_ghost(coarse, fine, monkeypatch):
+    """One mesh fewer than by default, and coarser ones. test_fitted_ellipsoids.py tests a resistive ball with the
+    default meshes."""
     monkeypatch.setattr(search, "_MOST_MESHES", 2)
     monkeypatch.setattr(search, "_EDGES", ((0.7,), (0.5,)))
     ratio = 4.0
@@ -200,14 +200,15 @@ def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, fine, monke
     assert not body.column
     assert found.alternatives == (None,)
     assert np.linalg.norm(body.centroid - BALL) < 0.003
-    # What it does to the field: volume times (ratio - 1) / (ratio + 2); which of the two is hardly told.
+    # The effect on the field is volume times (ratio - 1) / (ratio + 2). The data hardly distinguish volume from ratio.
     strength = body.volume * np.expm1(sign * body.contrast) / (np.exp(sign * body.contrast) + 2)
     true = 4 * np.pi / 3 * RADIUS**3 * (ratio - 1) / (ratio + 2)
     np.testing.assert_allclose(strength, true, rtol=0.15)
-    # The image holds all of the body, its cells by the share that it covers: harmonic means would lose a tenth of it.
+    # The image contains the whole body, as cells are weighted by the covered fraction: harmonic means would lose a
+    # tenth.
     image = np.log(np.asarray(found.conductivity) / BATH / (1 + found.drift))
     np.testing.assert_allclose(np.asarray(measures(coarse.mesh)) @ image, sign * body.contrast * body.volume, rtol=0.05)
-    # So does that on the finer mesh, on whose cells it ends within fewer.
+    # So does the image on the finer mesh, whose edge of the body has fewer partly covered cells.
     assert found.finer is not None
     mesh, values = found.finer.model.mesh, np.asarray(found.finer.conductivity)
     assert mesh.num_cells == len(values) > coarse.mesh.num_cells
@@ -221,8 +222,8 @@ def test_a_ball_is_told_from_a_ghost_with_place_and_strength(coarse, fine, monke
     assert len(found.doubtful) == 1
 
 
-def test_what_is_shown_is_half_of_a_body_on_its_surface(coarse):
-    """Cells that are covered by half, whatever the contrast: a surface drawn there is the body's."""
+def test_displayed_values_on_the_surface_are_half_of_the_contrast(coarse):
+    """Cells that are half covered have half the contrast, whatever it is: an isosurface there is the body's surface."""
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
     coefficients = balls.of_radii([RADIUS])
     _, share, _ = balls.covered(0, balls.rows(coefficients)[0])
@@ -234,13 +235,13 @@ def test_what_is_shown_is_half_of_a_body_on_its_surface(coarse):
 
 
 @pytest.mark.parametrize("column", [True, False])
-@pytest.mark.parametrize(("worse", "told"), [(3.0, False), (5.0, True)])
-def test_a_kind_is_doubted_by_the_data_alone_and_has_a_deviation_of_its_own(coarse, worse, told, column):
+@pytest.mark.parametrize(("worse", "decided"), [(3.0, False), (5.0, True)])
+def test_an_alternative_kind_depends_on_the_data_alone_and_has_its_own_deviation(coarse, worse, decided, column):
     bodies = Ellipsoids.create(coarse.mesh, EllipsoidPrior(odds_for_columns=1e6), [[0.0, 0.0, 0.05]], [1])
     bodies, coefficients = bodies.otherwise([0] if column else [], bodies.of_radii([RADIUS]))
 
-    class Told:
-        """The other kind is `worse`, and has twice the deviation."""
+    class Evidence:
+        """The other kind is `worse` and has twice the deviation."""
 
         def fit(self, bodies, coefficients, *steps):
             return Fit(bodies, coefficients, 1.0, ROWS)
@@ -251,10 +252,10 @@ def test_a_kind_is_doubted_by_the_data_alone_and_has_a_deviation_of_its_own(coar
         def deviations(self, fit):
             return np.full(len(fit.coefficients), 0.1 if fit.bodies.other[0] == column else 0.2)
 
-    problem: Any = Told()
+    problem: Any = Evidence()
     fitted = Fit(bodies, coefficients, 1.0, ROWS)
     ((other, deviation),) = ellipsoid.alternatives(problem, fitted)  # pyright: ignore
-    assert (other is None) == told
+    assert (other is None) == decided
     if other is not None:
         (own,) = ellipsoid.contrast_deviations(problem, fitted)  # pyright: ignore
         assert other.column != column
@@ -267,7 +268,7 @@ def test_balls_keep_their_volume_on_any_mesh(coarse):
         np.testing.assert_allclose(balls.body(0, balls.of_radii([radius])).volume, 4 / 3 * np.pi * radius**3, rtol=0.02)
 
 
-def test_a_smooth_field_is_of_the_same_channels(coarse):
+def test_an_unsuitable_smooth_field_is_refused(coarse):
     rest = coarse.voltages(BATH)
 
     def found(smooth: Any):
@@ -291,7 +292,7 @@ def test_a_prior_of_a_sheet_is_refused(coarse):
 
 @pytest.mark.parametrize("factor", [0.1, 12.0])
 def test_on_a_finer_mesh_a_ball_changes_voltages_as_on_one_cut_along_it(coarse, fine, factor):
-    """Told from the background's voltages, which are those of the given mesh."""
+    """Its effect is the difference from the voltages of the background, which are those of the given mesh."""
     cut_along, held, rest = fine
     inside = np.asarray(measures(cut_along.mesh))[held].sum()
     there = np.asarray(cut_along.voltages(BATH * np.where(held, factor, 1.0)))
@@ -311,7 +312,7 @@ def test_plates_and_discs_stay_where_they_are_on_a_finer_mesh():
     electrodes = CombinedElectrodes(plates(mesh, ["left"], 0.01), discs(), plates(mesh, ["right"], 0.02))
     given = ForwardModel(mesh, electrodes, opposite(18, current=1e-3))
     problem = shape_problem(given)
-    balls = Ellipsoids.create(mesh, EllipsoidPrior(), [[0.0, -0.06, 0.05]], [1])  # over the wall
+    balls = Ellipsoids.create(mesh, EllipsoidPrior(), [[0.0, -0.06, 0.05]], [1])  # outside of the wall
     there = refine_at_surfaces(problem, Fit(balls, balls.of_radii([0.02]), 0.0, ROWS), (0.3,))
     model = there.problem.model
     assert model.mesh.num_points > 2 * mesh.num_points
@@ -319,21 +320,21 @@ def test_plates_and_discs_stay_where_they_are_on_a_finer_mesh():
     np.testing.assert_allclose(area, given_area, rtol=0.01)
 
 
-def test_cut_cells_are_harmonic_means_of_conductive_bodies_and_gentler_ones_of_resistive(ellipsoids):
+def test_conductivity_of_partly_covered_cells(ellipsoids):
     share = np.array([0.0, 0.5, 1.0])
     conductive, resistive = (np.exp(ellipsoids.mixture(share, np.log(ratio))[0]) for ratio in (4.0, 0.25))
     np.testing.assert_allclose(conductive, [1, 1 / (0.5 + 0.5 / 4), 4], rtol=1e-12)
     np.testing.assert_allclose(resistive, [1, (0.5 + 0.5 * 0.5) ** 2, 0.25], rtol=1e-12)
 
 
-def test_finer_cells_know_which_they_come_from(coarse):
+def test_refined_cells_know_their_parent_cells(coarse):
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
     there = refine_at_surfaces(shape_problem(coarse), Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), (0.5,))
     volume = np.asarray(measures(there.problem.model.mesh))
     np.testing.assert_allclose(np.bincount(there.cell, volume), np.asarray(measures(coarse.mesh)), rtol=1e-9)
 
 
-def test_the_first_edges_that_make_a_mesh_grow_little_are_taken():
+def test_edges_are_refined_while_the_mesh_grows_little():
     coarse = model(400)
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(), [BALL], [1])
     fit, problem = Fit(balls, balls.of_radii([RADIUS]), 0.0, ROWS), shape_problem(coarse)
@@ -343,9 +344,9 @@ def test_the_first_edges_that_make_a_mesh_grow_little_are_taken():
     assert refine_at_surfaces(problem, fit, (1.0, 0.3)).problem.model.mesh.num_points == few
 
 
-def test_bodies_have_moved_once_their_surfaces_have(ellipsoids):
+def test_bodies_have_moved_if_their_surfaces_have(ellipsoids):
     before = ellipsoids.of_radii([0.02, 0.02, 0.02])
-    for coefficient in (1, 4, 6):  # the first one's place, radius and a stretch
+    for coefficient in (1, 4, 6):  # position, radius and one stretch of the first body
         little, far = before.copy(), before.copy()
         little[coefficient] += 0.02
         far[coefficient] += 2.0
@@ -358,11 +359,11 @@ def test_bodies_have_moved_once_their_surfaces_have(ellipsoids):
     columns, upright = ellipsoids.otherwise([0], before)
     assert ellipsoids.moved(before, columns, upright)
     upright, risen = upright.copy(), upright.copy()
-    risen[3] += 2.0  # what a column has no use for
+    risen[3] += 2.0  # parameters that a column does not use
     assert not columns.moved(upright, columns, risen)
 
 
-def test_of_many_to_start_from_only_those_that_data_ask_for_are_taken(coarse, fine):
+def test_only_starts_required_by_the_data_are_used(coarse, fine):
     cut_along, held, rest = fine
     change = np.asarray(cut_along.voltages(BATH * np.where(held, 4.0, 1.0))) - rest
     frame, noise = np.asarray(coarse.voltages(BATH)) + change, np.full(len(change), 0.03 * np.sqrt(np.mean(change**2)))
@@ -374,14 +375,14 @@ def test_of_many_to_start_from_only_those_that_data_ask_for_are_taken(coarse, fi
     assert len(fit.bodies.sign) == 1
 
 
-def test_those_beyond_doubt_are_fitted_together_before_others_are_tried(coarse):
-    """Alone, the first of two would move between them. What is fitted, and from where, is recorded in place of fits."""
+def test_certain_bodies_are_fitted_together_before_others_are_tried(coarse):
+    """Alone, the first of the two would move between them. Fits are replaced by a record of their starts."""
     fitted = []
 
     class Recorded:
         def settled(self, bodies, coefficients, level, steps):
             fitted.append((list(bodies.sign), coefficients))
-            return level, Fit(bodies, coefficients, 1.0, ROWS), 0.0  # no other is likelier
+            return level, Fit(bodies, coefficients, 1.0, ROWS), 0.0  # no other is more probable
 
     places = [BALL, [-0.03, 0.04, 0.03], [0.0, 0.0, 0.05]]
     balls = Ellipsoids.create(coarse.mesh, EllipsoidPrior(modes=1), places, [1, 1, -1])

@@ -1,4 +1,4 @@
-"""Bodies in a solid as ellipsoids, fitted with default meshes to what was solved on another mesh."""
+"""Bodies in a solid as ellipsoids, fitted with default meshes to voltages solved on another mesh."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from jeit.inverse.shapes import EllipsoidPrior, reconstruct_shapes, search
 from jeit.mesh import bisect, centroids, cut, measures
 from jeit.protocol import opposite
 
-PLACES = BALL, np.array([-0.012, 0.035, 0.045])  # of two
+PLACES = BALL, np.array([-0.012, 0.035, 0.045])  # positions of two balls
 
 
 @pytest.fixture(scope="module")
@@ -20,14 +20,14 @@ def coarse():
 
 @pytest.fixture(scope="module")
 def few():
-    """A model of fewer nodes, and its voltages of the bath."""
+    """A model with fewer nodes, and its voltages of the bath."""
     one = model(1200)
     return one, np.asarray(one.voltages(BATH))
 
 
 @pytest.fixture
 def one_mesh(monkeypatch):
-    """One finer mesh, where what is said does not depend on them."""
+    """Use one finer mesh where the result does not depend on their number."""
     monkeypatch.setattr(search, "_MOST_MESHES", 1)
 
 
@@ -39,22 +39,22 @@ def bath(coarse):
 
 @pytest.fixture(scope="module")
 def ball():
-    """A model whose mesh is cut along the ball, which of its cells lie inside, and its voltages of the bath."""
+    """A model whose mesh is cut along the ball, the mask of cells inside, and the model's voltages of the bath."""
     fine, held = sharp(6000)
     return fine, held, np.asarray(fine.voltages(BATH))
 
 
 @pytest.fixture(scope="module")
 def column():
-    """By how much a column changes the voltages."""
+    """The voltage change by a column."""
     fine, held = sharp(4000, along=2)
     return np.asarray(fine.voltages(BATH * np.where(held, 4.0, 1.0))) - np.asarray(fine.voltages(BATH))
 
 
 @pytest.fixture(scope="module")
 def two_balls():
-    """Functions of points, below zero in the one and the other, and a model whose mesh is cut along both, with its
-    voltages of the bath."""
+    """Functions of points, negative in one ball each, and a model whose mesh is cut along both, with its voltages of
+    the bath."""
     mesh = model(5000).mesh
     balls = [lambda points, place=place: np.linalg.norm(points - place, axis=-1) - RADIUS for place in PLACES]
     for outside in balls:
@@ -69,7 +69,7 @@ def two_balls():
 
 
 @pytest.mark.slow
-def test_a_column_is_told_from_a_ball(coarse, bath, column):
+def test_a_column_is_distinguished_from_a_ball(coarse, bath, column):
     noise = 0.03 * np.sqrt(np.mean(column**2))
     start = [(1, BALL + 0.005, 0.03)]
     found = reconstruct_shapes(coarse, bath + column, BATH, start=start, noise=noise)
@@ -77,15 +77,15 @@ def test_a_column_is_told_from_a_ball(coarse, bath, column):
     assert body.column
     assert found.alternatives == (None,)
     assert np.linalg.norm((body.centroid - BALL)[:2]) < 0.002
-    # What it does to the field, as of a disk in a sheet: volume times (ratio - 1) / (ratio + 1).
+    # The effect on the field, as of a disk in a sheet: volume times (ratio - 1) / (ratio + 1).
     strength = body.volume * np.tanh(body.contrast / 2)
     np.testing.assert_allclose(strength, np.pi * RADIUS**2 * SIZE[2] * 3 / 5, rtol=0.15)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("ratios", "alike"), [((4.0, 4.0), True), ((2.0, 10.0), False)])
-def test_two_balls_are_of_one_material_unless_the_data_tell_otherwise(coarse, bath, two_balls, ratios, alike):
-    """Strong ones are hardly told by how much: together they are told better."""
+def test_two_balls_are_of_one_material_unless_the_data_contradict(coarse, bath, two_balls, ratios, alike):
+    """Large ratios are hard to estimate; a common one is estimated more precisely."""
     balls, fine, rest = two_balls
     mesh = fine.mesh
     factor = np.ones(mesh.num_cells)
@@ -106,8 +106,8 @@ def test_two_balls_are_of_one_material_unless_the_data_tell_otherwise(coarse, ba
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kinds", ["ellipsoids", "columns"])
-def test_a_kind_that_is_given_is_kept(few, one_mesh, column, kinds):
-    """Of a column's voltages, from two starts of which one is nothing."""
+def test_a_given_kind_is_kept(few, one_mesh, column, kinds):
+    """Voltages of a column, from two starts of which only one is at a body."""
     coarse, bath = few
     frame, noise = bath + column, 0.03 * np.sqrt(np.mean(column**2))
     start, prior = [(1, BALL + 0.005, 0.03), (-1, (-0.03, 0.04, 0.03), 0.02)], EllipsoidPrior(kinds=kinds)
@@ -123,8 +123,8 @@ def test_a_kind_that_is_given_is_kept(few, one_mesh, column, kinds):
 
 
 @pytest.mark.slow
-def test_what_a_smooth_field_explains_bends_no_body(coarse, bath, ball, monkeypatch):
-    """Salt that has sunk to the floor, twice as conductive there as the bath, under a ball ten times as conductive."""
+def test_a_smooth_field_does_not_distort_bodies(coarse, bath, ball, monkeypatch):
+    """Settled salt makes the bath at the floor twice as conductive, below a ball ten times as conductive."""
     fine, held, rest = ball
     place = np.asarray(centroids(fine.mesh))
     sunk = np.exp(np.log(2) * np.exp(-place[:, 2] / 0.015))
@@ -134,7 +134,7 @@ def test_what_a_smooth_field_explains_bends_no_body(coarse, bath, ball, monkeypa
     smooth = reconstruct(coarse, frame, BATH, prior=Gaussian(0.025), hyperparameter=5.0, noise=noise)
     start = [(1, BALL + 0.005, 0.025)]
     beside = reconstruct_shapes(coarse, frame, BATH, start=start, noise=noise, smooth=smooth)
-    with monkeypatch.context() as fewer:  # one finer mesh, and on more a body goes astray all the same
+    with monkeypatch.context() as fewer:  # one finer mesh; with more, a body is displaced as well
         fewer.setattr(search, "_MOST_MESHES", 1)
         alone = reconstruct_shapes(coarse, frame, BATH, start=start, noise=noise)
     assert max(np.linalg.norm(body.centroid - BALL) for body in alone.bodies) > 0.02
@@ -147,8 +147,8 @@ def test_what_a_smooth_field_explains_bends_no_body(coarse, bath, ball, monkeypa
 
 
 @pytest.mark.slow
-def test_a_resistive_ball_is_told_from_a_ghost_with_place_and_strength(coarse, bath, ball):
-    """A conductive one: see test_ellipsoids.py."""
+def test_a_resistive_ball_is_distinguished_from_a_ghost(coarse, bath, ball):
+    """test_ellipsoids.py tests a conductive one."""
     ratio = 0.2
     fine, held, rest = ball
     change = np.asarray(fine.voltages(BATH * np.where(held, ratio, 1.0))) - rest
@@ -162,14 +162,15 @@ def test_a_resistive_ball_is_told_from_a_ghost_with_place_and_strength(coarse, b
     assert not body.column
     assert found.alternatives == (None,)
     assert np.linalg.norm(body.centroid - BALL) < 0.003
-    # What it does to the field: volume times (ratio - 1) / (ratio + 2); which of the two is hardly told.
+    # The effect on the field is volume times (ratio - 1) / (ratio + 2). The data hardly distinguish volume from ratio.
     strength = body.volume * np.expm1(sign * body.contrast) / (np.exp(sign * body.contrast) + 2)
     true = 4 * np.pi / 3 * RADIUS**3 * (ratio - 1) / (ratio + 2)
     np.testing.assert_allclose(strength, true, rtol=0.15)
-    # The image holds all of the body, its cells by the share that it covers: harmonic means would lose a tenth of it.
+    # The image contains the whole body, as cells are weighted by the covered fraction: harmonic means would lose a
+    # tenth.
     image = np.log(np.asarray(found.conductivity) / BATH / (1 + found.drift))
     np.testing.assert_allclose(np.asarray(measures(coarse.mesh)) @ image, sign * body.contrast * body.volume, rtol=0.05)
-    # So does that on the finer mesh, on whose cells it ends within fewer.
+    # So does the image on the finer mesh, whose edge of the body has fewer partly covered cells.
     assert found.finer is not None
     fine, values = found.finer.model.mesh, np.asarray(found.finer.conductivity)
     assert fine.num_cells == len(values) > coarse.mesh.num_cells

@@ -1,5 +1,5 @@
-"""Gradients of every kind of image in all that has one, electrodes and nodes too, against finite differences on a mesh
-that is fine enough for them; batches against loops, compiled code against what NumPy answers at once."""
+"""Gradients of every kind of image with respect to all its inputs, including electrodes and nodes, against finite
+differences on a sufficiently fine mesh; batches against loops, and compiled against uncompiled results."""
 
 from typing import Any
 
@@ -36,7 +36,7 @@ from jeit.inverse.nonlinear import (
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 
-pytestmark = pytest.mark.slow  # test_image_gradients.py has one of each kind, on a small body
+pytestmark = pytest.mark.slow  # no electrode ends on a node, where derivatives jump
 
 ANGLE = 2 * np.pi * np.arange(8) / 8 + 0.13  # no end of an electrode on a node, where derivatives jump
 ELECTRODES = BoundaryElectrodes(0.1 * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=1), 0.02, 1e-2)
@@ -54,12 +54,12 @@ THETA: dict[str, Any] = {
     "position": np.asarray(ELECTRODES.position),
     "points": np.asarray(MESH.points),
 }
-# Of the steps of differences: channels, cells, noise relative to themselves, electrodes and points in metres.
+# Sizes for the steps of differences: channels, cells, noise relative to themselves, electrodes and points in metres.
 SIZE = {"data": 0.01 * EMPTY, "background": 1e-3, "noise": THETA["noise"], "position": 1e-2, "points": 1e-3}
 
 
 def placed(theta, model=MODEL):
-    """The model with electrodes and points of the mesh where `theta` has them."""
+    """The model with the electrodes and points given in `theta`."""
     moved = model.with_electrodes(eqx.tree_at(lambda e: e.position, model.electrodes, theta["position"]))
     return eqx.tree_at(lambda m: m.mesh.points, moved, theta["points"])
 
@@ -88,7 +88,7 @@ def test_linear_images(prior):
 
 
 def solved(theta, prior, solver, parametrisation=None, model=MODEL):
-    """The reconstruction of everything in `theta`."""
+    """The reconstruction with every input in `theta`."""
     return reconstruct(
         placed(THETA | theta, model),
         theta["data"],
@@ -109,8 +109,8 @@ def image_of(found):
 TIGHT = GaussNewton(max_steps=100, rtol=1e-24)
 
 
-def test_nonlinear_images_of_a_model_that_is_traced_as_a_whole():
-    """Protocol and cells included: reciprocal channels are then not combined, and the image is the same."""
+def test_nonlinear_images_of_a_traced_model():
+    """Protocol and cells are traced too. Reciprocal channels are then not combined, and the image is the same."""
 
     def image(theta, model=MODEL):
         model = model.with_electrodes(model.electrodes.with_contact_impedance(theta["contact"]))
@@ -144,7 +144,8 @@ def test_nonlinear_images_of_smooth_priors(prior):
 
 
 def test_images_of_total_variation():
-    """The smoothed energy's own optimality condition, not the forms that touch it. The background all but drops out."""
+    """By the optimality condition of the smoothed energy, not by its quadratic models. The background has almost no
+    effect."""
     assert_gradient(
         lambda theta: image_of(solved(theta, TotalVariation(0.3), GaussNewton(max_steps=1000, rtol=1e-16))),
         {name: value for name, value in THETA.items() if name != "background"} | {"hyperparameter": 3.0},
@@ -167,7 +168,7 @@ def test_images_between_bounds():
 
 
 def test_images_with_further_unknowns():
-    """In all but the nodes, which unknowns take nothing from: they come in by the model, as in the tests above."""
+    """With respect to all inputs except the nodes, which reach unknowns only by the model, as in the tests above."""
     unknowns = [ContactImpedance(MODEL, 0.1), ElectrodePosition(MODEL, 3e-4), Scale(0.03)]
 
     def image(theta):
@@ -175,13 +176,13 @@ def test_images_with_further_unknowns():
         return image_of(found) + 1e3 * jnp.sum(found.model.electrodes.contact_impedance)
 
     theta = {name: value for name, value in THETA.items() if name != "points"} | {"hyperparameter": 10.0}
-    # Nothing answers at once here: all is compiled either way.
+    # There is no uncompiled result here.
     assert_gradient(image, theta, equal=None, compiled=True)
 
 
 @pytest.mark.parametrize(("contact", "names"), [("common", ["data"]), ("each", ["position", "points", "data"])])
 def test_calibrations(contact, names):
-    """Of one impedance for all electrodes against the data alone: how electrodes and nodes come in is the same."""
+    """One impedance for all electrodes, fitted to the data alone; electrodes and nodes enter in the same way."""
     apart = ELECTRODES.with_contact_impedance(np.linspace(0.2, 0.5, 8))
     wide = MODEL.with_electrodes(ELECTRODES.with_contact_impedance(np.full(8, 0.3)))
     data = MODEL.with_electrodes(apart).voltages(2e-3) * (1 + 1e-3 * np.random.default_rng(2).normal(size=EMPTY.shape))
@@ -195,7 +196,7 @@ def test_calibrations(contact, names):
         return 1e3 * found.conductivity + impedance + 1e2 * found.misfit + found.contact_deviation.sum()
 
     theta = {name: (THETA | {"data": data})[name] for name in names}
-    assert_gradient(fitted, theta, equal=1e-6, compiled=True)  # at once it ends where parameters change by 1e-8
+    assert_gradient(fitted, theta, equal=1e-6, compiled=True)  # uncompiled, it ends where parameters change by 1e-8
 
 
 def test_gradients_of_batches_are_batches_of_gradients():

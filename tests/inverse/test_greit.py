@@ -1,4 +1,4 @@
-"""GREIT: the matrix against its definition, its noise figure, and its images of small targets beside NOSER's."""
+"""GREIT: the matrix against its definition, its noise figure, and its images of small targets compared with NOSER."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +40,7 @@ def reconstruction(model):
 
 
 def judge(truth, position, methods):
-    """Figures of merit of each method, for targets of 8 mm radius simulated on another mesh, small changes each."""
+    """Figures of merit of each method for targets of 8 mm radius, simulated on another mesh as small changes."""
     inside = np.linalg.norm(np.asarray(centroids(truth.mesh)) - position[:, None], axis=-1) < 0.008
     difference = inside @ np.asarray(truth.jacobian(1.0)).T
     area = inside @ np.asarray(measures(truth.mesh))
@@ -53,7 +53,7 @@ def judge(truth, position, methods):
 
 @pytest.fixture(scope="module")
 def figures(model, reconstruction):
-    """Of GREIT and of NOSER at the same noise figure, out to 0.8 radii, between an electrode and a gap."""
+    """Figures of merit of GREIT and NOSER at the same noise figure, up to 0.8 radii, between an electrode and a gap."""
     angle = np.pi / 32
     position = np.linspace(0, 0.8 * RADIUS, 17)[:, None] * [np.cos(angle), np.sin(angle)]
     noser = one_step(model, 1.0, hyperparameter=2.75e-3)
@@ -62,13 +62,14 @@ def figures(model, reconstruction):
 
 
 def central_response(model):
-    """Of a target of 0.05 radii in the middle, per siemens, from the Jacobian."""
+    """Response to a target of 0.05 radii in the middle, per siemens, from the Jacobian."""
     covered = np.linalg.norm(np.asarray(centroids(model.mesh)), axis=1) < 0.1 * RADIUS
     return np.asarray(model.jacobian(1.0)) @ covered
 
 
 def noise_figure_by_draws(model, reconstruction, noise=None):
-    """The definition, with noise drawn: mean signal over standard deviation, of the data over that of the image."""
+    """The noise figure by its definition with simulated noise: mean signal over standard deviation, of data over
+    image."""
     noise = np.ones(208) if noise is None else np.asarray(noise)
     response, matrix = central_response(model), np.asarray(reconstruction.matrix)
     drawn = np.random.default_rng(1).normal(size=(len(response), 2000))
@@ -78,8 +79,8 @@ def noise_figure_by_draws(model, reconstruction, noise=None):
     return np.mean(np.abs(response / noise)) / drawn.std() / of_image
 
 
-def test_matrix_is_the_fit_of_desired_images_to_responses(model):
-    """R (YYᵀ + λ²W⁻¹) = XYᵀ with unequal noise and a mask, the sum over targets taken one by one."""
+def test_matrix_fits_desired_images_to_responses(model):
+    """R (YYᵀ + λ²W⁻¹) = XYᵀ with unequal noise and a mask, by an explicit sum over targets."""
     mask = np.ones(208, bool)
     mask[[3, 50]] = False
     noise = np.random.default_rng(0).uniform(0.5, 2, 208)
@@ -103,10 +104,10 @@ def body_radius(mesh):
     return np.sqrt(float(measures(mesh).sum()) / np.pi)
 
 
-def test_targets_are_spread_evenly_within_the_outline():
+def test_targets_are_distributed_evenly_within_the_outline():
     mesh = on_a_rectangle(400).mesh
     position, covered = _place_targets(mesh, np.zeros(2), 0.007, 500)
-    # A strip half a spacing wide at the edge holds no centre of a target that lies inside.
+    # A strip half a spacing wide at the edge has no centres of targets inside.
     assert 420 < len(position) < 520
     assert (np.abs(position) < np.array([0.15, 0.1]) - 0.005).all()
     distance = np.linalg.norm(position[:, None] - position, axis=-1) + np.eye(len(position))
@@ -114,13 +115,13 @@ def test_targets_are_spread_evenly_within_the_outline():
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     area = covered.T @ measure
     np.testing.assert_allclose(area.mean(), np.pi * 0.007**2, rtol=0.01)
-    # A cell counts with its own centre, whichever part of it is covered.
+    # A cell counts by its centre, whichever part of it is covered.
     gravity = (covered.T @ (measure[:, None] * centre)) / area[:, None]
     assert np.linalg.norm(gravity - position, axis=1).max() < np.sqrt(measure.max())
     np.testing.assert_allclose(np.linalg.norm((gravity - position).mean(axis=0)), 0, atol=1e-3)
 
 
-def test_desired_images_are_discs_with_the_targets_change():
+def test_desired_images_are_discs_with_the_target_change():
     mesh = disk(RADIUS, num_points=3000)
     measure, centre = np.asarray(measures(mesh)), np.asarray(centroids(mesh))
     position, area = np.array([[0.0, 0.0], [0.03, -0.02], [0.095, 0.0]]), np.array([1e-4, 2e-4, 1e-4])
@@ -128,30 +129,30 @@ def test_desired_images_are_discs_with_the_targets_change():
     np.testing.assert_allclose(desired.T @ measure, area, rtol=1e-12)
     for k in range(2):
         distance = np.linalg.norm(centre - position[k], axis=1)
-        # A smooth edge, symmetric about the radius, makes the disc a little larger: 2 ∫ r h(r) dr.
+        # A smooth edge, symmetric about the radius, enlarges the disc a little: 2 ∫ r h(r) dr.
         height = area[k] / (np.pi * 0.03**2)
         assert desired[distance < 0.02, k].min() == desired[:, k].max() == pytest.approx(height, rel=0.03)
         assert desired[distance > 0.0376, k].max() == 0
         np.testing.assert_allclose(desired[np.abs(distance - 0.03) < 5e-4, k].mean(), height / 2, rtol=0.1)
 
 
-def test_noise_figure_is_met(model, reconstruction):
+def test_requested_noise_figure_is_reached(model, reconstruction):
     assert reconstruction.rule == "noise-figure"
-    # The target by which it was set, a smaller one in the middle, has a response of the same shape.
+    # The noise figure was set with another target; a smaller one in the middle has a response of the same shape.
     assert noise_figure_by_draws(model, reconstruction) == pytest.approx(0.5, rel=0.03)
     noise = jnp.asarray(np.random.default_rng(2).uniform(0.5, 2, 208))
     other = greit(model, 1.0, noise_figure=0.8, noise=noise)
     assert noise_figure_by_draws(model, other, noise) == pytest.approx(0.8, rel=0.03)
 
 
-def test_hyperparameter_is_in_units_of_noise(model, reconstruction):
+def test_hyperparameter_is_relative_to_the_noise(model, reconstruction):
     given = greit(model, 1.0, hyperparameter=float(reconstruction.hyperparameter) / 7, noise=7.0)
     assert given.rule == "given"
     largest = np.abs(np.asarray(reconstruction.matrix)).max()
     np.testing.assert_allclose(given.matrix, reconstruction.matrix, atol=1e-9 * largest)
 
 
-def test_works_like_any_linear_reconstruction(model, reconstruction):
+def test_compatible_with_other_linear_reconstructions(model, reconstruction):
     assert reconstruction.weights.shape == (104, model.mesh.num_cells)  # reciprocity halves 208 channels
     change = jnp.stack([central_response(model), -central_response(model)])
     image = np.asarray(reconstruction.image(change))
@@ -162,7 +163,7 @@ def test_works_like_any_linear_reconstruction(model, reconstruction):
 
 
 def test_amplitude_is_more_uniform_than_with_noser(figures):
-    """At one noise figure, from the middle out to 0.8 radii."""
+    """At equal noise figures, from the middle to 0.8 radii."""
     spread = [float(np.std(merit.amplitude_response) / np.mean(merit.amplitude_response)) for merit in figures]
     assert spread[0] < 0.05
     assert spread[0] < 0.65 * spread[1]
@@ -170,14 +171,14 @@ def test_amplitude_is_more_uniform_than_with_noser(figures):
     assert figures[0].amplitude_response.max() < 1.14
 
 
-def test_little_ringing_and_displacement(figures):
+def test_ringing_and_displacement_are_small(figures):
     found, noser = figures
     assert found.ringing.max() < 0.17
     assert found.ringing.max() < 0.5 * noser.ringing.max()
     assert np.abs(found.position_error).max() < 0.042 * RADIUS
     assert np.abs(found.position_error).mean() < 0.6 * np.abs(noser.position_error).mean()
     assert found.shape_deformation.max() < 0.1
-    # The price: images a little larger than NOSER's.
+    # The price is an image that is slightly larger than NOSER's.
     assert found.resolution.max() < 0.44
     assert found.resolution.min() > 0.25
 
@@ -237,8 +238,8 @@ def test_thin_bodies_are_refused():
         greit(thin, 1.0, target_radius=0.2)
 
 
-def test_a_ball_in_a_solid_is_imaged_where_it_is():
-    """Within a seventh of the box's side, seen by fourteen points."""
+def test_a_ball_in_a_solid_is_imaged_at_its_position():
+    """Within a seventh of the box's side, measured with fourteen points."""
     sides = np.concatenate([np.eye(3), -np.eye(3)]) * 0.05
     middle = np.array([0, 0, 0.05])
     corners = np.stack(np.meshgrid(*3 * [[-0.05, 0.05]], indexing="ij"), axis=-1).reshape(-1, 3)

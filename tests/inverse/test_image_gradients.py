@@ -1,5 +1,5 @@
-"""Images, calibrations and uncertainties as functions that JAX transforms: gradients against finite differences in all
-that has one, batches against loops, compiled code against what NumPy answers at once."""
+"""Differentiable images, calibrations and uncertainties: gradients with respect to all inputs against finite
+differences, batches against loops, and compiled against uncompiled results."""
 
 from typing import Any
 
@@ -26,7 +26,7 @@ from jeit.inverse.nonlinear import LBFGSB, GaussNewton
 from jeit.mesh import Disk, centroids
 from jeit.protocol import adjacent
 
-ANGLE = 2 * np.pi * np.arange(5) / 5 + 0.13  # no end of an electrode on a node, where derivatives jump
+ANGLE = 2 * np.pi * np.arange(5) / 5 + 0.13  # no electrode ends on a node, where derivatives jump
 ELECTRODES = BoundaryElectrodes(0.1 * np.stack([np.cos(ANGLE), np.sin(ANGLE)], axis=1), 0.02, 1e-2)
 MESH = Disk(0.1).mesh(num_points=16)
 MODEL: Any = ForwardModel(MESH, ELECTRODES, adjacent(5, current=1e-3))
@@ -42,15 +42,15 @@ THETA: dict[str, Any] = {
     "position": np.asarray(ELECTRODES.position),
     "points": np.asarray(MESH.points),
 }
-# What compiles quickly, and what takes seconds: the geometry.
+# Inputs that compile quickly, and those that take seconds: the geometry.
 VARIED = {name: THETA[name] for name in ("data", "background", "noise")}
 FIXED = {name: THETA[name] for name in ("position", "points")}
-# Of the steps of differences: channels, cells, noise relative to themselves, electrodes and points in metres.
+# Sizes for the steps of differences: channels, cells, noise relative to themselves, electrodes and points in metres.
 SIZE = {"data": 0.01 * EMPTY, "background": 1e-3, "noise": THETA["noise"], "position": 1e-2, "points": 1e-3}
 
 
 def placed(theta):
-    """The model with electrodes and points of the mesh where `theta` has them."""
+    """The model with the electrodes and points given in `theta`."""
     moved = MODEL.with_electrodes(eqx.tree_at(lambda e: e.position, MODEL.electrodes, theta["position"]))
     return eqx.tree_at(lambda m: m.mesh.points, moved, theta["points"])
 
@@ -67,7 +67,7 @@ def linear_image(theta, prior):
 
 
 def test_linear_images():
-    """In one function of three priors, for compilation; of the fourth and of the geometry see below."""
+    """Three priors in one function, to compile once; the fourth prior and the geometry are tested below."""
 
     def image(theta):
         theta = FIXED | theta
@@ -80,7 +80,7 @@ def test_linear_images():
     assert_gradient(image, VARIED | {"level 0": 3.0, "level 1": 1e4, "level 2": 1e3, "length": 0.03})
 
 
-def test_the_gaussian_prior_where_points_are():
+def test_the_gaussian_prior_with_respect_to_points():
     rows = RANDOM.normal(size=(2, MESH.num_cells))
 
     def product(theta):
@@ -91,7 +91,7 @@ def test_the_gaussian_prior_where_points_are():
 
 
 def solved(theta, prior, solver, parametrisation=None):
-    """The reconstruction of everything in `theta`."""
+    """The reconstruction with every input in `theta`."""
     return reconstruct(
         placed(theta),
         theta["data"],
@@ -114,7 +114,7 @@ TIGHT = GaussNewton(max_steps=100, rtol=1e-16)
 
 @pytest.mark.slow
 def test_nonlinear_images():
-    """Against differences; and derivatives of coefficients are the minimum's however early the solver stopped."""
+    """Against differences. Derivatives of coefficients are those of the minimum, even if the solver stopped early."""
 
     def image(theta, solver):
         theta = {name: theta.get(name, THETA.get(name)) for name in (*VARIED, "hyperparameter", "share")}
@@ -149,8 +149,8 @@ def test_nonlinear_images():
 
 
 @pytest.mark.parametrize("solver", [GaussNewton(), pytest.param(LBFGSB(), marks=pytest.mark.slow)])
-def test_the_loop_is_not_differentiated(solver):
-    """Gradients of what it finds can be traced, by all that a model has."""
+def test_the_iteration_is_not_differentiated(solver):
+    """Gradients of the solution can be traced with respect to all arrays of a model."""
     gradient = eqx.filter_eval_shape(eqx.filter_grad(lambda model: image_of(whole(model, solver))), MODEL)
     assert gradient.mesh.points.shape == MODEL.mesh.points.shape
     assert gradient.protocol.drive.shape == MODEL.protocol.drive.shape
@@ -168,8 +168,8 @@ def test_batches_of_linear_images():
     np.testing.assert_allclose(batch, one_by_one, rtol=0, atol=1e-9 * abs(one_by_one).max())
 
 
-def test_batches_of_reconstructions_and_how_each_ended():
-    """Compiled together, against one after the other: one that converged, one that did not, and one of NaN."""
+def test_batches_of_reconstructions_and_their_status():
+    """Compiled in a batch against one after the other: one that converged, one that did not, and one of NaN."""
 
     def found(frame):
         return reconstruct(
@@ -229,7 +229,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_has_to_be_settled_outside_is_said(name):
+def test_settings_that_must_be_known_outside_are_reported(name):
     function, match = REFUSED[name]
     with pytest.raises(ValueError, match=match):
         jax.jit(function)(1e-3)

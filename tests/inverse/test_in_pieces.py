@@ -1,4 +1,4 @@
-"""What is worked out some cells, or some columns, at a time: the same as all at once, however the pieces fall."""
+"""Computations by blocks of cells or columns: results do not depend on the blocks."""
 
 import threading
 
@@ -27,8 +27,8 @@ def model():
 
 
 @pytest.mark.parametrize("number", [208, 100], ids=["of fields' products", "of channels"])
-def test_jacobians_are_joined_of_pieces(number, model, monkeypatch):
-    """Of more channels than fields have products, and of fewer."""
+def test_jacobians_by_blocks(number, model, monkeypatch):
+    """With more channels than products of fields, and with fewer."""
     weights, channels = RANDOM.normal(size=(3, number)), np.arange(number)
     expected = weights @ np.asarray(model.jacobian(1.0))[:number]
     monkeypatch.setattr(forward_model, "_CELLS_AT_ONCE", 70)
@@ -40,7 +40,7 @@ def test_jacobians_are_joined_of_pieces(number, model, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["nodal", "diagonal", "dense"])
-def test_rows_are_restricted_in_pieces_as_whole(kind):
+def test_restricted_rows_by_blocks(kind):
     mesh = box(0.1, 0.1, 0.1, num_points=60)
     count, cells = mesh.num_cells, host.asarray(mesh.cells)
     means, deviation = host.zeros((count, mesh.num_points)), host.arange(1.0, count + 1)
@@ -59,13 +59,13 @@ def test_rows_are_restricted_in_pieces_as_whole(kind):
 
 
 @pytest.mark.parametrize("number", [1, 32, 33, 64, 100])
-def test_columns_are_joined_of_pieces(number):
+def test_columns_by_blocks(number):
     matrix, columns = RANDOM.normal(size=(7, 5)), RANDOM.normal(size=(5, number))
     np.testing.assert_allclose(by_columns(lambda part: matrix @ part, columns, 7), matrix @ columns, rtol=1e-12)
 
 
-def test_columns_are_always_solved_for_on_the_same_threads():
-    """What new ones allocate would stay with the process."""
+def test_columns_are_always_solved_on_the_same_threads():
+    """Memory allocated by new threads would stay with the process."""
     pools = set()
 
     def noted(part):
@@ -78,15 +78,15 @@ def test_columns_are_always_solved_for_on_the_same_threads():
 
 
 def test_images_of_a_linear_problem_are_not_copied_for_jax(model):
-    """A solid body's take a third of a gigabyte each: JAX's, which cannot be written into, would be there besides."""
+    """Those of a solid body take a third of a gigabyte each; copies by JAX, which are read-only, would double it."""
     images, weights = Linearisation.create(model, 1.0, prior=Laplace()).factors(3.0)
     assert images.flags.writeable
     matrix = one_step(model, 1.0, prior=Laplace(), hyperparameter=3.0).matrix
     np.testing.assert_allclose(images @ weights, matrix, rtol=0, atol=1e-9 * abs(np.asarray(matrix)).max())
 
 
-def test_samples_far_from_all_of_greits_targets_are_passed_over_unnoticed(monkeypatch):
-    """Shares of balls are those of all samples; the grid is not that of the body's corner."""
+def test_samples_far_from_all_targets_are_skipped(monkeypatch):
+    """Fractions covered by balls equal those with all samples; the grid does not start at the body's corner."""
     mesh = box(0.1, 0.13, 0.09, num_points=400)
     middle = np.array([0.003, -0.004, 0.046])
     position, covered = greit._place_targets(mesh, middle, 0.012, 60)

@@ -1,4 +1,4 @@
-"""Linear images: the matrix against its definition, the rules, and what they find on simulated inclusions."""
+"""Linear images: the matrix against its definition, hyperparameter rules, and images of simulated inclusions."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,8 @@ def model():
 
 @pytest.fixture(scope="module")
 def difference(model):
-    """An inclusion at (0.05, 0.02) m of doubled conductivity, seen by a finer mesh; plus one part in 1e4 of noise."""
+    """Difference voltages of an inclusion of double conductivity at (0.05, 0.02) m on a finer mesh, with relative noise
+    of 1e-4."""
     fine = ForwardModel(disk(0.1, num_points=900), model.electrodes, model.protocol)
     inside = jnp.linalg.norm(centroids(fine.mesh) - jnp.array([0.05, 0.02]), axis=1) < 0.02
     change = fine.voltages(jnp.where(inside, 2.0, 1.0)) - fine.voltages(1.0)
@@ -50,7 +51,7 @@ def test_matrix_solves_the_normal_equations(model, name):
     assert np.abs(matrix[:, ~mask]).max() == 0
 
 
-def test_gaussian_matrix_is_the_data_space_form_of_its_covariance(model):
+def test_gaussian_matrix_equals_its_data_space_form(model):
     jacobian = np.asarray(model.jacobian(1.0))
     centre = np.asarray(centroids(model.mesh))
     covariance = np.exp(-((centre[:, None] - centre) ** 2).sum(axis=-1) / (2 * 0.02**2))
@@ -75,7 +76,7 @@ def test_image_equals_the_full_matrix_for_one_frame_and_many(model, difference):
     np.testing.assert_allclose(imaged[-2:], images, atol=1e-12 * np.abs(expected).max())
 
 
-def test_an_image_is_the_same_at_once_compiled_batched_and_of_a_reconstruction_that_is_traced(model, difference):
+def test_images_are_equal_uncompiled_compiled_batched_and_of_a_traced_reconstruction(model, difference):
     reconstruction = one_step(model, 1.0, hyperparameter=0.03)
     expected = reconstruction.image(np.asarray(difference))
     assert isinstance(expected, jax.Array)
@@ -93,35 +94,35 @@ def test_an_image_is_the_same_at_once_compiled_batched_and_of_a_reconstruction_t
 
 
 @pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS.keys())
-def test_every_prior_finds_the_inclusion(model, difference, prior):
+def test_every_prior_images_the_inclusion(model, difference, prior):
     image = one_step(model, 1.0, prior=prior, difference=difference).image(difference)
     strongest = find_inclusions(model.mesh, image)[0]
     assert strongest.sign == 1
-    # Tikhonov alone pulls images towards the edge, where a change of conductivity costs least.
+    # Tikhonov regularisation shifts images towards the edge, where the sensitivity is largest.
     tolerance = 0.02 if isinstance(prior, Tikhonov) else 0.012
     assert np.linalg.norm(np.array(strongest.centroid) - [0.05, 0.02]) < tolerance
 
 
 @pytest.mark.parametrize("filtered", [False, True])
-def test_back_projection_finds_the_inclusion(model, difference, filtered):
+def test_back_projection_images_the_inclusion(model, difference, filtered):
     image = back_projection(model, 1.0, filtered=filtered, hyperparameter=0.01).image(difference)
     strongest = find_inclusions(model.mesh, image)[0]
     assert strongest.sign == 1
     assert np.linalg.norm(np.array(strongest.centroid) - [0.05, 0.02]) < 0.03
 
 
-def test_back_projection_images_a_uniform_change_as_itself(model):
+def test_back_projection_of_a_uniform_change(model):
     change = model.voltages(1.01) - model.voltages(1.0)
     image = np.asarray(back_projection(model, 1.0).image(change))
     reached = image != 0
     assert reached.mean() > 0.9
-    # z stays put while σ changes, so the voltages do not scale exactly.
+    # z is constant while σ changes, so that voltages do not scale exactly.
     np.testing.assert_allclose(image[reached], 0.01, rtol=0.1)
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_rules_choose_a_hyperparameter_that_follows_the_noise(model, difference, rule):
-    """Data in units of noise: with ten times the noise, rules that see data must not choose a smaller λ."""
+def test_chosen_hyperparameters_increase_with_the_noise(model, difference, rule):
+    """Data in units of noise: with ten times the noise, rules that use the data must not choose a smaller λ."""
     chosen = []
     for level in (1e-2, 1e-1):
         scale = level * float(jnp.abs(difference).max())

@@ -1,4 +1,4 @@
-"""Low-rank factors of a covariance: traced ones against those of NumPy, and both against the covariance itself."""
+"""Low-rank factors of a covariance: traced factors against those of NumPy, and both against the covariance."""
 
 import jax
 import numpy as np
@@ -6,7 +6,7 @@ import numpy as np
 from jeit.inverse.prior.low_rank import pivoted_cholesky, traced_pivoted_cholesky
 
 
-def test_factors_give_the_covariance_and_traced_ones_are_the_same():
+def test_factors_reproduce_the_covariance_and_equal_traced_ones():
     places = np.random.default_rng(0).uniform(0, 2, (30, 2))
     covariance = np.exp(-((places[:, None] - places) ** 2).sum(axis=-1))
     known = pivoted_cholesky(np.ones(30), lambda one: covariance[one], tolerance=1e-10, max_rank=30)

@@ -1,4 +1,4 @@
-"""Matérn fields: their correlation against the closed form, even variances, and images by them."""
+"""Matérn fields: correlation against the closed form, uniform variances, and images with them as prior."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from jeit.protocol import adjacent
 
 
 def covariance(mesh, length):
-    """Of the cell nearest to the middle with all, and the distances to it."""
+    """Covariances of the cell nearest to the middle with all cells, and the distances to it."""
     centre = np.asarray(centroids(mesh))
     distance = np.linalg.norm(centre - centre.mean(axis=0), axis=1)
     middle = distance.argmin()
@@ -28,8 +28,8 @@ def covariance(mesh, length):
     return found, np.linalg.norm(centre - centre[middle], axis=1)
 
 
-def test_correlation_in_a_sheet_is_the_closed_form():
-    """κr K₁(κr) from a third of the length to twice of it, within 3 %; with cells half as large, half of that."""
+def test_correlation_in_a_sheet_equals_the_closed_form():
+    """κr K₁(κr) from a third of the length to twice the length, within 3 %; with cells half as large, half of that."""
     worst = []
     for number in (700, 2800):
         found, distance = covariance(disk(1.0, num_points=number), 0.25)
@@ -40,28 +40,28 @@ def test_correlation_in_a_sheet_is_the_closed_form():
     assert worst[1] < 0.6 * worst[0]
 
 
-def test_correlation_in_a_solid_is_the_closed_form():
-    """exp(-κr), from half the length to twice of it, on average within 2 %."""
+def test_correlation_in_a_solid_equals_the_closed_form():
+    """exp(-κr), from half the length to twice the length, on average within 2 %."""
     found, distance = covariance(box(1.0, 1.0, 1.0, num_points=2800), 0.25)
     scaled = distance / 0.25
     there = (scaled > 0.5) & (scaled < 2)
     assert np.abs(found[there] - np.exp(-scaled[there])).mean() < 0.02
 
 
-def test_variance_is_even_up_to_the_wall():
+def test_variance_is_uniform_up_to_the_wall():
     mesh = disk(1.0, num_points=1500)
     variance = np.sum(np.asarray(Matern(0.25).basis(mesh, np.zeros((0, 0))).shapes) ** 2, axis=1)
     assert 0.9 < variance.min() < variance.max() < 1.0
 
 
-def test_estimated_variances_are_near_the_exact_ones(monkeypatch):
+def test_estimated_variances_approximate_the_exact_ones(monkeypatch):
     mesh = disk(1.0, num_points=600)
     exact = Matern(0.25)._field(mesh, 0.0)
     monkeypatch.setattr("jeit.inverse.prior.matern._MAX_EXACT_NODES", 10)
     assert np.asarray(Matern(0.25)._field(mesh, 0.0).scale) == pytest.approx(exact.scale, rel=0.15)
 
 
-def test_basis_and_product_are_of_one_covariance():
+def test_basis_and_product_are_consistent():
     mesh = disk(1.0, num_points=300)
     rows = np.random.default_rng(0).normal(size=(3, mesh.num_cells))
     shapes = np.asarray(Matern(0.3).basis(mesh, rows).shapes)
@@ -82,7 +82,7 @@ def imaged(model):
     return centre, target, np.asarray(model.voltages(body)), np.asarray(model.voltages(1.0))
 
 
-def test_images_show_a_body_where_it_is(model):
+def test_images_show_a_body_at_its_position(model):
     centre, target, after, before = imaged(model)
     change = np.asarray(one_step(model, 1.0, prior=Matern(0.02)).image(after - before))
     assert np.linalg.norm(centre[change.argmax()] - target) < 0.015
@@ -90,7 +90,7 @@ def test_images_show_a_body_where_it_is(model):
     assert np.linalg.norm(centre[np.asarray(found.conductivity).argmax()] - target) < 0.015
 
 
-# All shapes of a Gaussian leave a thousandth of its variance out, which is a fifth of the narrowest bars.
+# All basis functions of a Gaussian omit a thousandth of its variance, which is a fifth of the narrowest error bars.
 @pytest.mark.parametrize(
     ("prior", "least"),
     [
@@ -99,15 +99,16 @@ def test_images_show_a_body_where_it_is(model):
         (Matern(0.02), 0.05),
     ],
 )
-def test_of_many_cells_fewer_shapes_make_the_same_image(prior, least, monkeypatch):
-    """Images within 3 % of those of all shapes, and error bars: what data do not tell of keeps its variance."""
+def test_fewer_basis_functions_give_the_same_image(prior, least, monkeypatch):
+    """Images within 3 % of those with all basis functions, and error bars: components without information keep their
+    variance."""
     model = ForwardModel(disk(0.1, num_points=120), BoundaryElectrodes(ring(0.1, 8), 0.012, 1e-3), adjacent(8))
     _, _, after, before = imaged(model)
 
     def found():
         noise = 1e-3 * np.abs(before).max()
         one = reconstruct(model, after, 1.0, prior=prior, hyperparameter=1.0, noise=noise)
-        bars = 1.0 if least is None else posterior(one).standard_deviation()  # which are compiled for seconds
+        bars = 1.0 if least is None else posterior(one).standard_deviation()  # compiled for seconds
         return np.asarray(one.conductivity) - 1, np.asarray(bars)
 
     image, deviation = found()
@@ -118,7 +119,7 @@ def test_of_many_cells_fewer_shapes_make_the_same_image(prior, least, monkeypatc
     assert np.abs(bars / deviation - 1).max() < (least or 1.0)
 
 
-def test_gaussian_by_way_of_a_grid():
+def test_gaussian_prior_by_a_grid():
     mesh = box(1.0, 1.0, 1.0, num_points=1500)
     centre = np.asarray(centroids(mesh))
     rows = np.random.default_rng(0).normal(size=(4, mesh.num_cells))
@@ -127,8 +128,8 @@ def test_gaussian_by_way_of_a_grid():
     assert np.abs(about - exact).max() < 5e-3 * np.abs(exact).max()
 
 
-def test_a_grid_of_more_points_than_cells_is_still_a_gain():
-    """Of cells a cylinder has fewer than its bounding box has grid points; pairs of cells are far more."""
+def test_a_grid_with_more_points_than_cells_is_still_faster():
+    """A cylinder has fewer cells than its bounding box has grid points, but far more pairs of cells."""
     mesh = box(1.0, 1.0, 1.0, num_points=1500)
     centre = np.asarray(centroids(mesh))
     assert GriddedGaussian.suits(centre, 0.14)
@@ -136,7 +137,7 @@ def test_a_grid_of_more_points_than_cells_is_still_a_gain():
     assert not GriddedGaussian.suits(centre, 0.05)
 
 
-def test_any_number_of_columns_goes_over_the_grid_alike():
+def test_results_do_not_depend_on_the_number_of_columns():
     centre = np.random.default_rng(2).uniform(size=(300, 3))
     columns = np.random.default_rng(3).normal(size=(300, 130))
     grid = GriddedGaussian(centre, 0.4)
@@ -144,8 +145,9 @@ def test_any_number_of_columns_goes_over_the_grid_alike():
     np.testing.assert_allclose(grid.product(columns), alone, rtol=1e-10, atol=1e-10)
 
 
-def test_laplace_of_many_cells_is_of_their_nodes(monkeypatch):
-    """Γ is symmetric and positive, and smooth: of white rows it keeps a small share of the steps between cells."""
+def test_laplace_prior_of_many_cells_is_defined_on_nodes(monkeypatch):
+    """Γ is symmetric, positive and smooth: applied to white noise it keeps a small fraction of the jumps between
+    cells."""
     mesh = box(1.0, 1.0, 1.0, num_points=300)
     rows = np.random.default_rng(1).normal(size=(2, mesh.num_cells))
     monkeypatch.setattr(priors, "_LARGE_MESH_CELLS", 10)

@@ -12,11 +12,11 @@ def draw(count, seed=0):
     return 0.1 + TRUE * np.random.default_rng(seed).normal(size=(count, TRUE.size))
 
 
-def test_many_frames_tell_every_channel():
+def test_many_frames_determine_the_noise_of_every_channel():
     np.testing.assert_allclose(repeated_noise(draw(4000), prior_frames=1.0), TRUE, rtol=0.05, atol=2e-6)
 
 
-def test_few_frames_are_drawn_towards_the_typical():
+def test_few_frames_are_shrunk_towards_the_typical_noise():
     found = np.stack([repeated_noise(draw(3, seed)) for seed in range(200)])
     plain = np.stack([draw(3, seed).std(axis=0, ddof=1) for seed in range(200)])
     middle = slice(12, 18)  # where the typical value is about right
@@ -53,6 +53,6 @@ def test_bad_input(frames, mask, message):
 
 
 @pytest.mark.parametrize("prior_frames", [-5.0, np.nan, np.inf])
-def test_frames_seen_before_are_a_number_from_zero(prior_frames):
+def test_invalid_numbers_of_previous_frames(prior_frames):
     with pytest.raises(ValueError, match="prior_frames"):
         repeated_noise(draw(5), prior_frames=prior_frames)

@@ -1,4 +1,4 @@
-"""Electrode positions estimated from a reference frame: against the true ones of a simulated tank, on another mesh."""
+"""Electrode positions estimated from a reference frame, against the true ones of a simulated tank on another mesh."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ DESCRIBED = BoundaryElectrodes(ring(RADIUS, 16), WIDTH, 0.005)
 
 
 def turned(degrees):
-    """The described places, each turned by so many degrees counter-clockwise."""
+    """The described positions, each rotated counter-clockwise by the given degrees."""
     described = np.asarray(DESCRIBED.position)
     angle = np.arctan2(described[:, 1], described[:, 0]) + np.deg2rad(degrees)
     return RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -31,7 +31,7 @@ def turned(degrees):
 
 @pytest.fixture(scope="module")
 def tank():
-    """Turns of the electrodes, degrees, and the voltages of the tank without a body, on a finer mesh."""
+    """Rotations of the electrodes in degrees, and the voltages of the tank without a body on a finer mesh."""
     rng = np.random.default_rng(0)
     degrees, impedance = 1.5 * rng.normal(size=16), 0.005 * np.exp(0.7 * rng.normal(size=16))
     electrodes = BoundaryElectrodes(turned(degrees), WIDTH, impedance)
@@ -39,9 +39,9 @@ def tank():
     return degrees, voltages * (1 + 0.002 * rng.normal(size=len(voltages)))
 
 
-def test_electrodes_are_found_where_they_are(tank):
-    """But for maps of the disk onto itself that keep angles, which a homogeneous disk's voltages hardly show: a turn of
-    all electrodes, and shifts as of cos θ and sin θ."""
+def test_electrode_positions_are_estimated(tank):
+    """Except for conformal maps of the disk onto itself, which hardly change a homogeneous disk's voltages: a common
+    rotation, and displacements proportional to cos θ and sin θ."""
     degrees, voltages = tank
     model = ForwardModel(body_mesh(DISK, DESCRIBED, 1500), DESCRIBED, PROTOCOL)
     placed = place_electrodes(model, voltages, deviation=np.deg2rad(2) * RADIUS)
@@ -64,7 +64,7 @@ def measured(voltages, name):
     return Measurement(voltages, mask, PROTOCOL, electrodes=DESCRIBED, domain=DISK, name=name)
 
 
-def test_a_difference_is_prepared_with_the_places_that_explain_the_reference(tank):
+def test_a_difference_is_prepared_with_the_estimated_positions(tank):
     _, voltages = tank
     prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
     assert prepared.calibration.shift.shape == (16, 1)
@@ -74,7 +74,7 @@ def test_a_difference_is_prepared_with_the_places_that_explain_the_reference(tan
     assert np.abs(np.asarray(prepared.model.electrodes.position) - np.asarray(DESCRIBED.position)).max() > 1e-3
 
 
-def test_places_that_explain_the_reference_are_kept(tank):
+def test_positions_that_explain_the_reference_are_kept(tank):
     model = ForwardModel(body_mesh(DISK, DESCRIBED, 4000), DESCRIBED, PROTOCOL)
     voltages = np.asarray(model.voltages(SIGMA))
     prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
@@ -82,9 +82,9 @@ def test_places_that_explain_the_reference_are_kept(tank):
     np.testing.assert_array_equal(prepared.model.electrodes.position, DESCRIBED.position)
 
 
-def test_the_background_follows_channels_far_from_the_drives(tank):
-    """Voltages next to the drives are 30 % larger than a sheet's, as where current spreads over the height of a tank;
-    fitted to these, the largest, the background would be 9 % too low."""
+def test_the_background_is_fitted_to_channels_far_from_the_drives(tank):
+    """Voltages next to the drives are 30 % larger than in a sheet, as where current spreads over the height of a tank.
+    A fit to these, the largest, would give a background that is 9 % too low."""
     _, voltages = tank
     near = np.abs(voltages) > 2.5 * np.median(np.abs(voltages))
     deep = np.where(near, 1.3, 1.0) * voltages
@@ -94,15 +94,15 @@ def test_the_background_follows_channels_far_from_the_drives(tank):
     assert float(calibration.conductivity) == pytest.approx(SIGMA, rel=0.02)
     off = np.asarray(calibration.voltages) - deep
     assert float(calibration.misfit) == pytest.approx(np.linalg.norm(off) / np.linalg.norm(deep))
-    # What noise does not explain of the misfit is an error of all strengths.
+    # The part of the misfit that noise does not explain is counted as an error of all strengths.
     size = np.linalg.norm(deep / noise)
     misfit = min(float(calibration.misfit), np.linalg.norm(off / noise) / size)
     strength = np.sqrt(misfit**2 - (prepared.noise / np.sqrt(2) * np.sqrt(len(deep)) / size) ** 2)
     assert prepared.accuracy.strength == pytest.approx(strength)
 
 
-def test_places_that_miss_all_voltages_more_are_not_taken(tank, monkeypatch):
-    """However well they explain small voltages."""
+def test_positions_that_increase_the_relative_misfit_are_rejected(tank, monkeypatch):
+    """Even if they explain the small voltages."""
     _, voltages = tank
     monkeypatch.setattr(preparation, "_WORSE", 1e-3)
     prepared = prepare_difference(measured(1.01 * voltages, "frame"), measured(voltages, "reference"), num_points=1500)
@@ -110,8 +110,8 @@ def test_places_that_miss_all_voltages_more_are_not_taken(tank, monkeypatch):
     assert prepared.calibration.model_error is not None
 
 
-def test_errors_of_a_difference_are_those_of_its_uncertainty_and_of_rounding(tank):
-    """The frame's uncertainty counts; voltages have two digits, so that each is off by up to 5 %."""
+def test_errors_of_a_difference_include_its_uncertainty_and_rounding(tank):
+    """The uncertainty of the frame counts; voltages have two digits, so that each is off by up to 5 %."""
     _, voltages = tank
     known = Uncertainty(position=0.0, drift=0.4, size=0.03, other=0.1)
     one, base = (np.array([float(f"{each:.1e}") for each in times * voltages]) for times in (1.1, 1.0))
@@ -131,7 +131,7 @@ def test_errors_of_a_difference_are_those_of_its_uncertainty_and_of_rounding(tan
         prepare_difference(replace(frame, uncertainty=Uncertainty(position=0.3)), reference, num_points=1500)
 
 
-def test_what_cannot_be_placed_is_refused(tank):
+def test_setups_without_adjustable_positions_are_refused(tank):
     _, voltages = tank
     model = ForwardModel(DISK.mesh(num_points=800), DESCRIBED, PROTOCOL)
     with pytest.raises(ValueError, match="opposite sign"):
@@ -148,7 +148,7 @@ def test_what_cannot_be_placed_is_refused(tank):
 
 
 @pytest.mark.parametrize("kind", ["arcs", "arcs that share an edge", "discs", "patches", "discs on a wall"])
-def test_sensitivity_to_places_and_contacts_is_the_derivative(kind):
+def test_sensitivity_to_positions_and_contacts(kind):
     """Against central differences of Z, also where electrodes share facets or cells."""
     mesh = DISK.mesh(num_points=300)
     angle = np.array([0.3, 1.9, 3.6, 5.0]) if kind != "arcs that share an edge" else np.array([0.3, 0.515, 3.6, 5.0])
@@ -187,7 +187,7 @@ def test_sensitivity_to_places_and_contacts_is_the_derivative(kind):
 
 
 def test_the_error_of_a_difference_is_that_of_its_model(tank):
-    """Columns of the error against differences of voltages; the last, drifts of contacts, are of one frame alone."""
+    """Columns of the error against differences of voltages; the last, drifts of contacts, affect one frame only."""
     model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)
     body = SIGMA * np.where(np.asarray(model.mesh.points)[np.asarray(model.mesh.cells)].mean(axis=1)[:, 0] > 0.05, 3, 1)
     rest = np.full(len(body), SIGMA)
@@ -210,7 +210,7 @@ def test_the_error_of_a_difference_is_that_of_its_model(tank):
 
 
 def test_the_noise_is_estimated_from_the_residual():
-    """Of voltages of the described model, where the fit starts, with half of the expected noise."""
+    """Voltages of the described model, at which the fit starts, with half of the expected noise."""
     model = ForwardModel(DISK.mesh(num_points=300), DESCRIBED, PROTOCOL)
     exact = np.asarray(model.voltages(1.0))
     noise = 0.5 * np.asarray(relative_noise(exact)) * np.random.default_rng(0).normal(size=len(exact))

@@ -1,4 +1,4 @@
-"""Posterior uncertainty: against dense algebra, by simulation, and its bad input."""
+"""Posterior uncertainty against dense algebra and by simulation, and invalid input."""
 
 import jax
 import jax.numpy as jnp
@@ -75,9 +75,10 @@ def test_credible_intervals_and_samples(model, noise):
 
 
 @pytest.mark.slow
-def test_the_truth_is_covered_at_the_nominal_rate(model, noise):
-    """200 bodies drawn from the prior, with noise: intervals hold the truth as often as they say, within 5 points."""
-    scale = 5.0  # deviations of log σ of a fifth
+def test_intervals_cover_the_truth_at_the_nominal_rate(model, noise):
+    """200 bodies drawn from the prior, with noise: intervals contain the truth at the stated rate within 5 percentage
+    points."""
+    scale = 5.0  # standard deviation 0.2 of log σ
     imager = Imager.create(
         model, 1.0, prior=Gaussian(LENGTH), noise=noise, hyperparameter=scale,
         solver=GaussNewton(max_steps=8, rtol=1e-6), parametrisation=Parametrisation(informative=0.0),

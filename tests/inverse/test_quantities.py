@@ -1,4 +1,4 @@
-"""Contrast, area and strength of bodies, with intervals: against tanks that differ from their description."""
+"""Contrast, area and strength of bodies with their intervals, in tanks that differ from their description."""
 
 from dataclasses import replace
 
@@ -24,7 +24,8 @@ DESCRIBED = BoundaryElectrodes(ring(RADIUS, 16), 0.02, 0.005)
 
 
 def imaged(change, radius, seed=0, degrees=1.5):
-    """The image of a round body in a tank whose electrodes are `degrees` off, contacts a factor of two apart."""
+    """The image of a round body in a tank whose electrodes are off by `degrees` and whose contact impedances differ by
+    a factor of two."""
     rng = np.random.default_rng(seed)
     place = np.asarray(DESCRIBED.position)
     angle = np.arctan2(place[:, 1], place[:, 0]) + np.deg2rad(degrees) * rng.normal(size=16)
@@ -42,10 +43,11 @@ def imaged(change, radius, seed=0, degrees=1.5):
     return image_difference(frames[1], frames[0])
 
 
-def test_a_fitted_body_has_its_quantities_and_wider_ones_where_the_model_is_in_doubt(monkeypatch):
-    """On the mesh of the data, with no noise: the median is the truth, and errors of the model widen the interval.
+def test_quantities_of_a_fitted_body_and_wider_intervals_by_model_errors(monkeypatch):
+    """The median is the truth, and model errors widen the intervals. The data are free of noise.
 
-    The mesh is that of the data, so its error is set to zero."""
+    The data are of the same mesh, so that the error of the mesh is set to zero.
+    """
     monkeypatch.setitem(ellipsoid._BY_THE_MESH, 2, 1e-9)
     model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)
     middle, radius = np.asarray(centroids(model.mesh)), 0.025
@@ -71,7 +73,7 @@ def test_a_fitted_body_has_its_quantities_and_wider_ones_where_the_model_is_in_d
 
 @pytest.mark.slow
 def test_errors_of_the_mesh_and_of_the_size_widen_intervals(monkeypatch):
-    """By 0.3 of log σ, where the data leave far less, by 5 % of each length, and by 10 % of each strength."""
+    """By 0.3 of log σ, far more than by the data, by 5 % of each length, and by 10 % of each strength."""
     model = ForwardModel(DISK.mesh(num_points=500), DESCRIBED, PROTOCOL)
     inside = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.02, 0.035], axis=1) < 0.025
     voltages = np.asarray(model.voltages(SIGMA * np.where(inside, 3.0, 1.0)))
@@ -92,14 +94,14 @@ def test_errors_of_the_mesh_and_of_the_size_widen_intervals(monkeypatch):
     assert found[1e-9, 0.05][1] == pytest.approx(0.1, rel=0.1)  # of an area, twice that of a length
     assert found[1e-9, 0.05][0] == pytest.approx(found[1e-9, 1e-9][0], rel=1e-6)
     assert found[1e-9, 1e-9 + 0.1][1] == pytest.approx(0.1, rel=0.1)
-    # The outline is that of the median area, and that of the fit where the data leave open how small the body is.
+    # The outline has the median area; if the data do not determine the area of a small body, it is that of the fit.
     for low, times in ((one.area, 2.0), (None, 1.0)):
         known = replace(one.quantities, measure=2 * one.area, measure_interval=(low, 3 * one.area))
         assert one.with_quantities(known).area == pytest.approx(times * one.area)
 
 
-def test_other_weights_of_the_data_leave_the_smooth_field_as_it_is():
-    """Its errors in volts; the data have errors of their own besides."""
+def test_other_weights_of_the_data_keep_the_smooth_field():
+    """The covariance of the smooth field is in volts, and does not depend on the weights of the data."""
     random = np.random.default_rng(0)
     jacobian, weights = random.normal(size=(4, 3)), (np.ones(4), random.uniform(1, 3, 4))
     data = [Data(np.zeros(4), one, np.eye(4), np.eye(4), 0.0) for one in weights]  # pyright: ignore
@@ -112,8 +114,8 @@ def test_other_weights_of_the_data_leave_the_smooth_field_as_it_is():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("change", "radius"), [(0.5, 0.027), (2.0, 0.025), (-0.5, 0.02), (9.0, 0.012)])
-def test_numbers_are_right_in_a_tank_that_is_not_as_described(change, radius):
-    """Within twice their intervals; they were wrong by up to two orders of magnitude."""
+def test_quantities_in_a_tank_that_differs_from_its_description(change, radius):
+    """Within twice their intervals. Without model errors they were wrong by up to two orders of magnitude."""
     result = imaged(change, radius)
     (one,) = result.inclusions
     assert np.linalg.norm(np.array(one.centroid) - [0.02, 0.035]) < 0.02 * RADIUS
@@ -134,8 +136,8 @@ def held(contrast, unlikely, area=1e-3):
     return _HeldFits(float(np.log(contrast)), unlikely, float(np.log(area)), 0.05)
 
 
-def test_what_the_likelihood_says_is_summed_up():
-    """A parabola about a contrast of one, of deviation 0.1: half of its mass lies below, the prior aside."""
+def test_summary_of_a_likelihood():
+    """A parabola about a contrast of one with deviation 0.1: without the prior, half of its mass lies below."""
     places = np.exp(np.linspace(-0.5, 0.5, 21))
     found = _summary(1, 2, 0.0, [held(one, 0.5 * (np.log(one) / 0.1) ** 2) for one in places])
     assert found.change == pytest.approx(np.expm1(1.0), rel=0.02)
@@ -148,7 +150,7 @@ def test_what_the_likelihood_says_is_summed_up():
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_ends_that_the_data_leave_open_are_none(sign):
+def test_undetermined_ends_of_intervals(sign):
     strong = _summary(sign, 2, 0.0, [held(one, 40 / one if one < 3 else 0.2) for one in (0.5, 1.0, 2.0, 3.0, 4.5)])
     assert strong.change_interval[sign > 0] is None
     assert strong.change_interval[sign < 0] is not None

@@ -1,4 +1,4 @@
-"""Nonlinear reconstructions of bodies simulated on another, finer mesh; every solver with every prior and link."""
+"""Nonlinear reconstructions of bodies simulated on another, finer mesh: every solver with every prior and link."""
 
 import jax
 import jax.numpy as jnp
@@ -53,7 +53,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def frame():
-    """Voltages of a disk with an inclusion of thrice its conductivity, and their noise of 0.1 %."""
+    """Voltages of a disk with an inclusion of three times its conductivity, with noise of 0.1 %, and this noise."""
     fine = model_of(2500)
     inside = np.linalg.norm(centroids(fine.mesh) - CENTRE, axis=1) < INCLUSION
     voltages = fine.voltages(jnp.where(inside, 3.0, 1.0))
@@ -62,7 +62,7 @@ def frame():
 
 
 def contrast_and_centroid(model, conductivity):
-    """Mean conductivity where the inclusion is, and centroid of what stands out by half."""
+    """Mean conductivity in the inclusion, and centroid of the cells that exceed half of the change."""
     position, weight = np.asarray(centroids(model.mesh)), np.asarray(measures(model.mesh))
     values = np.asarray(conductivity)
     inside = np.linalg.norm(position - CENTRE, axis=1) < 0.8 * INCLUSION
@@ -73,7 +73,7 @@ def contrast_and_centroid(model, conductivity):
 @pytest.mark.parametrize("solver", ["gauss-newton", "levenberg-marquardt"])
 @pytest.mark.parametrize("rule", ["discrepancy", "gcv"])
 @pytest.mark.parametrize("prior", [Gaussian(0.02), Laplace()], ids=["gaussian", "laplace"])
-def test_contrast_and_place_of_an_inclusion(solver, rule, prior, model, frame):
+def test_contrast_and_position_of_an_inclusion(solver, rule, prior, model, frame):
     voltages, noise = frame
     result = reconstruct(model, voltages, 1.0, prior=prior, noise=noise, hyperparameter=rule, solver=solver)
     contrast, centroid = contrast_and_centroid(model, result.conductivity)
@@ -100,7 +100,7 @@ def test_every_link(link, prior, model, frame):
 
 
 def test_derivative_of_the_misfit():
-    """Taylor's second order, and products with the Jacobian against autodiff."""
+    """By second-order Taylor remainders, and products with the Jacobian against automatic differentiation."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 6), 0.012, 1e-3)
     model = ForwardModel(Disk(RADIUS).mesh(num_points=40), electrodes, adjacent(6))
     voltages = np.asarray(model.voltages(np.where(np.asarray(centroids(model.mesh))[:, 0] > 0.03, 2.0, 1.0)))
@@ -124,7 +124,8 @@ def test_derivative_of_the_misfit():
 
 @pytest.fixture(scope="module")
 def tiny():
-    """Model, voltages and noise of five electrodes and 16 nodes: solvers of optimistix are compiled for seconds."""
+    """Model, voltages and noise of five electrodes and 16 nodes, because solvers of optimistix take seconds to
+    compile."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 5), 0.012, 1e-3)
     model = ForwardModel(Disk(RADIUS).mesh(num_points=16), electrodes, adjacent(5))
     voltages = np.asarray(model.voltages(np.where(np.asarray(centroids(model.mesh))[:, 0] > 0.03, 2.0, 1.0)))
@@ -132,16 +133,16 @@ def tiny():
 
 
 @pytest.mark.slow
-def test_solvers_of_optimistix_say_that_steps_were_too_few(tiny):
+def test_solvers_of_optimistix_report_too_few_steps(tiny):
     model, voltages, options = tiny
     few = LeastSquares(optx.LevenbergMarquardt(1e-9, 1e-9), max_steps=2)
     assert reconstruct(model, voltages, 1.0, solver=few, **options).status == "step limit"
 
 
 @pytest.mark.slow
-def test_solvers_of_optimistix_that_stand_still_for_rounding_have_converged(tiny):
-    """Tolerances at the root of a number's precision are reached or not by luck; one step is no such luck. The image is
-    that of Gauss-Newton."""
+def test_solvers_of_optimistix_that_stagnate_by_rounding_have_converged(tiny):
+    """A tolerance near the square root of the precision may or may not be reached, but a single step must not pass. The
+    image is that of Gauss-Newton."""
     model, voltages, options = tiny
     solver = optx.LevenbergMarquardt(1e-9, 1e-9)
     ours = reconstruct(model, voltages, 1.0, solver=GaussNewton(rtol=1e-12), **options)
@@ -160,18 +161,18 @@ def test_a_warm_start_needs_fewer_steps(model, frame):
     np.testing.assert_allclose(warm.conductivity, cold.conductivity, rtol=1e-2)
 
 
-def test_masked_channels_are_not_looked_at(model, frame):
+def test_masked_channels_are_ignored(model, frame):
     voltages, noise = frame
     mask = np.ones(208, bool)
     mask[3::20] = False
-    spoilt = jnp.where(mask, voltages, jnp.nan)
-    result = reconstruct(model, spoilt, 1.0, prior=Gaussian(0.02), noise=noise, mask=mask, hyperparameter="gcv")
+    incomplete = jnp.where(mask, voltages, jnp.nan)
+    result = reconstruct(model, incomplete, 1.0, prior=Gaussian(0.02), noise=noise, mask=mask, hyperparameter="gcv")
     _, centroid = contrast_and_centroid(model, result.conductivity)
     assert result.status == "converged"
     assert np.linalg.norm(centroid - CENTRE) < 0.03 * RADIUS
 
 
-def test_too_few_steps_are_said_so(model, frame):
+def test_too_few_steps_are_reported(model, frame):
     voltages, noise = frame
     result = reconstruct(model, voltages, 1.0, prior=Gaussian(0.02), noise=noise, solver=GaussNewton(max_steps=2))
     assert result.status == "step limit"
@@ -181,7 +182,7 @@ def test_too_few_steps_are_said_so(model, frame):
 
 @pytest.mark.parametrize("solver", [GaussNewton(), LevenbergMarquardt()])
 def test_voltages_of_the_background_are_at_the_minimum(model, solver):
-    """Its objective is nothing, so that no step is small beside it."""
+    """Their objective is zero, so that no step is small relative to it."""
     result = reconstruct(model, model.voltages(1.0), 1.0, prior=Gaussian(0.02), hyperparameter=3.0, solver=solver)
     assert result.status == "converged"
     assert result.iterations <= 1
@@ -240,26 +241,26 @@ def test_bad_input(change, message, model, frame):
     ],
 )
 def test_bad_settings(make, change, message):
-    """Of a solver and of a parametrisation, before there is a problem."""
+    """Invalid settings of a solver or a parametrisation are refused before there is a problem."""
     with pytest.raises(ValueError, match=message):
         make(**change)
 
 
-def test_a_name_is_a_solver():
+def test_solvers_can_be_given_by_name():
     for name in SOLVERS:
         assert as_solver(name).name == name
 
 
-def test_a_name_unknown_is_answered_by_those_that_would_do():
-    """A linear image is none of a reconstruction, and what takes long none of a frame."""
+def test_an_unknown_name_lists_the_suitable_ones():
+    """Linear methods are not offered for reconstructions, and slow methods not for frames of a stream."""
     with pytest.raises(ValueError, match=r"^solver must be one of gauss-newton, levenberg-marquardt, l-bfgs"):
         as_solver("newton")
     with pytest.raises(ValueError, match="must be one of one-step, gauss-newton, levenberg"):
         as_solver("newton", frames=True)
 
 
-def test_informed_shapes_alter_an_image_little(model, frame):
-    """Those that the data tell nothing of stay as the prior has them."""
+def test_informative_basis_functions_hardly_change_an_image(model, frame):
+    """Components without information in the data keep their prior values."""
     options = {"prior": Gaussian(0.02), "noise": frame[1], "hyperparameter": 30.0}
     every = reconstruct(model, frame[0], 1.0, **options)
     some = reconstruct(model, frame[0], 1.0, parametrisation=Parametrisation(informative=0.01), **options)
@@ -277,14 +278,14 @@ def test_unknowns_of_another_model_are_refused(model, frame):
 
 
 def test_a_misfit_that_is_not_finite_is_a_failure(model, frame):
-    """However fine the conductivity looks; and nothing is built on it."""
+    """Even if the conductivity is finite; and further computations with it are refused."""
     result = reconstruct(model, frame[0], 1.0, noise=1e-300, hyperparameter=3.0, solver=GaussNewton(max_steps=2))
     assert result.status == "failed"
     with pytest.raises(ValueError, match="failed"):
         posterior(result)
 
 
-def test_voltages_in_other_units_are_hinted_at(model, frame):
+def test_voltages_in_other_units_give_a_hint(model, frame):
     options = {"hyperparameter": 3.0, "solver": GaussNewton(max_steps=2)}
     result = reconstruct(model, 1e3 * frame[0], 1.0, noise=1e3 * frame[1], **options)
     assert result.status == "step limit"
@@ -296,14 +297,14 @@ def test_bounds_in_the_wrong_order():
         Bounded(2.0, 1.0)
 
 
-def test_data_that_no_body_explains_show_in_the_misfit(model, frame):
+def test_unexplained_data_increase_the_misfit(model, frame):
     result = reconstruct(model, -frame[0], 1.0, prior=Gaussian(0.02), noise=frame[1], hyperparameter=100.0)
     assert np.isfinite(np.asarray(result.conductivity)).all()
     assert result.misfit > 100
 
 
 @pytest.mark.parametrize("given", [Log(), {"link": Log()}])
-def test_what_is_no_parametrisation_is_refused(model, frame, given):
+def test_other_objects_are_refused_as_parametrisation(model, frame, given):
     with pytest.raises(ValueError, match="such as Parametrisation"):
         reconstruct(model, frame[0], 1.0, parametrisation=given)
 
@@ -329,8 +330,8 @@ def test_links_invert_and_differentiate(link):
     [(Tikhonov(), 1e-13), (Noser(), 1e-12), (Gaussian(0.03), 1e-2)],
     ids=["tik", "noser", "gauss"],
 )
-def test_a_basis_is_a_root_of_its_prior(prior, tolerance, model):
-    """S Sᵀ Jᵀ = Γ Jᵀ; the Gaussian's low rank leaves out a thousandth of the variance."""
+def test_a_basis_is_a_square_root_of_its_prior(prior, tolerance, model):
+    """S Sᵀ Jᵀ = Γ Jᵀ; the low rank of the Gaussian omits a thousandth of the variance."""
     jacobian = model.jacobian(1.0)
     basis = prior.basis(model.mesh, jacobian)
     product = jax.vmap(basis.expand, in_axes=1, out_axes=1)(basis.restrict(jacobian).T)
@@ -341,7 +342,7 @@ def test_a_basis_is_a_root_of_its_prior(prior, tolerance, model):
 
 
 def test_the_laplace_basis_inverts_its_precision(model):
-    """Sᵀ Q S = 1 but for the constant image, whose precision is a millionth."""
+    """Sᵀ Q S = 1 except for the constant image, whose precision is a millionth."""
     prior, jacobian = Laplace(), model.jacobian(1.0)
     shapes = prior.basis(model.mesh, jacobian).shapes
     whitened = shapes.T @ (prior.precision(model.mesh, jacobian) @ np.asarray(shapes))
@@ -350,8 +351,8 @@ def test_the_laplace_basis_inverts_its_precision(model):
     np.testing.assert_allclose(eigenvalues[1:], 1, atol=1e-3)
 
 
-def test_conductivity_as_it_is_does_not_go_below_zero(model):
-    """A factorisation may go well there; steps that lead below are shortened all the same."""
+def test_conductivity_without_a_link_stays_positive(model):
+    """A factorisation may succeed for negative values; steps that lead there are shortened all the same."""
     inclusion = np.linalg.norm(np.asarray(centroids(model.mesh)) - [0.02, 0.01], axis=1) < 0.02
     voltages = model.voltages(np.where(inclusion, 1e-4, 2.0))
     options = {"hyperparameter": 0.01, "parametrisation": Parametrisation(link=Linear())}

@@ -1,4 +1,4 @@
-"""Maps: cells that share a value, cells held fixed, pixels of a grid."""
+"""Parametrisations: cells that share a value, fixed cells, and pixels of a grid."""
 
 import jax
 import jax.numpy as jnp
@@ -21,14 +21,14 @@ def model():
 
 
 def halves(model):
-    """Left, right, and a rim that is known."""
+    """Left half, right half, and a known rim."""
     centre = np.asarray(centroids(model.mesh))
     label = np.where(centre[:, 0] < 0, 0, 1)
     return np.where(np.linalg.norm(centre, axis=1) > 0.07, -1, label)
 
 
 @pytest.mark.parametrize("prior", [Noser(), Gaussian(0.03)], ids=["noser", "gaussian"])
-def test_values_of_regions_are_found_and_fixed_cells_kept(prior, model):
+def test_values_of_regions_are_estimated_and_fixed_cells_kept(prior, model):
     label = halves(model)
     truth = np.select([label == 0, label == 1], [0.5, 2.0], 1.0)
     voltages = model.voltages(truth)
@@ -42,7 +42,7 @@ def test_values_of_regions_are_found_and_fixed_cells_kept(prior, model):
     np.testing.assert_array_equal(result.conductivity[label == -1], 1.0)
 
 
-def test_pixels_hold_one_value_each(model):
+def test_pixels_have_one_value_each(model):
     label = pixels(model.mesh, (6, 5))
     assert label.min() == 0
     assert label.max() < 30
@@ -57,8 +57,8 @@ def test_pixels_hold_one_value_each(model):
 
 
 @pytest.mark.parametrize("prior", [Noser(), Gaussian(0.03)], ids=["noser", "gaussian"])
-def test_a_pooled_basis_and_its_adjoint(prior, model):
-    """⟨rows, S c⟩ = ⟨rows S, c⟩, and the derivative of the problem is that of autodiff."""
+def test_a_region_basis_and_its_adjoint(prior, model):
+    """⟨rows, S c⟩ = ⟨rows S, c⟩, and the derivative of the problem equals automatic differentiation."""
     jacobian = model.jacobian(1.0)
     basis = prior.basis(model.mesh, jacobian).pooled(Regions.create(model.mesh, halves(model)))
     c = jax.random.normal(jax.random.key(0), (basis.num_coefficients,))

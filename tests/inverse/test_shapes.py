@@ -1,4 +1,4 @@
-"""Bodies as star shapes: derivatives, geometry, and what is found in tanks solved on another mesh."""
+"""Bodies as star shapes: derivatives, geometry, and estimates in tanks solved on another mesh."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,8 @@ def fine():
 
 @pytest.fixture(scope="module")
 def frame(fine):
-    """A square of metal and a disk of plastic in a bath grown 5 % more conductive, on a fine mesh; 0.1 % noise."""
+    """A square of metal and a disk of plastic in a bath of 5 % higher conductivity, on a fine mesh, with 0.1 %
+    noise."""
     place = np.asarray(centroids(fine.mesh))
     square = np.abs(place - SQUARE).max(axis=1) < 0.018
     disk = np.linalg.norm(place - DISK, axis=1) < 0.025
@@ -44,7 +45,7 @@ def found(model, frame):
     return reconstruct_shapes(model, frame, BATH, start=STARTS, noise=0.03 * np.abs(frame))
 
 
-def test_derivatives_are_those_of_finite_differences(model):
+def test_derivatives_equal_finite_differences(model):
     stars = Stars.create(model.mesh, StarPrior(), [[0.01, 0.02], [-0.01, 0.0], [0.01, -0.02]], [1, -1, 1])
     rng = np.random.default_rng(0)
     point = stars.of_radii([0.03, 0.02, 0.03]) + 0.2 * rng.normal(size=1 + 3 * stars.prior.size)
@@ -62,7 +63,7 @@ def test_derivatives_are_those_of_finite_differences(model):
     np.testing.assert_allclose(here.overlap_slope @ along, difference, rtol=1e-6)
 
 
-def test_a_star_knows_its_area_its_middle_and_what_it_holds(model):
+def test_area_centroid_and_interior_of_a_star(model):
     stars = Stars.create(model.mesh, StarPrior(), [[0.03, 0.01]], [-1])
     round_one = stars.body(0, stars.of_radii([0.02]))
     assert round_one.sign == -1
@@ -78,7 +79,7 @@ def test_a_star_knows_its_area_its_middle_and_what_it_holds(model):
 
 @pytest.mark.parametrize("reach", [0.085, 0.105])
 def test_a_star_ends_where_the_body_does(model, reach):
-    """A disk over the edge of the tank, its middle inside or outside: the area of two circles' lens."""
+    """A disk across the edge of the tank with its centre inside or outside: the area of the lens of two circles."""
     stars = Stars.create(model.mesh, StarPrior(), [[reach, 0.0]], [1])
     star, radius = stars.body(0, stars.of_radii([0.03])), 0.03
     assert np.linalg.norm(star.outline, axis=1).max() < 1.001 * RADIUS
@@ -92,7 +93,7 @@ def test_a_star_ends_where_the_body_does(model, reach):
     assert not star.holds(np.array([1.01 * RADIUS, 0.0]))
 
 
-def test_bodies_are_found_and_ghosts_left_out(found):
+def test_bodies_are_detected_and_ghosts_rejected(found):
     assert [one.sign for one in sorted(found.bodies, key=lambda one: one.sign)] == [-1, 1]
     plastic, metal = sorted(found.bodies, key=lambda one: one.sign)
     assert np.linalg.norm(metal.centroid - SQUARE) < 0.02 * RADIUS
@@ -106,7 +107,7 @@ def test_bodies_are_found_and_ghosts_left_out(found):
 
 
 @pytest.mark.slow
-def test_neighbours_that_merge_are_told_apart(model, fine):
+def test_merged_neighbours_are_separated(model, fine):
     """Two disks of plastic, from one start between them."""
     places = np.array([[0.03, 0.03], [0.03, -0.02]])
     result = reconstruct_shapes(model, _solved(fine, places, 0.02, 1e-2), BATH, start=[(-1, (0.03, 0.0), 0.03)])
@@ -116,7 +117,7 @@ def test_neighbours_that_merge_are_told_apart(model, fine):
 
 
 @pytest.mark.parametrize("factor", [0.6, pytest.param(1.5, marks=pytest.mark.slow), 100.0])
-def test_weak_bodies_are_told_from_small_strong_ones(model, fine, factor):
+def test_weak_bodies_are_distinguished_from_small_strong_ones(model, fine, factor):
     sign = 1 if factor > 1 else -1
     voltages = _solved(fine, [[0.03, 0.03]], 0.03, factor)
     noise = 0.01 * jnp.abs(voltages)
@@ -144,8 +145,9 @@ def test_conductivity_is_that_of_the_stars(found, model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("apart", "ghosts"), [(1e3, 2), (1e-6, 0)])
-def test_bodies_that_lie_on_each_other_do_not_cancel(model, frame, apart, ghosts):
-    """Two of opposite sign in one place, where nothing is: kept apart they are ghosts; else they pass for bodies."""
+def test_overlapping_bodies_do_not_cancel(model, frame, apart, ghosts):
+    """Two of opposite sign at a place without a body: as separate ghosts they are rejected, otherwise they would pass
+    for bodies."""
     pair = [(1, (0, 0.05), 0.04), (-1, (0, 0.05), 0.04)]
     result = reconstruct_shapes(
         model, frame, BATH, start=[*STARTS[:2], *pair], noise=0.03 * np.abs(frame), prior=StarPrior(apart=apart)
@@ -156,7 +158,7 @@ def test_bodies_that_lie_on_each_other_do_not_cancel(model, frame, apart, ghosts
     assert ((covered > 1).mean() < 1e-3) == (ghosts == 2)
 
 
-def test_nothing_to_start_from_is_a_bath_that_drifted(model):
+def test_without_starts_only_the_drift_is_estimated(model):
     result = reconstruct_shapes(model, model.voltages(1.1 * BATH), BATH, start=[])
     assert result.bodies == result.doubtful == ()
     np.testing.assert_allclose(result.drift, 0.1, atol=1e-3)
@@ -176,14 +178,14 @@ def test_nothing_to_start_from_is_a_bath_that_drifted(model):
         ({"background": -1.0}, "positive"),
     ],
 )
-def test_bad_arguments_are_refused(model, frame, given, message):
+def test_invalid_arguments_are_refused(model, frame, given, message):
     arguments = {"background": BATH, "start": STARTS, **given}
     with pytest.raises(ValueError, match=message):
         reconstruct_shapes(model, frame, arguments.pop("background"), **arguments)
 
 
 @pytest.mark.parametrize("wrong", [{"modes": 0}, {"modes": 2.5}, {"roughness": -1}, {"contrast": "strong"}])
-def test_bad_priors_are_refused(wrong):
+def test_invalid_priors_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         StarPrior(**wrong)
 
@@ -193,7 +195,7 @@ def test_traced_data_are_refused(model, frame):
         jax.grad(lambda v: reconstruct_shapes(model, v, BATH, start=STARTS).misfit)(jnp.asarray(frame))
 
 
-def test_stars_are_plain_values():
+def test_stars_contain_plain_values():
     star = Star(1, np.zeros(2), np.array([[1.0, 0], [0, 1], [-1, 0], [0, -1]]), 3.5, False, 2.0)
     np.testing.assert_allclose(star.area, 2.0)
     assert star.holds(np.array([[0.0, 0.0], [0.9, 0.0], [2.0, 0.0]])).tolist() == [True, True, False]

@@ -1,4 +1,4 @@
-"""Error bars of total variation: against the inverse of a dense matrix, by samples and by derivatives."""
+"""Uncertainty of total-variation images: against the inverse of a dense matrix, samples and derivatives."""
 
 import equinox as eqx
 import jax
@@ -34,7 +34,7 @@ def model(request):
 
 @pytest.fixture(scope="module")
 def image(model):
-    """By total variation."""
+    """An image by total variation."""
     return sharp(model)
 
 
@@ -52,7 +52,7 @@ def sharp(model, smoothing=0.01, hyperparameter=300.0, parametrisation=None):
 
 
 def precision(inversion, coefficients):
-    """Q (n, n) of the prior and S (m, n), dense, from the definition: what each jump, or slope, weighs at the end."""
+    """Q (n, n) of the prior and S (m, n), dense, by definition: the weights of jumps or slopes at the solution."""
     penalty, mesh, count = inversion.penalty, inversion.model.mesh, inversion.basis.num_coefficients
     image = np.asarray(penalty.reference + coefficients[:count])
     if mesh.dimension == 2:
@@ -75,7 +75,7 @@ def precision(inversion, coefficients):
 
 
 def covariance(found):
-    """Σ (n, n), by inverting the whole matrix, and S (m, n), with a background if it was estimated."""
+    """Σ (n, n) by inverting the whole matrix, and S (m, n), with a background if it was estimated."""
     inversion, ended = found.inversion, found.coefficients
     prior, shapes = precision(inversion, ended)
     jacobian = np.asarray(inversion.linearise(ended)[1])
@@ -102,34 +102,34 @@ def assert_as_inverted(found, mask):
 
 
 @pytest.mark.parametrize("smoothing", [0.01, 1e-5])
-def test_deviations_are_those_of_the_whole_matrix_inverted(smoothing, model):
+def test_deviations_equal_those_of_the_inverted_matrix(smoothing, model):
     found = sharp(model, smoothing)
     assert np.ptp(np.log(np.asarray(found.conductivity))) > 0.2  # there is an edge
     assert_as_inverted(found, inside(model))
 
 
 @pytest.mark.slow
-def test_so_they_are_with_a_background_estimated_along(model):
-    """Twice free, by the image and by the unknown: known all the same where the data tell of the sum."""
+def test_deviations_with_an_estimated_background(model):
+    """The background is free both in the image and as an unknown, but the data determine the sum."""
     found = sharp(model, parametrisation=Parametrisation(unknowns=[Background(0.2)]))
     around, inverse = assert_as_inverted(found, inside(model))
     expected = 0.2 * np.sqrt(inverse[-1, -1])
     assert float(around.unknowns()["Background"][0]) == pytest.approx(expected, rel=1e-7)
 
 
-def test_what_the_prior_leaves_nearly_free_is_known_from_the_data(model):
-    """A constant image costs total variation nothing but the little pull to the background."""
+def test_components_almost_free_in_the_prior_are_determined_by_the_data(model):
+    """A constant image is penalised only by the weak attraction to the background."""
     price = 1e6
     found = sharp(model, hyperparameter=price)
     mean, deviation = posterior(found).region(np.ones(model.mesh.num_cells, bool))
     jacobian = np.asarray(found.inversion.linearise(found.coefficients)[1])
     even = jacobian @ np.ones(jacobian.shape[1])
-    weight = even @ np.asarray(found.inversion.data.precision) @ even + price * 1e-3  # of log σ, everywhere alike
+    weight = even @ np.asarray(found.inversion.data.precision) @ even + price * 1e-3  # of log σ, everywhere equal
     assert deviation / mean == pytest.approx(1 / np.sqrt(weight), rel=0.01)
     assert deviation / mean < 0.1 / np.sqrt(price * 1e-3)
 
 
-def test_data_narrow_every_bar_and_intervals_hold_the_image(model):
+def test_data_reduce_every_deviation_and_intervals_contain_the_image(model):
     found = sharp(model, hyperparameter=30.0)
     around = posterior(found)
     free = np.sqrt(np.asarray(around.prior.variance(around.inversion.basis)))
@@ -139,20 +139,21 @@ def test_data_narrow_every_bar_and_intervals_hold_the_image(model):
     assert ((lower < found.conductivity) & (found.conductivity < upper)).all()
 
 
-def test_samples_spread_as_the_whole_matrix_inverted_says(model, image):
+def test_scatter_of_samples_equals_the_deviations(model, image):
     found = image
     inverse, shapes = covariance(found)
     drawn = np.log(np.asarray(posterior(found).sample(jax.random.key(0), 1500))) - np.log(found.conductivity)
     assert drawn.shape == (1500, model.mesh.num_cells)
-    # Of 1,500 samples a deviation is off by 2 %, four times of which none of some hundred cells exceeds.
+    # With 1,500 samples a deviation has an error of 2 %; none of some hundred cells exceeds four times this.
     np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(diagonal(shapes, inverse)), rtol=0.08)
     even = shapes.mean(axis=0)
     assert drawn.mean(axis=1).std() == pytest.approx(np.sqrt(even @ inverse @ even), rel=0.08)
 
 
 @pytest.mark.parametrize("damping", [0.0, 0.7])
-def test_steps_are_those_of_the_whole_matrix(damping, image):
-    """To the minimum of the misfit linearised and of the form that touches the energy, weighted with 1 + damping."""
+def test_steps_equal_those_of_the_whole_matrix(damping, image):
+    """Steps to the minimum of the linearised misfit and of the quadratic model of the energy, weighted with 1 +
+    damping."""
     inversion, point = on_host((image.inversion, image.coefficients))
     point = point + 0.05 * np.random.default_rng(0).normal(size=point.shape)
     residual, jacobian = inversion.linearise(point)
@@ -166,8 +167,8 @@ def test_steps_are_those_of_the_whole_matrix(damping, image):
 
 
 @pytest.mark.slow
-def test_deviations_go_through_a_derivative():
-    """Traced, in one compiled program, they are the same, and their slope is that of differences."""
+def test_deviations_can_be_traced_and_differentiated():
+    """Traced in one compiled program they are equal, and their derivative equals differences."""
     model = sheet()
     voltages = model.voltages(np.where(inside(model), 0.5, 1.0))
 

@@ -1,4 +1,4 @@
-"""One table: every solver on every problem, with the most iterations each may take."""
+"""Every solver on every problem, with the maximum number of iterations of each."""
 
 import functools
 import itertools
@@ -34,7 +34,7 @@ def centred(num_points):
     return ForwardModel(Disk(0.1).mesh(num_points=num_points), electrodes, reference_electrode(9, reference=8))
 
 
-# Body, where the inclusion is and how large (metres), and its conductivity in a body of one.
+# Position and size of the inclusion (metres), and its conductivity in a body of 1 S.
 PROBLEMS = {
     "conductive in a disk": (disk, (0.03, 0.02), 0.025, 3.0),
     "resistive in a disk": (disk, (-0.04, 0.0), 0.03, 0.3),
@@ -42,7 +42,7 @@ PROBLEMS = {
     "conductive in a sheet": (sheet, (-0.06, 0.03), 0.03, 2.5),
     "conductive among discs": (centred, (0.02, 0.04), 0.025, 2.5),
 }
-# Solver, and the most iterations it may take on any of the problems: recorded, with a fifth to spare.
+# Solver, and the maximum number of iterations on any of the problems: the recorded number and a fifth more.
 SOLVERS = {
     "gauss-newton": (GaussNewton(max_steps=1000), 8),
     "levenberg-marquardt": (LevenbergMarquardt(max_steps=1000), 12),
@@ -55,7 +55,7 @@ SOLVERS = {
 
 @functools.cache
 def pose(name):
-    """Model, voltages of a finer one, options, and the best reconstruction there is."""
+    """Model, voltages of a finer one, options, and the best possible reconstruction."""
     make, centre, radius, conductivity = PROBLEMS[name]
     fine, model = make(2000), make(300)
     inside = np.linalg.norm(np.asarray(centroids(fine.mesh)) - centre, axis=1) < radius
@@ -66,14 +66,15 @@ def pose(name):
     return model, voltages, options, best
 
 
-# jeit's own solvers are tried on every problem; those that are compiled for each body, on the two problems of one.
+# jeit's own solvers are tested on every problem; those that are compiled for each body, on the two problems of one
+# body.
 OWN = ("gauss-newton", "levenberg-marquardt")
 BODIES = {"optimistix LM": "disk", "optimistix Dogleg": "sheet", "l-bfgs-b": "disk", "projected-gradient": "sheet"}
 BOUNDED = [(f"conductive in a {BODIES[name]}", name) for name in ("l-bfgs-b", "projected-gradient")]
 
 
 def cases():
-    """The pairs to try; the quick suite takes the solvers that need no compilation (others: test_reconstruct.py)."""
+    """The pairs to test; the quick tests use the solvers that need no compilation (others: test_reconstruct.py)."""
     for problem, solver in itertools.product(PROBLEMS, SOLVERS):
         if solver in OWN or problem.endswith(f"a {BODIES[solver]}"):
             quick = problem == "conductive in a disk" and solver in OWN
@@ -95,7 +96,7 @@ def test_every_solver_on_every_problem(problem, name):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("problem", "name"), BOUNDED)
-def test_bounds_that_are_not_reached_change_nothing(problem, name):
+def test_inactive_bounds_change_nothing(problem, name):
     model, voltages, options, free = pose(problem)
     within = Parametrisation(bounds=(1e-3, 1e3))
     result = reconstruct(model, voltages, 1.0, solver=SOLVERS[name][0], parametrisation=within, **options)
@@ -107,7 +108,7 @@ def test_bounds_that_are_not_reached_change_nothing(problem, name):
 @pytest.mark.slow
 @pytest.mark.parametrize(("problem", "name"), BOUNDED)
 def test_bounds_hold_and_are_reached(problem, name):
-    """With other priors: see test_bounded.py."""
+    """With other priors; see test_bounded.py."""
     model, voltages, options, _ = pose(problem)
     between = Parametrisation(bounds=(0.95, 1.6))
     result = reconstruct(model, voltages, 1.0, solver=SOLVERS[name][0], parametrisation=between, **options)

@@ -1,4 +1,4 @@
-"""Streams: frame by frame against `reconstruct` and the textbook's Kalman filter; and frames that are no good."""
+"""Streams: every frame against `reconstruct` and the textbook Kalman filter, and refused frames."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def near(model, place):
 
 
 def pressed(model, value, place=PLACES[0]):
-    """Voltages of a body that conducts 1 S, and `value` within 30 mm of a place."""
+    """Voltages of a body of 1 S with `value` within 30 mm of a place."""
     return np.asarray(model.voltages(np.where(near(model, place), value, 1.0)))
 
 
@@ -29,21 +29,21 @@ def settings(model):
 
 
 def moving(model):
-    """A press that moves: half the conductivity within 30 mm, with noise of 0.1 %."""
+    """A moving press: half the conductivity within 30 mm, with noise of 0.1 %."""
     clean = np.stack([pressed(model, 0.5, place) for place in PLACES])
     return clean + 1e-3 * np.abs(pressed(model, 1.0)) * np.random.default_rng(0).normal(size=clean.shape)
 
 
 @pytest.fixture(scope="module")
 def model():
-    """Of sixteen electrodes, for linear images."""
+    """A model with sixteen electrodes, for linear images."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 16), 0.012, 1e-3)
     return ForwardModel(Disk(RADIUS).mesh(num_points=120), electrodes, adjacent(16))
 
 
 @pytest.fixture(scope="module")
 def small():
-    """Of six electrodes and 25 nodes, for iterations, which take two seconds to compile even so."""
+    """A model with six electrodes and 25 nodes for iterative images, which take two seconds to compile even so."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 6), 0.012, 1e-3)
     return ForwardModel(Disk(RADIUS).mesh(num_points=25), electrodes, adjacent(6))
 
@@ -70,13 +70,13 @@ def rough(small):
 
 @pytest.fixture(scope="module")
 def imager(small, rough):
-    """Gauss-Newton, by four steps a frame."""
+    """Gauss-Newton with four steps a frame."""
     return Imager.create(small, 1.0, **rough)
 
 
 @pytest.fixture(scope="module")
 def damped(small, rough):
-    """By Levenberg and Marquardt's steps."""
+    """With Levenberg-Marquardt steps."""
     return Imager.create(small, 1.0, solver=LevenbergMarquardt(), **rough)
 
 
@@ -87,7 +87,7 @@ def linear(model, options):
 
 @pytest.fixture(scope="module")
 def clean(linear, frames):
-    """The last image of sound frames."""
+    """The last image of valid frames."""
     return list(stream(linear, frames))[-1].conductivity
 
 
@@ -113,7 +113,7 @@ def test_iterated_images_follow_the_press(small, few, imager):
     assert_press_is_followed(small, imager, few, 0.75, 0.03)  # whose cells are as large as the press
 
 
-def test_iterations_end_where_reconstruct_does(small, few, imager, rough):
+def test_iterations_converge_to_reconstruct(small, few, imager, rough):
     image = list(stream(imager, few))[-1]
     best = reconstruct(small, few[-1], 1.0, solver=GaussNewton(rtol=1e-10), **rough)
     error = np.linalg.norm(image.conductivity - best.conductivity) / np.linalg.norm(best.conductivity - 1)
@@ -123,7 +123,7 @@ def test_iterations_end_where_reconstruct_does(small, few, imager, rough):
 
 
 def test_the_linear_image_is_the_first_step_of_gauss_newton(small, few, imager, rough):
-    """Of changes so small that the first step is all there is."""
+    """For changes so small that the first step suffices."""
     rest = pressed(small, 1.0)
     faint = rest + 1e-5 * (few[:3] - rest)
     straight = Imager.create(small, 1.0, solver=OneStep(), **rough)
@@ -132,7 +132,7 @@ def test_the_linear_image_is_the_first_step_of_gauss_newton(small, few, imager, 
         np.testing.assert_allclose(one, step, atol=1e-4 * np.abs(step).max())
 
 
-def test_a_reference_takes_the_model_error_out(small, few, rough):
+def test_a_reference_removes_the_model_error(small, few, rough):
     rest = pressed(small, 1.0)
     gain = 1 + 0.05 * np.cos(np.arange(len(rest)))
     imager = Imager.create(small, 1.0, reference=gain * rest, **rough)
@@ -140,8 +140,8 @@ def test_a_reference_takes_the_model_error_out(small, few, rough):
     assert np.linalg.norm(darkest(small, image.conductivity) - PLACES[0]) < 0.03
 
 
-def test_frames_of_nothing_but_noise_are_said_to_be_unchanged(model, linear):
-    """Noise alone, an undisturbed frame, and a press that is fainter than the noise of a channel."""
+def test_frames_of_noise_alone_are_reported_as_unchanged(model, linear):
+    """Noise alone, an undisturbed frame, and a press weaker than the noise of a channel."""
     rest, faint, rng = pressed(model, 1.0), pressed(model, 0.9), np.random.default_rng(1)
     noise = 0.7 * np.median(np.abs(faint - rest)) / np.median(np.abs(rest)) * np.abs(rest)
     frames = [rest + noise * rng.normal(size=208), rest, faint + noise * rng.normal(size=208)]
@@ -153,8 +153,8 @@ def test_frames_of_nothing_but_noise_are_said_to_be_unchanged(model, linear):
 
 
 @pytest.mark.slow
-def test_total_variation_streams_too():
-    """A frame that stays ends where `reconstruct` does; of five electrodes, for compilation."""
+def test_streams_with_total_variation():
+    """A constant frame converges to `reconstruct`; with five electrodes, to limit compilation."""
     electrodes = BoundaryElectrodes(ring(RADIUS, 5), 0.012, 1e-3)
     tiny = ForwardModel(Disk(RADIUS).mesh(num_points=16), electrodes, adjacent(5))
     frame = np.asarray(tiny.voltages(np.where(np.asarray(centroids(tiny.mesh))[:, 0] > 0.03, 0.5, 1.0)))
@@ -166,8 +166,8 @@ def test_total_variation_streams_too():
 
 
 @pytest.mark.slow
-def test_both_descents_end_at_the_same_image(few, imager, damped):
-    """On a frame that stays, for each starts from the last image."""
+def test_both_descents_converge_to_the_same_image(few, imager, damped):
+    """For a constant frame, because each frame starts from the last image."""
     images = [list(stream(one, [few[0]] * 6))[-1] for one in (imager, damped)]
     assert {image.status for image in images} == {"imaged"}
     np.testing.assert_allclose(images[0].conductivity, images[1].conductivity, rtol=1e-4)
@@ -175,17 +175,17 @@ def test_both_descents_end_at_the_same_image(few, imager, damped):
 
 @pytest.fixture(scope="module")
 def noisy(small):
-    """Sixty frames of one press, with ten times the noise."""
+    """Sixty frames of one press with ten times the noise."""
     noise = 1e-2 * np.abs(pressed(small, 1.0))
     return pressed(small, 0.9) + noise * np.random.default_rng(0).normal(size=(60, len(noise))), noise
 
 
-MEMORY = 30.0  # the same everywhere, so that it is compiled once
+MEMORY = 30.0  # the same in all tests, so that it is compiled once
 
 
 @pytest.mark.parametrize("memory", [MEMORY, pytest.param(3.0, marks=pytest.mark.slow)])
-def test_a_memory_is_the_kalman_filter(memory, small, noisy):
-    """The textbook's, with all covariances, long enough for them to be steady."""
+def test_a_memory_equals_the_kalman_filter(memory, small, noisy):
+    """The textbook filter with all covariances, iterated until they are steady."""
     frames, noise = noisy
     options = {"prior": Gaussian(0.03), "noise": noise, "hyperparameter": 2.0, "solver": OneStep()}
     options["parametrisation"] = Parametrisation(informative=0.0)
@@ -196,7 +196,7 @@ def test_a_memory_is_the_kalman_filter(memory, small, noisy):
     voltages, jacobian = small.voltages_and_jacobian(np.ones(small.mesh.num_cells))
     rows = np.asarray(jacobian) @ shapes
     keep, state, covariance = np.exp(-1 / memory), np.zeros(len(shapes.T)), np.eye(len(shapes.T))
-    # The press has gone on for long before the filter's variances are steady: so start it from its steady state.
+    # The press has lasted long before the filter's variances are steady, so start it from its steady state.
     for _ in range(300):
         inverse = np.linalg.inv(rows @ covariance @ rows.T + np.diag(noise**2))
         gain = covariance @ rows.T @ inverse
@@ -208,8 +208,8 @@ def test_a_memory_is_the_kalman_filter(memory, small, noisy):
 
 
 @pytest.mark.parametrize("method", ["one-step", pytest.param("gauss-newton", marks=pytest.mark.slow)])
-def test_a_memory_takes_noise_out_and_leaves_the_press(method, small, noisy):
-    """Where a frame alone tells little: a prior of 5 % and much noise."""
+def test_a_memory_reduces_noise_and_keeps_the_press(method, small, noisy):
+    """With little information in a single frame: a prior of 5 % and much noise."""
     frames, noise = noisy
     options = {"prior": Gaussian(0.02), "noise": noise, "hyperparameter": 20.0, "solver": method}
     options["parametrisation"] = Parametrisation(informative=1e-6)
@@ -223,8 +223,8 @@ def test_a_memory_takes_noise_out_and_leaves_the_press(method, small, noisy):
     assert abs(press[1].mean() - 0.9) < abs(press[0].mean() - 0.9)
 
 
-def test_a_memory_is_the_same_to_gauss_newton_where_all_is_linear(small, noisy):
-    """Changes a hundred times smaller, and noise too: one step from the expected image is the filter's update."""
+def test_a_memory_with_gauss_newton_equals_the_linear_one(small, noisy):
+    """For changes and noise a hundred times smaller, one step from the predicted image is the filter's update."""
     rest, (frames, noise) = pressed(small, 1.0), noisy
     options = {"prior": Gaussian(0.02), "noise": noise / 100, "hyperparameter": 2000.0, "memory": MEMORY}
     options["parametrisation"] = Parametrisation(informative=1e-6)
@@ -236,11 +236,11 @@ def test_a_memory_is_the_same_to_gauss_newton_where_all_is_linear(small, noisy):
     np.testing.assert_allclose(iterated, linear, atol=0.002 * np.abs(linear).max())
 
 
-def spoil(frames, fault):
-    """Frames with one of them spoilt; the third."""
-    spoilt = [frame.copy() for frame in frames]
-    spoilt[2] = fault(spoilt[2])
-    return spoilt
+def with_fault(frames, fault):
+    """Frames with a fault in the third."""
+    faulty = [frame.copy() for frame in frames]
+    faulty[2] = fault(faulty[2])
+    return faulty
 
 
 def dead_electrode(frame, electrode=4):
@@ -253,7 +253,7 @@ def dead_part(frame, electrode=4):
 
 
 def fading_electrode(frame):
-    """It reads two fifths, so that the frame differs by a quarter only."""
+    """The electrode reads two fifths, so that the frame differs by a quarter only."""
     return frame - 0.6 * dead_part(frame)
 
 
@@ -268,7 +268,7 @@ def half_gone(frame):
 
 
 def clipped(frame):
-    """The amplifier gives no more than three fifths of the largest voltage."""
+    """The amplifier saturates at three fifths of the largest voltage."""
     return np.clip(frame, -0.6 * np.abs(frame).max(), 0.6 * np.abs(frame).max())
 
 
@@ -300,9 +300,9 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_bad_frame_is_refused_and_the_stream_goes_on(name, frames, linear, clean):
+def test_a_faulty_frame_is_refused_and_the_stream_continues(name, frames, linear, clean):
     fault, message = REFUSED[name]
-    images = list(stream(linear, spoil(frames, fault)))
+    images = list(stream(linear, with_fault(frames, fault)))
     assert images[2].status == "refused"
     assert message in images[2].reason
     assert images[2].conductivity is None
@@ -318,9 +318,9 @@ def test_a_bad_frame_is_refused_and_the_stream_goes_on(name, frames, linear, cle
         (lambda frame: np.where(np.arange(18) % 7 == 3, np.nan, frame), "partial", "3 channels"),
     ],
 )
-def test_iterations_go_on_from_the_last_image_after_a_bad_frame(fault, status, message, few, imager):
-    """One of too few channels, and one of channels enough."""
-    images, clean = list(stream(imager, spoil(few, fault))), list(stream(imager, few))
+def test_iterations_continue_from_the_last_image_after_a_faulty_frame(fault, status, message, few, imager):
+    """One frame with too few channels, and one with enough."""
+    images, clean = list(stream(imager, with_fault(few, fault))), list(stream(imager, few))
     assert images[2].status == status
     assert message in images[2].reason
     assert images[2].imaged == (status == "partial")
@@ -341,7 +341,7 @@ def test_iterations_go_on_from_the_last_image_after_a_bad_frame(fault, status, m
     ],
 )
 def test_channels_without_a_reading_are_left_out(fault, left, message, model, frames, linear):
-    images = list(stream(linear, spoil(frames, fault)))
+    images = list(stream(linear, with_fault(frames, fault)))
     assert images[2].status == "partial"
     assert message in images[2].reason
     assert images[2].usable.sum() == left
@@ -350,8 +350,8 @@ def test_channels_without_a_reading_are_left_out(fault, left, message, model, fr
 
 
 @pytest.mark.parametrize("method", ["gauss-newton", "one-step"])
-def test_a_masked_channel_is_not_looked_at(method, small, few, rough):
-    """Whatever it reads: the same image to rounding."""
+def test_masked_channels_are_ignored(method, small, few, rough):
+    """Whatever the masked channel reads, the image is the same to rounding."""
     mask = np.arange(len(few[0])) != 7
     imager = Imager.create(small, 1.0, solver=method, mask=mask, **rough)
     read = np.stack([few[0]] * 5)
@@ -364,7 +364,7 @@ def test_a_masked_channel_is_not_looked_at(method, small, few, rough):
 
 
 def test_regions_are_imaged_as_one(small, few, rough):
-    """A region's cells share one value, and those that are held do not move."""
+    """The cells of a region share one value, and fixed cells do not change."""
     label = 1 + np.arange(small.mesh.num_cells)
     label[near(small, PLACES[0])] = 0
     label[np.asarray(centroids(small.mesh))[:, 0] < -0.05] = -1
@@ -379,8 +379,8 @@ def test_regions_are_imaged_as_one(small, few, rough):
     assert image[pooled].mean() < 0.8
 
 
-def test_a_frame_that_needs_more_steps_is_said_so(small, imager):
-    """A press that conducts tenfold, and from there back to rest, by a step that is shortened."""
+def test_a_frame_that_needs_more_steps_is_reported(small, imager):
+    """A press of ten times the conductivity, and back to rest by a shortened step."""
     images = list(stream(imager, [pressed(small, 10.0), pressed(small, 1.0)]))
     assert [image.status for image in images] == ["step limit", "step limit"]
     assert "after 4 iterations:" in images[0].reason
@@ -390,7 +390,7 @@ def test_a_frame_that_needs_more_steps_is_said_so(small, imager):
 
 
 def test_an_undisturbed_frame_may_be_reached_by_the_last_step(small, imager):
-    """Which is not looked at again: but what is left of the objective is all that a step could lower."""
+    """The last step is not checked again; the remaining objective is the most that another step could gain."""
     for value, reached in ((5.0, False), (3.0, True)):
         image = list(stream(imager, [pressed(small, value), pressed(small, 1.0)]))[1]
         assert (np.abs(image.conductivity - 1).max() < 1e-5) == reached
@@ -400,7 +400,7 @@ def test_an_undisturbed_frame_may_be_reached_by_the_last_step(small, imager):
 
 @pytest.mark.parametrize("kind", ["imager", pytest.param("damped", marks=pytest.mark.slow)])
 def test_an_undisturbed_frame_is_at_its_minimum(kind, small, few, request):
-    """Its objective goes to nothing, so that no step is small beside it."""
+    """Its objective goes to zero, so that no step is small relative to it."""
     rest = pressed(small, 1.0)
     images = list(stream(request.getfixturevalue(kind), [rest, few[0], rest, rest]))
     assert [str(one.status) for one in images] == ["unchanged", "imaged", "unchanged", "unchanged"]
@@ -410,7 +410,7 @@ def test_an_undisturbed_frame_is_at_its_minimum(kind, small, few, request):
 
 @pytest.mark.parametrize("kind", ["imager", pytest.param("damped", marks=pytest.mark.slow)])
 def test_a_change_far_below_the_noise_is_still_imaged(kind, small, request):
-    """What ends the iteration does not keep it from its first step."""
+    """The stopping criterion does not prevent the first step."""
     much, little = (
         next(iter(stream(request.getfixturevalue(kind), [pressed(small, 1 - change)]))).conductivity - 1
         for change in (1e-3, 1e-5)

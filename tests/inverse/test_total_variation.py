@@ -1,4 +1,4 @@
-"""Total variation: its quadratic model, and that it finds a block's edge where smooth priors blur it."""
+"""Total variation: its quadratic model, and the edge of a block that smooth priors blur."""
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def frame():
-    """Voltages of a block of half the conductivity, and their noise of 0.1 %."""
+    """Voltages of a block of half the conductivity with noise of 0.1 %, and this noise."""
     fine = model_of(4000)
     inside = (np.abs(np.asarray(centroids(fine.mesh))) < BLOCK).all(axis=1)
     voltages = fine.voltages(jnp.where(inside, 0.5, 1.0))
@@ -49,7 +49,7 @@ def frame():
 
 
 def edge_width(mesh, conductivity):
-    """Metres over which log σ falls from a tenth to nine tenths of its depth, along the block's long middle line."""
+    """Metres over which log σ changes from a tenth to nine tenths of its depth along the block's long middle line."""
     centre, values = np.asarray(centroids(mesh)), np.log(np.asarray(conductivity))
     band = np.abs(centre[:, 1]) < 0.03
     bins = np.arange(0.005, 0.1, 0.005)
@@ -76,7 +76,7 @@ def test_an_edge_is_sharper_than_with_any_smooth_prior(model, frame):
 
 
 @pytest.mark.slow
-def test_both_solvers_find_the_same(model, frame):
+def test_both_solvers_give_the_same_image(model, frame):
     options = {"prior": TotalVariation(), "noise": frame[1], "hyperparameter": 100.0}
     first, second = (
         reconstruct(model, frame[0], 1.0, solver=kind(max_steps=200, rtol=1e-7), **options)
@@ -99,8 +99,8 @@ def small_penalty(mesh):
         pytest.param(box(0.1, 0.1, 0.05, cell_size=0.05), id="3d"),
     ],
 )
-def test_the_quadratic_model_touches_the_energy_from_above(mesh):
-    """Slope along any step is the energy's; for a linear misfit the true cost never exceeds the model's."""
+def test_the_quadratic_model_bounds_the_energy_from_above(mesh):
+    """Its slope along any step is that of the energy; for a linear misfit the true cost never exceeds the model."""
     penalty = small_penalty(mesh)
     m = mesh.num_cells
     data = IndependentChannels.create(adjacent(6, driven_electrodes=True)).weigh(jnp.ones(36)).combine(jnp.ones(36))
@@ -145,7 +145,7 @@ def test_bad_input(change, message, model, frame):
 
 
 def test_there_is_no_linear_image(model, frame):
-    """Nor any of what a quadratic prior has."""
+    """Nor any other property of a quadratic prior."""
     with pytest.raises(ValueError, match="TotalVariation is not quadratic"):
         one_step(model, 1.0, prior=TotalVariation())
     for ask in (TotalVariation().covariance_product, TotalVariation().precision, TotalVariation().basis):

@@ -1,4 +1,4 @@
-"""Joint estimation: electrode positions, contact impedances, background and scale, with the conductivity."""
+"""Joint estimation of electrode positions, contact impedances, background and scale with the conductivity."""
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ CENTRE = np.array([0.015, 0.01])
 
 
 def model_of(num_points, shift=0.0, contact=1e-3, driven=False):
-    """A disk 100 mm across; `shift` of the electrodes along its edge, metres."""
+    """A disk of 100 mm diameter, with a `shift` of the electrodes along its edge in metres."""
     angle = ANGLE + np.asarray(shift) / RADIUS
     position = RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     electrodes = BoundaryElectrodes(position, 0.006, contact)
@@ -45,8 +45,9 @@ def model():
 
 
 @pytest.mark.slow
-def test_positions_repair_an_image(model):
-    """Every electrode 2 mm off. A disk cannot tell of three motions: those of its conformal maps onto itself.
+def test_estimated_positions_improve_an_image(model):
+    """Every electrode is displaced by 2 mm. A disk's voltages do not determine three motions: its conformal maps onto
+    itself.
 
     (1, cos and sin of the angle; Boyle, Adler and Lionheart, IEEE Trans. Med. Imaging 31 (2012) 2185-2193.)
     """
@@ -85,7 +86,7 @@ def test_contact_impedances(model):
     found = np.asarray(result.unknowns["ContactImpedance"]) / 1e-3
     np.testing.assert_allclose(result.model.electrodes.contact_impedance, 1e-3 * found, rtol=1e-12)
     assert np.corrcoef(found, factor)[0, 1] > 0.98
-    # A common factor is what a coarse mesh is off by at the electrodes' ends.
+    # A common factor is the error of a coarse mesh at the electrodes' ends.
     ratio = found / factor
     assert np.abs(ratio / ratio.mean() - 1).max() < 0.12
     deviation = posterior(result).unknowns()["ContactImpedance"]
@@ -94,7 +95,8 @@ def test_contact_impedances(model):
 
 @pytest.mark.slow
 def test_background_and_scale():
-    """Each by itself: only the contact impedance tells a scale from a background. The image takes a share of it."""
+    """Each by itself: only the contact impedance distinguishes a scale from a background, which the image partly
+    explains."""
     known = model_of(900, driven=True)
     voltages, noise = noisy(known.voltages(1.3), 1e-4)
     options = {"prior": Gaussian(0.02), "noise": noise, "hyperparameter": 10.0}
@@ -110,7 +112,7 @@ def test_background_and_scale():
 
 @pytest.mark.slow
 def test_derivative_with_all_unknowns():
-    """Products with the Jacobian against autodiff, and Taylor's second order."""
+    """Products with the Jacobian against automatic differentiation, and second-order Taylor remainders."""
     model = model_of(150, driven=True)
     voltages, noise = noisy(model.voltages(1.1))
     unknowns = [ContactImpedance(model), ElectrodePosition(model, 1e-4), Background(), Scale()]
@@ -129,8 +131,9 @@ def test_derivative_with_all_unknowns():
 
 
 @pytest.mark.slow
-def test_what_is_estimated_by_logarithms_is_given_as_itself():
-    """Contact impedances in ohm·m and a factor; deviations in the same units: those of the logarithms times them."""
+def test_logarithmic_unknowns_are_reported_in_their_own_units():
+    """Contact impedances in ohm·m and a factor; deviations in the same units: those of the logarithms times the
+    values."""
     number = 5  # and few nodes: unknowns are compiled for seconds
 
     def tiny(contact):
@@ -153,7 +156,7 @@ def test_what_is_estimated_by_logarithms_is_given_as_itself():
     np.testing.assert_allclose(found.unknowns()["Scale"], 0.05 * share[number:] * factor, rtol=1e-9)
 
 
-def test_discs_in_a_sheet_move_both_ways():
+def test_discs_in_a_sheet_move_in_both_directions():
     electrodes = SheetDiscs(grid(0.08, 0.08, 3, 3), 0.004, 1e-3)
     sheet = ForwardModel(Rectangle(0.12, 0.12).mesh(num_points=700), electrodes, adjacent(9))
     unknown = ElectrodePosition(sheet, 1e-3)

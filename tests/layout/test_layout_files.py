@@ -1,4 +1,4 @@
-"""Layouts: what is refused, the named ones, and CSV, DXF and SVG files written and read back."""
+"""Layouts: invalid ones, named ones, and CSV, DXF and SVG files written and read back."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -18,7 +18,7 @@ OUTLINE = Polygon(
 CENTRES = [[-0.08, 0.0125], [0.0, -1 / 30], [0.08, 0.04]]
 SKIN = Layout(CENTRES, [6e-3, 5e-3, 4e-3], outline=OUTLINE, labels=["A1", "µ; “b”, c", "<&#3>"], name="skin")
 ENDINGS = (".csv", ".dxf", ".svg")
-ROUNDING = 1e-9  # m: 1e-6 mm
+ROUNDING = 1e-9  # metres: 1e-6 mm
 
 
 def assert_same(layout, other):
@@ -29,7 +29,7 @@ def assert_same(layout, other):
 
 @st.composite
 def layouts(draw):
-    """Up to seven discs apart, anywhere within a few metres of the origin."""
+    """Up to seven separate discs within a few metres of the origin."""
     number = draw(st.integers(1, 7))
     numbers = st.floats(0, 1).map(lambda value: round(value, 12))
     centre = np.array(draw(st.tuples(numbers, numbers))) * 4 - 2
@@ -75,7 +75,7 @@ def test_outlines_round_trip(outline, ending, tmp_path):
         np.testing.assert_allclose(loop, wanted, rtol=0, atol=ROUNDING)
 
 
-def test_csv_keeps_contact_impedance_and_takes_an_outline(tmp_path):
+def test_csv_keeps_contact_impedance_and_outline(tmp_path):
     layout = Layout(CENTRES, 6e-3, contact_impedance=[1e-4, 2e-4, 3e-4])
     write_layout(layout, tmp_path / "skin.csv")
     back = read_layout(tmp_path / "skin.csv", outline=Rectangle(0.2, 0.1))
@@ -138,7 +138,7 @@ def test_bad_tables_are_refused(text, complaint, tmp_path):
         read_layout(path, outline=Rectangle(0.2, 0.2))
 
 
-def test_svg_is_to_scale_with_y_up(tmp_path):
+def test_svg_is_to_scale_with_the_y_axis_upwards(tmp_path):
     path = tmp_path / "skin.svg"
     write_layout(SKIN, path)
     root = ElementTree.parse(path).getroot()
@@ -220,8 +220,9 @@ RECT = '<rect x="-5" y="5" width="80" height="40"/>'
     ],
 )
 @pytest.mark.parametrize(("width", "unit"), [("100mm", 1.0), ("10cm", 1.0), ("4in", 1.016), ("192px", 0.508)])
-def test_svg_drawn_by_hand(skin, width, unit, tmp_path):
-    """Nested transforms, worked out on paper: (3, 4) is mirrored to (-3, 4), turned to (6, -3), then to (32, 24)."""
+def test_hand_drawn_svg(skin, width, unit, tmp_path):
+    """Nested transforms, computed by hand: (3, 4) is mirrored to (-3, 4), rotated to (6, -3), then moved to (32,
+    24)."""
     height = f"{float(width[:-2]) / 2:g}{width[-2:]}"
     (tmp_path / "hand.svg").write_text(DRAWN.format(width=width, height=height, skin=skin))
     layout = read_layout(tmp_path / "hand.svg")
@@ -242,7 +243,7 @@ def test_svg_roles_by_class_and_holes_in_a_path(tmp_path):
     np.testing.assert_allclose(layout.known_outline.area, 3200e-6 - 16e-6)
 
 
-def test_svg_without_a_skin_takes_the_one_given(tmp_path):
+def test_svg_without_a_skin_uses_the_given_one(tmp_path):
     (tmp_path / "hand.svg").write_text(DRAWN.format(width="100mm", height="50mm", skin=""))
     assert read_layout(tmp_path / "hand.svg", outline=Rectangle(0.2, 0.2)).outline.width == 0.2
     with pytest.raises(ValueError, match=r"'hand' does not say the skin's; give it, as in read_layout"):
@@ -250,7 +251,7 @@ def test_svg_without_a_skin_takes_the_one_given(tmp_path):
 
 
 class TestDrawings:
-    """DXF files as CAD programs make them."""
+    """DXF files as CAD programs write them."""
 
     @pytest.fixture
     def drawing(self):
@@ -344,13 +345,13 @@ class TestDrawings:
         with pytest.raises(ValueError, match=r"cad.dxf: (this is not a DXF|nothing is drawn)"):
             read_layout(tmp_path / "cad.dxf")
 
-    def test_without_ezdxf_the_extra_is_named(self, monkeypatch, tmp_path):
+    def test_error_without_ezdxf_names_the_extra(self, monkeypatch, tmp_path):
         monkeypatch.setitem(__import__("sys").modules, "ezdxf", None)
         with pytest.raises(ImportError, match=r"pip install 'jeit\[cad\]'"):
             write_layout(SKIN, tmp_path / "skin.dxf")
 
 
-def test_paths_that_cannot_be(tmp_path):
+def test_invalid_paths(tmp_path):
     with pytest.raises(FileNotFoundError, match="there is no file"):
         read_layout(tmp_path / "none.csv")
     with pytest.raises(ValueError, match=r"ends with none of \.csv, \.dxf, \.svg"):
@@ -406,7 +407,7 @@ def test_named_layouts():
         ("grid-40x4", "5 mm apart, and they are 6 mm across"),
     ],
 )
-def test_other_names_are_refused(name, complaint):
+def test_unknown_names_are_refused(name, complaint):
     with pytest.raises(ValueError, match=complaint):
         named_layout(name)
 

@@ -1,4 +1,4 @@
-"""Layouts: how many, how far apart, and inside what."""
+"""Arrangements of electrodes: their number, spacing and outline."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def nearest_gap(position):
     return gap.min(axis=1)
 
 
-def test_ring_begins_at_noon_and_turns_as_told():
+def test_ring_begins_at_the_top_and_has_the_given_direction():
     position = ring(2.0, 4)
     np.testing.assert_allclose(position, [[0, 2], [-2, 0], [0, -2], [2, 0]], atol=1e-12)
     np.testing.assert_allclose(ring(2.0, 4, clockwise=True)[1], [2, 0], atol=1e-12)
@@ -26,7 +26,7 @@ def test_ring_and_centre_puts_the_centre_last():
     np.testing.assert_allclose(position[-1], [3, 1], atol=1e-12)
 
 
-def test_perimeter_is_even_along_the_edge():
+def test_perimeter_is_evenly_spaced_along_the_edge():
     position = perimeter(Rectangle(0.32, 0.2), 16, start=0.01)
     inside = np.abs(position) <= np.array([0.16, 0.1]) + 1e-12
     assert inside.all()
@@ -35,7 +35,7 @@ def test_perimeter_is_even_along_the_edge():
     assert len(np.unique(position.round(9), axis=0)) == 16
 
 
-def test_grid_spans_what_it_is_told():
+def test_grid_has_the_given_extent():
     position = grid(0.2, 0.1, 4, 3, centre=(1.0, 0.0))
     assert position.shape == (12, 2)
     np.testing.assert_allclose(np.ptp(position, axis=0), [0.2, 0.1])
@@ -46,7 +46,7 @@ def test_grid_spans_what_it_is_told():
     "domain",
     [Disk(0.1), Rectangle(0.2, 0.2), Polygon([[0, 0], [0.3, 0], [0.3, 0.1], [0.1, 0.1], [0.1, 0.3], [0, 0.3]])],
 )
-def test_quasi_uniform_fills_any_outline_evenly(domain):
+def test_quasi_uniform_covers_any_outline_evenly(domain):
     position = quasi_uniform(domain, 32, margin=0.005)
     assert position.shape == (32, 2)
     assert np.asarray(domain.contains(position)).all()
@@ -67,8 +67,8 @@ def test_quasi_uniform_fills_any_outline_evenly(domain):
         ("inner-9", Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0, 0.05]]), 9),
     ],
 )
-def test_names_are_made_for_any_skin_and_diameter(name, outline, number):
-    layout = named_layout(name, outline, diameter=4e-3)  # Layout refuses electrodes that leave their skin
+def test_named_layouts_for_any_skin_and_diameter(name, outline, number):
+    layout = named_layout(name, outline, diameter=4e-3)  # Layout refuses electrodes outside of their skin
     assert (layout.num_electrodes, layout.name, layout.outline) == (number, name, outline)
     np.testing.assert_array_equal(layout.diameters, 4e-3)
     if name.startswith("perimeter") and isinstance(outline, Disk):
@@ -77,7 +77,7 @@ def test_names_are_made_for_any_skin_and_diameter(name, outline, number):
 
 
 @pytest.mark.parametrize(
-    ("name", "said"),
+    ("name", "message"),
     [
         ("park-inner", "its skin spans -100 to 100 mm by -100 to 100 mm; on another take inner-32"),
         ("perimeter-8", "'perimeter-8' is of rectangles and disks"),
@@ -85,6 +85,6 @@ def test_names_are_made_for_any_skin_and_diameter(name, outline, number):
         ("park-iner", "did you mean 'park-inner'"),
     ],
 )
-def test_names_that_a_skin_has_not(name, said):
-    with pytest.raises(ValueError, match=said):
+def test_names_unsuitable_for_a_skin(name, message):
+    with pytest.raises(ValueError, match=message):
         named_layout(name, Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0, 0.05]]))

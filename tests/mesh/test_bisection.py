@@ -1,4 +1,4 @@
-"""Meshes made finer in places, and cut along surfaces."""
+"""Local mesh refinement by bisection, and meshes cut along surfaces."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from jeit.mesh import bisect, bisection, box, centroids, cut, disk, measures, qu
 
 
 def finer(centre, radius, edge):
-    """Edges of this length within a ball."""
+    """Refine to this edge length within a ball."""
 
     def size(corners):
         return np.where(np.linalg.norm(corners.mean(axis=1) - centre, axis=1) < radius, edge, np.inf)
@@ -24,8 +24,9 @@ MESHES = {"disk": disk(1.0, num_points=200), "box": box(1.0, 1.0, 1.0, num_point
 
 
 @pytest.mark.parametrize("name", MESHES)
-def test_cells_are_as_small_as_asked_for_and_no_others(name):
-    """The mesh stays conforming (`Mesh.create` refuses others), of the same measure, and keeps its cells' shape."""
+def test_cells_have_the_requested_size_only_where_requested(name):
+    """The mesh stays conforming (`Mesh.create` refuses others), keeps its measure, and keeps the quality of its
+    cells."""
     mesh = MESHES[name]
     centre, edge = np.full(mesh.dimension, 0.4), 0.06
     found = bisect(mesh, finer(centre, 0.2, edge))
@@ -51,7 +52,7 @@ def area(mesh, index):
 
 
 @pytest.mark.parametrize("name", ["disk", pytest.param("box", marks=pytest.mark.slow)])
-def test_a_cut_mesh_has_the_surface_on_sides_of_cells(name):
+def test_a_cut_mesh_resolves_the_surface(name):
     mesh = MESHES[name]
     centre, radius = np.asarray(centroids(mesh)).mean(axis=0) + 0.03, 0.3
 
@@ -73,7 +74,7 @@ def test_a_cut_mesh_has_the_surface_on_sides_of_cells(name):
     assert errors[1] < 0.03
 
 
-def test_surfaces_may_leave_the_body():
+def test_surfaces_may_extend_beyond_the_body():
     mesh = MESHES["box"]
     found = cut(mesh, lambda points: points[:, 0] + 0.3 * points[:, 2] - 0.11)
     side = np.asarray(found.points) @ [1, 0, 0.3] - 0.11
@@ -83,7 +84,7 @@ def test_surfaces_may_leave_the_body():
 
 
 @pytest.mark.parametrize("surface", [sphere(1.0, num_points=400), tube(0.5, 1.5, num_points=400)], ids=["ball", "tube"])
-def test_surfaces_in_space_are_divided_and_cut(surface):
+def test_meshes_of_surfaces_in_space_are_refined_and_cut(surface):
     edge = 0.08
     finer_there = bisect(surface, finer([0.5, 0.2, 0.1], 0.5, edge))
     found = cut(finer_there, lambda points: points[:, 0] - 0.21)
@@ -100,7 +101,7 @@ def test_more_nodes_than_can_be_indexed_are_refused(monkeypatch):
         bisect(MESHES["disk"], lambda corners: np.full(len(corners), 1e-6))
 
 
-def test_what_does_not_fit_is_refused():
+def test_invalid_input_is_refused():
     mesh = MESHES["disk"]
     with pytest.raises(ValueError, match=r"^mesh"):
         bisect(None, lambda corners: corners)  # pyright: ignore

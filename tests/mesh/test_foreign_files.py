@@ -1,4 +1,4 @@
-"""Mesh files from anywhere: only the file is read, as much as memory holds, and every fault is a `ValueError`."""
+"""Untrusted mesh files: only the file itself is read, within the memory limit, and every fault is a `ValueError`."""
 
 import signal
 import warnings
@@ -22,8 +22,8 @@ XDMF = (
 
 
 @pytest.fixture(autouse=True)
-def in_ten_seconds():
-    """A reader that waits for ever is stopped."""
+def ten_second_limit():
+    """Stop a reader that does not end."""
 
     def stop(*_):
         raise TimeoutError("ten seconds are over")
@@ -35,8 +35,9 @@ def in_ten_seconds():
     signal.signal(signal.SIGALRM, before)
 
 
-def told(path):
-    """What is said where a file is refused. Anything but a `ValueError` is raised."""
+def refusal(path):
+    """Return the error message if a file is refused, and an empty text if it is read. Any exception but `ValueError` is
+    raised."""
     try:
         read(path)
     except ValueError as error:
@@ -45,7 +46,7 @@ def told(path):
 
 
 def refused(path):
-    message = told(path)
+    message = refusal(path)
     assert 0 < len(message) <= 400
     return message
 
@@ -106,7 +107,7 @@ LEADING = {
 
 
 @pytest.mark.parametrize("name", LEADING)
-def test_what_leads_elsewhere_is_refused(name, tmp_path):
+def test_references_to_other_files_are_refused(name, tmp_path):
     file, content, message = LEADING[name]
     (tmp_path / file).write_bytes(content if isinstance(content, bytes) else content.encode())
     (tmp_path / "secret.inp").write_text("*NODE\n1, 0, 0\n2, 1, 0\n3, 0, 1\n*ELEMENT, TYPE=CPS3\n1, 1, 2, 3\n")
@@ -114,7 +115,7 @@ def test_what_leads_elsewhere_is_refused(name, tmp_path):
 
 
 @pytest.mark.parametrize("compressor", ["zlib", "lzma"])
-def test_what_is_packed_is_unpacked_as_far_as_memory_holds(compressor, tmp_path, monkeypatch):
+def test_compressed_data_are_unpacked_within_the_memory_limit(compressor, tmp_path, monkeypatch):
     meshio.Mesh(POINTS, [("triangle", np.asarray(MESH.cells))]).write(tmp_path / "a.vtu", compression=compressor)
     assert read(tmp_path / "a.vtu").num_cells == MESH.num_cells
     large = np.zeros((100_000, 3))
@@ -122,7 +123,7 @@ def test_what_is_packed_is_unpacked_as_far_as_memory_holds(compressor, tmp_path,
     monkeypatch.setenv("JEIT_FILE_GB", "0.002")
     assert (tmp_path / "b.vtu").stat().st_size < 5e5
     assert "b.vtu, unpacked, would take" in refused(tmp_path / "b.vtu")
-    assert meshio.vtu._vtu.zlib is zlib  # as it was
+    assert meshio.vtu._vtu.zlib is zlib  # as before
 
 
 def test_a_file_larger_than_memory_is_not_opened(tmp_path, monkeypatch):
@@ -139,8 +140,8 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("suffix", [*FORMATS])
-def test_files_cut_off_and_changed(suffix, tmp_path):
-    """Wherever they are cut, and with any bytes changed: a mesh, or a `ValueError`."""
+def test_truncated_and_corrupted_files(suffix, tmp_path):
+    """Truncated anywhere or with any bytes changed, a file gives a mesh or a `ValueError`."""
     path = tmp_path / f"a{suffix}"
     if suffix in TEXTS:
         path.write_text(TEXTS[suffix])
@@ -158,7 +159,7 @@ def test_files_cut_off_and_changed(suffix, tmp_path):
         path.write_bytes(one)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # large coordinates
-            message = told(path)
+            message = refusal(path)
         assert len(message) <= 400, message
 
 

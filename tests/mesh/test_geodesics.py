@@ -1,4 +1,4 @@
-"""Ways along surfaces, against great circles, unrolled cylinders and cones; and surfaces laid flat."""
+"""Geodesic distances against great circles, unrolled cylinders and cones; and flattened surfaces."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def test_great_circles_on_5000_nodes():
     assert np.median(error) < 5e-4
 
 
-def test_great_circles_converge():
+def test_convergence_to_great_circles():
     ways = []
     for number in (300, 1200, 4800):
         mesh = sphere(0.05, num_points=number)
@@ -46,7 +46,7 @@ def test_great_circles_converge():
     assert ways[2] < 1e-4  # metres, of up to 120 mm
 
 
-def test_cylinders_unrolled():
+def test_distances_on_cylinders():
     places, angle, z = on_cylinder(14, 0.15)
     mesh = tube(RADIUS, 0.15, num_points=2500)
     found, exact = Geodesics.create(mesh).between(places), along_cylinder(angle, z)
@@ -56,7 +56,7 @@ def test_cylinders_unrolled():
     assert np.quantile(error, 0.95) < 1e-3
 
 
-def test_does_not_depend_on_which_way_triangles_point():
+def test_orientation_of_triangles_does_not_matter():
     points = np.asarray(tube(RADIUS, 0.12, num_points=2500).points)
     mesh = tube(RADIUS, 0.12, num_points=2500)
     ways = Geodesics.create(mesh)
@@ -78,7 +78,7 @@ def test_does_not_depend_on_which_way_triangles_point():
     assert (nodes >= 0.8 * by_edges).all()
 
 
-def test_cones_unrolled():
+def test_distances_on_cones():
     mesh = forearm(0.2, 0.025, 0.045, num_points=4000)
     apex, flat = unroll(mesh), Geodesics.create(mesh)
     angle = np.array([0.3, 0.9, 1.4])
@@ -87,7 +87,7 @@ def test_cones_unrolled():
     places = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
     laid = apex.flat(places)
     exact = np.linalg.norm(laid[:, None] - laid, axis=-1)
-    slant = np.hypot(1, 0.1) * radius / 0.1  # from the apex, and the angle that a turn becomes
+    slant = np.hypot(1, 0.1) * radius / 0.1  # distance from the apex, and the angle to which a turn unrolls
     turned = np.abs(angle[:, None] - angle) * 0.1 / np.hypot(1, 0.1)
     cone = np.sqrt(slant[:, None] ** 2 + slant**2 - 2 * slant[:, None] * slant * np.cos(turned))
     np.testing.assert_allclose(exact, cone, atol=1e-4)
@@ -95,7 +95,7 @@ def test_cones_unrolled():
     assert apex.distortion < 1e-4
 
 
-def test_a_bent_sheet_is_as_long_as_flat():
+def test_distances_on_a_bent_sheet_equal_those_on_the_flat_one():
     sheet = Rectangle(0.1, 0.1).mesh(num_points=600)
     bent = bend(sheet, RADIUS)
     points = np.asarray(bent.points)
@@ -118,7 +118,7 @@ def test_places_at_nodes_on_edges_and_on_faces_of_shells():
         assert ways.between(ends)[0, 1] == pytest.approx(np.pi * radius, rel=0.01)
 
 
-def test_limits_and_nearness():
+def test_limits_and_nearest_neighbours():
     places, _, _ = on_cylinder(30, 0.1, seed=3)
     ways = Geodesics.create(tube(RADIUS, 0.1, num_points=1500))
     full = ways.distances(places, places)
@@ -132,26 +132,28 @@ def test_limits_and_nearness():
         assert set(np.flatnonzero(full[row] < 0.0399)) <= set(index)
 
 
-def test_refuses_places_off_the_surface():
+def test_places_off_the_surface_are_refused():
     ways, on = Geodesics.create(tube(RADIUS, 0.1, num_points=300)), [[RADIUS, 0, 0.05]]
     assert np.isfinite(ways.distances([[1.04 * RADIUS, 0, 0.05]], on)).all()
     assert np.isfinite(ways.distances([[1.3 * RADIUS, 0, 0.05]], on)).all()  # across a thick skin
-    said = r": 1 of 1 lie off the surface, the first, at \[5\.0, 0\.0, 0\.0\] m, by 4\.9\d+e\+03 mm; give places on it"
-    with pytest.raises(ValueError, match="^sources" + said):
+    message = (
+        r": 1 of 1 lie off the surface, the first, at \[5\.0, 0\.0, 0\.0\] m, by 4\.9\d+e\+03 mm; give places on it"
+    )
+    with pytest.raises(ValueError, match="^sources" + message):
         ways.distances([[5.0, 0, 0]], on)
-    with pytest.raises(ValueError, match="^targets" + said):
+    with pytest.raises(ValueError, match="^targets" + message):
         ways.distances(on, [[5.0, 0, 0]])
 
 
-def test_what_is_not_developable_says_how_far_it_is_stretched():
-    told = unroll(sphere(0.05, num_points=600))
-    assert told.mean_distortion > 0.05
+def test_distortion_of_surfaces_that_are_not_developable():
+    flat = unroll(sphere(0.05, num_points=600))
+    assert flat.mean_distortion > 0.05
     oval = unroll(forearm(0.2, (0.02, 0.03), (0.045, 0.035), num_points=1200))
     assert 1e-5 < oval.mean_distortion < 0.005
     assert len(oval.seam)
 
 
-def test_refuses_what_is_no_surface():
+def test_other_meshes_are_refused():
     with pytest.raises(ValueError, match="mesh is plane"):
         Triangles.of(Rectangle(0.1, 0.1).mesh(num_points=100))
     with pytest.raises(ValueError, match="face: the mesh has the tags"):

@@ -1,4 +1,4 @@
-"""Every bad input has its own error, which names the argument and says what to do."""
+"""Every invalid input gives an error that names the argument and says what to do."""
 
 import numpy as np
 import pytest
@@ -124,7 +124,7 @@ def test_bad_input(attempt, message):
         attempt()
 
 
-def test_a_boundary_that_touches_itself():
+def test_a_boundary_that_touches_itself_is_refused():
     # A frame of eight triangles whose inner corner meets its outer boundary in one node.
     points = [[0, 0], [3, 0], [3, 3], [0, 3], [0, 1.5], [1, 1], [2, 1.5], [1, 2]]
     cells = [[0, 1, 5], [1, 6, 5], [1, 2, 6], [2, 7, 6], [2, 3, 7], [3, 4, 7], [0, 5, 4]]

@@ -1,4 +1,4 @@
-"""`Mesh.create`: orientation, boundary, tags, and meshes under JAX transformations."""
+"""`Mesh.create`: orientation, boundary, tags, and meshes in JAX transformations."""
 
 import equinox as eqx
 import jax
@@ -15,7 +15,7 @@ HOLE = [[0.4, 0.4], [0.6, 0.4], [0.6, 0.6], [0.4, 0.6]]
 
 
 @pytest.mark.parametrize("cells", [TWO_TRIANGLES, TWO_TRIANGLES[:, ::-1], [[0, 2, 1], [0, 2, 3]]])
-def test_cells_are_turned_counter_clockwise(cells):
+def test_cells_are_oriented_counter_clockwise(cells):
     mesh = Mesh.create(SQUARE, cells)
     np.testing.assert_allclose(measures(mesh), 0.5)
     np.testing.assert_array_equal(mesh.facets, [[0, 1], [1, 2], [2, 3], [3, 0]])
@@ -28,7 +28,7 @@ def test_types_and_sizes():
     assert mesh.cells.dtype == mesh.facets.dtype == jnp.int32
 
 
-def test_loops_run_head_to_tail_outer_first_and_holes_clockwise():
+def test_loops_are_ordered_outer_first_and_holes_clockwise():
     mesh = polygon(SQUARE, holes=[HOLE], cell_size=0.1)
     points, facets = np.asarray(mesh.points), np.asarray(mesh.facets)
     ends = np.flatnonzero(facets[1:, 0] != facets[:-1, 1]) + 1
@@ -54,7 +54,7 @@ def test_tags_by_index_and_by_nodes_agree():
     np.testing.assert_array_equal(by_index.tags["right"], [1])
 
 
-def test_tetrahedron_has_outward_facets_whichever_way_it_is_given():
+def test_tetrahedron_has_outward_facets_for_either_orientation():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     for cell in ([0, 1, 2, 3], [0, 2, 1, 3]):
         mesh = Mesh.create(points, [cell])
@@ -82,7 +82,7 @@ def test_arc_length_counts_along_each_loop():
         boundary_loops(Mesh.create(np.eye(4, 3), [[0, 1, 2, 3]]))
 
 
-def test_a_mesh_is_a_pytree_that_jit_and_vmap_take():
+def test_a_mesh_is_a_pytree_for_jit_and_vmap():
     mesh = disk(0.1, num_points=50)
     scale = jnp.array([1.0, 2.0, 3.0])
     area = jax.jit(jax.vmap(lambda s: measures(eqx.tree_at(lambda m: m.points, mesh, s * mesh.points)).sum()))(scale)
@@ -101,7 +101,7 @@ def test_create_accepts_traced_points():
         jax.jit(lambda cells: Mesh.create(mesh.points, cells))(mesh.cells)
 
 
-def test_large_coordinates_are_questioned():
+def test_large_coordinates_give_a_warning():
     with pytest.warns(UserWarning, match="millimetres"):
         Mesh.create(100 * SQUARE, TWO_TRIANGLES)
     with pytest.warns(UserWarning, match="millimetres"):

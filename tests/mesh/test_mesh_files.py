@@ -1,4 +1,4 @@
-"""Meshes written and read back, and what Gmsh makes."""
+"""Meshes written and read back, and meshes made by Gmsh."""
 
 import importlib.util
 
@@ -92,7 +92,7 @@ def test_unwritable_requests(tmp_path):
 
 
 @pytest.mark.skipif(importlib.util.find_spec("gmsh") is not None, reason="gmsh is installed")
-def test_without_gmsh_the_error_says_what_to_install():
+def test_error_without_gmsh_says_what_to_install():
     with pytest.raises(ImportError, match=r"pip install 'jeit\[mesh\]'"):
         from_gmsh(Disk(0.1))
 

@@ -1,4 +1,4 @@
-"""Measures and P1 gradients: exact for linear functions, equal to finite differences, unchanged by transformations."""
+"""Measures and P1 gradients: exact for linear functions, equal to finite differences, and valid in transformations."""
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ def test_gradients_of_a_linear_function_are_exact(mesh):
     slope = np.array([1.3, -0.7, 2.1])[: mesh.dimension]
     values = np.asarray(mesh.points) @ slope + 0.4
     gradient = np.einsum("mk,mkd->md", values[np.asarray(mesh.cells)], gradients(mesh))
-    # Rounding grows like the inverse of the cell size (0.01 m).
+    # Rounding is proportional to the inverse of the cell size (0.01 m).
     np.testing.assert_allclose(gradient, np.broadcast_to(slope, gradient.shape), atol=1e-12)
     np.testing.assert_allclose(np.asarray(gradients(mesh)).sum(axis=1), 0.0, atol=1e-11)
 
@@ -48,7 +48,7 @@ def test_areas_and_volumes_by_formula():
 
 @pytest.mark.parametrize("function", [measures, gradients, facet_measures, centroids])
 @pytest.mark.parametrize("mesh", [PLANE, SOLID], ids=["2-D", "3-D"])
-def test_derivatives_in_the_points(mesh, function):
+def test_derivatives_with_respect_to_points(mesh, function):
     direction, points = np.random.default_rng(0).normal(size=mesh.points.shape), np.asarray(mesh.points)
 
     def along(step):

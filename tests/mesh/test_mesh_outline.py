@@ -1,4 +1,4 @@
-"""Outlines: area, extent, what they contain, and their boundary by arc length."""
+"""Outlines: area, extent, interior, and boundary by arc length."""
 
 import tracemalloc
 
@@ -20,12 +20,12 @@ def test_area_by_counting_points(domain):
     left, right, low, high = domain.extent
     x, y = np.meshgrid(np.linspace(left, right, 801), np.linspace(low, high, 801))
     fraction = np.mean(np.asarray(domain.contains(np.stack([x, y], axis=-1))))
-    # A grid of 800² counts an area to about its perimeter over 800.
+    # A grid of 800² points counts an area to about its perimeter over 800.
     assert fraction * (right - left) * (high - low) == pytest.approx(float(domain.area), rel=5e-3)
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
-def test_boundary_runs_counter_clockwise_at_unit_speed_and_wraps(domain):
+def test_boundary_runs_counter_clockwise_at_unit_speed_periodically(domain):
     perimeter = float(domain.perimeter)
     arc = np.linspace(0, perimeter, 4001)
     points = np.asarray(domain.boundary(arc))
@@ -38,7 +38,7 @@ def test_boundary_runs_counter_clockwise_at_unit_speed_and_wraps(domain):
     np.testing.assert_allclose(domain.boundary(arc[7] - perimeter), points[7], atol=1e-12)
 
 
-def test_where_the_boundary_starts():
+def test_start_of_the_boundary():
     np.testing.assert_allclose(Disk(0.1, (1.0, 2.0)).boundary(0.0), [1.1, 2.0])
     np.testing.assert_allclose(Disk(0.1).boundary(0.1 * np.pi / 2), [0.0, 0.1], atol=1e-15)
     np.testing.assert_allclose(
@@ -54,13 +54,13 @@ def test_boundary_derivative_is_the_unit_tangent(domain):
     assert float(np.linalg.norm(tangent)) == pytest.approx(1.0, rel=1e-12)
 
 
-def test_the_radius_can_be_differentiated():
+def test_derivative_with_respect_to_the_radius():
     slope = jax.jit(jax.grad(lambda radius: Disk(radius).boundary(0.0)[0]))(0.1)
     assert float(slope) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
-def test_domains_mesh_themselves(domain):
+def test_outlines_mesh_themselves(domain):
     mesh = domain.mesh(num_points=300)
     assert mesh.num_points == pytest.approx(300, rel=0.06)
     assert quality(mesh).smallest_angle.min() >= 25
@@ -83,7 +83,7 @@ def test_distances_and_nearest_places_agree_with_the_edge(domain):
     edge = np.concatenate([_sampled(np.asarray(loop)) for loop in domain.loops()])
     apart = np.linalg.norm(points[:, None] - edge, axis=-1).min(axis=1)
     distance, inside = np.asarray(domain.signed_distance(points)), np.asarray(domain.contains(points))
-    # The edge is sampled every half a millimetre, which matters within a few of them.
+    # The edge is sampled every half a millimetre, which matters within a few millimetres of it.
     np.testing.assert_allclose(np.abs(distance), apart, atol=6e-4)
     clear = apart > 1e-3
     np.testing.assert_array_equal(distance[clear] > 0, inside[clear])
@@ -93,7 +93,7 @@ def test_distances_and_nearest_places_agree_with_the_edge(domain):
 
 
 @pytest.mark.parametrize("domain", DOMAINS, ids=NAMES)
-def test_what_it_is_described_by_makes_it_again(domain):
+def test_an_outline_is_rebuilt_from_its_description(domain):
     described = domain.describe()
     again = OUTLINES[described.pop("shape")](**described)
     assert type(again) is type(domain)
@@ -102,8 +102,8 @@ def test_what_it_is_described_by_makes_it_again(domain):
 
 
 @pytest.mark.slow
-def test_many_vertices_are_compared_some_at_a_time():
-    """A circle, a comb and a path through random points, as they are or turned on themselves; in little memory."""
+def test_many_vertices_are_compared_in_blocks():
+    """A circle, a comb and a path through random points, simple or self-intersecting, in little memory."""
     angle = np.linspace(0, 2 * np.pi, 2000, endpoint=False)
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
     spikes = circle * np.where(np.arange(2000) % 2, 1, 0.001)[:, None]

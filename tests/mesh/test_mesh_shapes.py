@@ -1,4 +1,5 @@
-"""Every built-in plane mesh: conforming, true to its outline, as fine as asked, and no angle below 25°."""
+"""Every built-in plane mesh: conforming, accurate at its outline, of the requested size, and without angles below
+25°."""
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ EDGE_POINTS = 0.1 * np.stack([np.cos(EDGES), np.sin(EDGES)], axis=1)
 
 
 def areas(mesh):
-    """Signed areas in NumPy: `measures` would be compiled anew for every mesh."""
+    """Signed areas in NumPy, because `measures` would be compiled for every mesh."""
     a, b, c = (np.asarray(mesh.points)[np.asarray(mesh.cells)[:, k]] for k in range(3))
     return 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
 
@@ -26,7 +27,7 @@ def lengths(mesh):
 
 
 def check(mesh, holes=0, smallest=25.0):
-    """Angle, conformity (Euler characteristic) and orientation."""
+    """Check angles, conformity (Euler characteristic) and orientation."""
     shape = quality(mesh)
     assert shape.smallest_angle.min() >= smallest - 1e-9
     cells, facets = np.asarray(mesh.cells), np.asarray(mesh.facets)
@@ -62,7 +63,7 @@ def test_uniform_rectangles_of_rows(width, height, num_points):
 
 
 @pytest.mark.parametrize("cell_size", [0.002, 0.01, 0.04, 1.0])
-def test_cell_size_is_met(cell_size):
+def test_requested_cell_size(cell_size):
     meshes = [disk(0.1, cell_size=cell_size), rectangle(0.2, 0.1, cell_size=cell_size)]
     for mesh in [*meshes, polygon(L_SHAPE, cell_size=cell_size) if cell_size > 0.005 else meshes[0]]:
         check(mesh)
@@ -81,7 +82,7 @@ def test_area_and_perimeter_of_the_disk_converge_at_second_order():
     )
     order = np.polyfit(np.log(1 / np.sqrt(sizes)), np.log(errors), 1)[0]
     np.testing.assert_allclose(order, 2.0, atol=0.1)
-    # The inscribed N-gon falls short by 2π²/(3N²), here N = 6 n / √(3 n).
+    # The inscribed N-gon is smaller by 2π²/(3N²), here N = 6 n / √(3 n).
     assert errors[-1, 0] < 6e-4
 
 
@@ -107,7 +108,7 @@ GRADED = {
 }
 
 
-# The steepest of all refinements stand for gentle ones.
+# The steepest refinement represents gentler ones.
 GENTLE = {"electrode edges, gentle", "electrode edges, steep"}
 SLOW = GENTLE | {"boundary nodes", "two refinements", "jumping size function"}
 CASES = [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in GRADED]
@@ -130,7 +131,7 @@ def test_graded_disks(name):
         assert np.linalg.norm(points - place, axis=1).min() < 1e-12
 
 
-def test_refinement_is_where_and_as_fine_as_asked():
+def test_requested_local_refinement():
     mesh = disk(0.1, cell_size=0.01, refine=Refine(EDGE_POINTS, cell_size=5e-4, growth=0.4))
     shape = quality(mesh)
     centre = np.asarray(mesh.points)[np.asarray(mesh.cells)].mean(axis=1)
@@ -192,7 +193,7 @@ def test_graded_rectangle_keeps_its_tags_and_boundary_nodes():
         assert lengths(mesh)[np.asarray(mesh.tags[name])].sum() == pytest.approx(length, rel=1e-12)
 
 
-def test_the_same_call_gives_the_same_mesh():
+def test_meshes_are_reproducible():
     first, second = (disk(0.1, num_points=400, refine=Refine(EDGE_POINTS, factor=5)) for _ in range(2))
     np.testing.assert_array_equal(first.points, second.points)
     np.testing.assert_array_equal(first.cells, second.cells)

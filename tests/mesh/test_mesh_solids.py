@@ -78,23 +78,23 @@ def test_box_has_six_tagged_faces():
     assert len(mesh.tags["side"]) == sum(len(mesh.tags[name]) for name in ("left", "right", "front", "back"))
 
 
-def test_cylinder_approaches_its_volume_and_is_well_shaped():
+def test_cylinder_converges_to_its_volume_with_good_cells():
     mesh = cylinder(0.1, 0.05, num_points=3000)
     assert mesh.num_points == pytest.approx(3000, rel=0.1)
-    # An inscribed 66-gon lacks (2π²/3)/66² = 0.15 % of the area.
+    # An inscribed 66-gon is smaller by (2π²/3)/66² = 0.15 % of the area.
     assert volume(mesh) == pytest.approx(np.pi * 0.01 * 0.05, rel=2.5e-3)
     assert surface(mesh) == pytest.approx(sum(surface(mesh, name) for name in ("bottom", "top", "side")), rel=1e-12)
-    # Three tetrahedra of a prism as high as it is wide have dihedral angles of 30° and more.
+    # The three tetrahedra of a prism as high as it is wide have dihedral angles of 30° and more.
     assert quality(mesh).smallest_angle.min() > 25
 
 
-def test_solids_take_the_refinement_of_the_plane():
+def test_solids_use_the_refinement_of_the_plane_mesh():
     mesh = cylinder(0.1, 0.02, cell_size=0.02, num_layers=2, refine=Refine([[0.1, 0.0]], cell_size=0.002))
     assert quality(mesh).shortest_edge.min() < 0.003
     assert len(np.unique(np.asarray(mesh.points)[:, 2])) == 3
 
 
-def test_plane_tags_become_parts_of_the_side():
+def test_tags_of_the_plane_mesh_become_tags_of_the_side():
     plane = rectangle(0.2, 0.1, num_points=30)
     mesh = layer(plane, 0.01, 1)
     assert set(mesh.tags) == {"bottom", "top", "side", "left", "right", "front", "back"}
@@ -116,8 +116,8 @@ FEW = {
 
 
 @pytest.mark.parametrize("name", FEW)
-def test_too_few_nodes_are_told_of_the_solid(name):
-    """Those asked for, not those of the plane mesh that it is made of; and as many as it says will do."""
+def test_error_for_too_few_nodes_states_those_of_the_solid(name):
+    """It states the requested number of nodes, not that of the plane mesh, and a number that is sufficient."""
     make, few = FEW[name]
     with pytest.raises(ValueError, match=rf"^num_points: .*\b{few}\b") as caught:
         make(few)

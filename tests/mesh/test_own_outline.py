@@ -1,4 +1,4 @@
-"""An outline made by a user, in one class: it goes wherever the built-in ones go."""
+"""A user-defined outline, in one class, works wherever the built-in ones do."""
 
 import xml.etree.ElementTree as ElementTree
 
@@ -26,7 +26,7 @@ matplotlib.use("Agg")
 
 
 class Stadium(Domain):
-    """All places within `radius` of the line from (-half, 0) to (half, 0), metres; arc length from the lower right."""
+    """All points within `radius` of the line from (-half, 0) to (half, 0), metres; arc length from the lower right."""
 
     half: float
     radius: float
@@ -92,18 +92,18 @@ def test_its_mesh_has_its_area_and_good_cells():
     mesh = STADIUM.mesh(num_points=600)
     corners = np.asarray(mesh.points)[np.asarray(mesh.cells)]
     area = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 2
-    # The mesh is inscribed, and its edge has about 75 nodes: the area falls short by 2/3 π²/75² of the round part.
+    # The mesh is inscribed with about 75 nodes on its edge: the area is smaller by 2/3 π²/75² of the round part.
     assert area == pytest.approx(STADIUM.area, rel=2e-3)
     assert mesh.num_points == pytest.approx(600, rel=0.06)
     assert quality(mesh).smallest_angle.min() >= 25
 
 
-def test_electrodes_on_its_edge_measure_what_a_stadium_measures(tmp_path):
+def test_voltages_of_electrodes_on_its_edge(tmp_path):
     electrodes = BoundaryElectrodes(perimeter(STADIUM, 8), 0.01, 1e-3)
     mesh = imaging_mesh(STADIUM, electrodes, 900)
     model = ForwardModel(mesh, electrodes, adjacent(8, current=1e-3))
     voltages = np.asarray(model.voltages(1.0))
-    # Half a turn about its middle takes every electrode to the fourth from it, and so each drive to the fourth.
+    # Half a turn about its middle maps every electrode to the fourth from it, and so each drive to the fourth.
     turned = voltages.reshape(8, -1)[[4, 5, 6, 7, 0, 1, 2, 3]].ravel()
     np.testing.assert_allclose(voltages, turned, rtol=0.02, atol=0.002 * np.abs(voltages).max())
     measured = Measurement(
@@ -117,7 +117,7 @@ def test_electrodes_on_its_edge_measure_what_a_stadium_measures(tmp_path):
     plt.close(axes.figure)
 
 
-def test_it_is_described_and_drawn():
+def test_its_description_and_drawing():
     assert describe_domain(STADIUM) == {"shape": "stadium", "half": 0.05, "radius": 0.04, "unit": "m"}
     path = outline_path(STADIUM)
     assert path.contains_point((0.085, 0.0))
@@ -139,7 +139,7 @@ def test_a_layout_on_it_is_written_and_read(ending, tmp_path):
         assert len(ElementTree.parse(path).findall(".//{*}g[@id='OUTLINE']/{*}polygon")) == 1
 
 
-def test_a_layout_beyond_it_is_refused():
+def test_a_layout_outside_of_it_is_refused():
     corner = [[0.085, 0.035], [0.0, 0.0]]
     assert Layout(corner, 0.005, outline=Rectangle(0.18, 0.08)).num_electrodes == 2
     with pytest.raises(ValueError, match="beyond the outline"):

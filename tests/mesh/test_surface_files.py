@@ -1,4 +1,4 @@
-"""Surfaces from files: scans, CAD, and what is wrong with them."""
+"""Surface meshes from files, such as scans and CAD, and faulty files."""
 
 import importlib.util
 import struct
@@ -29,8 +29,8 @@ def ascii_stl(path, mesh, scale):
     path.write_text("\n".join([*lines, "endsolid arm"]))
 
 
-def loose_obj(path, mesh, scale):
-    """Every triangle with corners of its own, coloured, and with texture and normals."""
+def unconnected_obj(path, mesh, scale):
+    """Write every triangle with corners of its own, with colours, texture and normals."""
     lines = ["# a scan", "o arm", "vt 0 0", "vn 0 0 1"]
     corners = scale * np.asarray(mesh.points)[np.asarray(mesh.cells)]
     lines += [f"v {x:.7g} {y:.7g} {z:.7g} 0.5 0.5 0.5" for x, y, z in corners.reshape(-1, 3)]
@@ -41,16 +41,16 @@ def loose_obj(path, mesh, scale):
 @pytest.mark.parametrize("mesh", [SLEEVE, BALL], ids=["open", "closed"])
 @pytest.mark.parametrize(
     ("name", "writer"),
-    [("a.stl", binary_stl), ("a.STL", ascii_stl), ("a.obj", loose_obj)],
+    [("a.stl", binary_stl), ("a.STL", ascii_stl), ("a.obj", unconnected_obj)],
     ids=["binary", "text", "obj"],
 )
-def test_loose_triangles_become_a_surface(mesh, name, writer, tmp_path):
+def test_unconnected_triangles_become_a_surface(mesh, name, writer, tmp_path):
     writer(tmp_path / name, mesh, 1000)
     back = read(tmp_path / name, scale=1e-3)
     assert (back.num_points, back.num_cells, back.num_facets) == (mesh.num_points, mesh.num_cells, mesh.num_facets)
     assert back.is_surface
     np.testing.assert_allclose(measures(back).sum(), measures(mesh).sum(), rtol=1e-5)
-    # Both are told outward, the open one by its file.
+    # Both are oriented outward, the open one by its file.
     np.testing.assert_allclose(np.asarray(normals(back)), np.asarray(normals(mesh)), atol=1e-4)
 
 
@@ -66,7 +66,7 @@ def test_round_trip(ending, tmp_path):
             np.testing.assert_array_equal(back.tags[name], index)
 
 
-def test_a_flat_sheet_becomes_two_dimensional_only_in_z(tmp_path):
+def test_a_flat_sheet_becomes_two_dimensional_only_at_constant_z(tmp_path):
     flat = bend(rectangle(0.2, 0.1, num_points=60), np.inf, axis="x")
     write(flat, tmp_path / "flat.vtu")
     assert not read(tmp_path / "flat.vtu").is_surface
@@ -114,7 +114,7 @@ def test_faults_of_files(tmp_path):
             read(tmp_path / "bad.stl")
 
 
-def test_polygons_and_corners_counted_back(tmp_path):
+def test_polygons_and_negative_indices(tmp_path):
     (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 1\nv 0 1 1\nf -4// -3// -2// \\\n -1//\n")
     mesh = read(tmp_path / "quad.obj")
     assert float(measures(mesh).sum()) == pytest.approx(np.sqrt(2))

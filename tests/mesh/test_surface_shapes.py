@@ -1,4 +1,4 @@
-"""Sleeves, spheres, bent sheets and shells: areas, volumes, normals, and what cannot be made."""
+"""Sleeves, spheres, bent sheets and shells: areas, volumes, normals, and impossible shapes."""
 
 import jax
 import numpy as np
@@ -37,7 +37,7 @@ def area(mesh):
 
 
 def order(make, exact, numbers=(100, 400, 1600)):
-    """The order in the edge's length at which areas or volumes converge, and the last relative error."""
+    """The order in the edge length at which areas or volumes converge, and the last relative error."""
     meshes = [make(number) for number in numbers]
     errors = [abs(area(mesh) / exact - 1) for mesh in meshes]
     return -2 * np.polyfit(np.log([mesh.num_cells for mesh in meshes]), np.log(errors), 1)[0], errors[-1]
@@ -45,7 +45,7 @@ def order(make, exact, numbers=(100, 400, 1600)):
 
 SMOOTH = {
     "tube": (lambda n: tube(0.04, 0.1, num_points=n), 2 * np.pi * 0.04 * 0.1),
-    # A truncated cone: π (r + R) times its slant.
+    # A truncated cone: π (r + R) times its slant height.
     "forearm": (lambda n: forearm(0.2, 0.025, 0.045, num_points=n), np.pi * 0.07 * np.hypot(0.2, 0.02)),
     "sphere": (lambda n: sphere(0.05, num_points=n), 4 * np.pi * 0.05**2),
     "cap": (lambda n: cap(0.05, 1.0, num_points=n), 2 * np.pi * 0.05**2 * (1 - np.cos(1.0))),
@@ -53,7 +53,7 @@ SMOOTH = {
 
 
 @pytest.mark.parametrize("name", SMOOTH)
-def test_areas_converge_and_normals_too(name):
+def test_areas_and_normals_converge(name):
     make, exact = SMOOTH[name]
     found, error = order(make, exact)
     assert found == pytest.approx(2, abs=0.15)
@@ -67,7 +67,7 @@ def test_areas_converge_and_normals_too(name):
 
 
 @pytest.mark.parametrize("name", ["tube", "sphere", "cap"])
-def test_normals_at_nodes_are_of_second_order(name):
+def test_normals_at_nodes_converge_at_second_order(name):
     errors = []
     for number in (200, 800, 3200):
         mesh = SMOOTH[name][0](number)
@@ -89,7 +89,7 @@ def test_an_oval_sleeve():
     assert edges.max() / edges.min() < 1.01
 
 
-def test_creases_keep_the_mean_of_their_sides():
+def test_normals_at_creases_are_the_mean_of_both_sides():
     cube = surface_of(box(0.1, 0.1, 0.1, cell_size=0.05))
     normal = node_normals(cube)
     corner = np.abs(np.asarray(cube.points) - [0.05, 0.05, 0.1]).max(axis=1).argmin()
@@ -101,7 +101,7 @@ def test_creases_keep_the_mean_of_their_sides():
     [(0.05, "x", SHEET), (-0.05, "y", SHEET), (0.05, "y", disk(0.1, num_points=200))],
     ids=["along x", "along y, upwards", "a disk"],
 )
-def test_bending_changes_no_length_and_no_voltage(radius, axis, mesh):
+def test_bending_changes_neither_lengths_nor_voltages(radius, axis, mesh):
     flat, bent = bend(mesh, np.inf, axis=axis), bend(mesh, radius, axis=axis)
     np.testing.assert_array_equal(flat.cells, bent.cells)
     np.testing.assert_allclose(measures(bent), measures(flat), rtol=1e-9)
@@ -122,7 +122,7 @@ def test_bending_changes_no_length_and_no_voltage(radius, axis, mesh):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
 
 
-def test_a_bent_sheet_without_cuts_is_the_sheet():
+def test_a_sheet_bent_without_cuts_keeps_its_topology():
     bent = bend(SHEET, 0.05, axis="x")
     np.testing.assert_array_equal(bent.cells, SHEET.cells)
     places = np.linspace(3, SHEET.num_points - 4, 8).astype(int)
@@ -134,8 +134,8 @@ def test_a_bent_sheet_without_cuts_is_the_sheet():
     np.testing.assert_allclose(np.hypot(bent.points[:, 1], bent.points[:, 2] + 0.05), 0.05, rtol=1e-12)
 
 
-def test_a_closed_sleeve_is_another_body():
-    """JoinedIndenters along its edge, a sheet conducts the other way round, too."""
+def test_a_closed_sleeve_differs_from_a_bent_sheet():
+    """When its edges are joined, a sheet also conducts the other way round."""
     closed = tube(0.2 / (2 * np.pi), 0.1, num_around=40)
     angles = 2 * np.pi * np.arange(8) / 8
     radius = 0.2 / (2 * np.pi)
@@ -147,8 +147,8 @@ def test_a_closed_sleeve_is_another_body():
     assert float(np.abs(sleeve - sheet).max() / np.abs(sheet).max()) > 0.3
 
 
-def test_current_along_a_sleeve_is_ohms():
-    """Between plates round its two ends the current is uniform, also on the triangles that lean to and fro."""
+def test_current_along_a_sleeve_obeys_ohms_law():
+    """Between plates round its two ends the current density is uniform, also on oblique triangles."""
     mesh = tube(0.04, 0.1, num_around=30)
     model = ForwardModel(
         mesh,
@@ -208,7 +208,7 @@ def test_a_shell_on_a_flat_sheet_is_a_layer():
     np.testing.assert_allclose(given.points, thick.points, atol=1e-12)
 
 
-def test_the_surface_of_a_solid():
+def test_surface_of_a_solid():
     surface = surface_of(box(0.2, 0.1, 0.05, cell_size=0.025))
     assert surface.num_facets == 0
     assert area(surface) == pytest.approx(2 * (0.02 + 0.01 + 0.005), rel=1e-12)
@@ -217,25 +217,25 @@ def test_the_surface_of_a_solid():
 
 
 @pytest.mark.parametrize("layers", [1, 3])
-def test_as_thick_as_told(layers):
-    """The largest thickness that an error tells is one that can be made, and a little more is not."""
+def test_the_largest_thickness_in_the_error_is_feasible(layers):
+    """The largest thickness that an error states can be made, and a slightly larger one cannot."""
     saddle = bend(SHEET, 0.05, axis="x")
     with pytest.raises(
         ValueError, match=r"radius of curvature .* at triangle \d+, near .* It can be \S+ m thick"
-    ) as told:
+    ) as caught:
         shell(saddle, 0.07, layers, outward=False)
-    most = float(str(told.value).split("It can be ")[1].split(" m")[0])
+    most = float(str(caught.value).split("It can be ")[1].split(" m")[0])
     assert most == pytest.approx(0.05, rel=0.02)
     shell(saddle, 0.99 * most, layers, outward=False)
     with pytest.raises(ValueError, match="radius of curvature"):
         shell(saddle, 1.01 * most, layers, outward=False)
 
 
-def test_the_thickness_told_is_not_the_one_refused():
+def test_the_stated_thickness_is_less_than_the_refused_one():
     sleeve = tube(0.03, 0.1, cell_size=5e-3)
-    with pytest.raises(ValueError, match="radius of curvature") as told:
+    with pytest.raises(ValueError, match="radius of curvature") as caught:
         shell(sleeve, 0.03, outward=False)
-    shell(sleeve, float(str(told.value).split("It can be ")[1].split(" m")[0]), outward=False)
+    shell(sleeve, float(str(caught.value).split("It can be ")[1].split(" m")[0]), outward=False)
 
 
 def test_a_thickness_in_another_unit_than_the_surface():
@@ -245,8 +245,8 @@ def test_a_thickness_in_another_unit_than_the_surface():
         shell(tube(0.03, 0.1, cell_size=5e-3), 3.0, outward=False)
 
 
-def test_a_skin_that_grows_into_itself():
-    """A sheet rolled up one and a half times, its turns 5 mm apart."""
+def test_a_skin_that_intersects_itself():
+    """A sheet rolled up one and a half times, with turns 5 mm apart."""
     flat = rectangle(0.1, 0.3, num_points=600)
     turn = (np.asarray(flat.points)[:, 1] / 0.3 + 0.5) * 3 * np.pi
     radius = 0.03 + 0.005 * turn / (2 * np.pi)
@@ -286,15 +286,15 @@ def test_faults(case):
         make()
 
 
-def test_refined_where_asked():
+def test_requested_local_refinement():
     fine = cap(0.05, 1.0, cell_size=0.01, refine=Refine([[0.0, 0.0]], cell_size=0.002))
     middle = np.linalg.norm(np.asarray(centroids(fine))[:, :2], axis=1)
     size = np.sqrt(np.asarray(measures(fine)))
     assert size[middle < 0.004].max() < 0.4 * size[middle > 0.03].mean()
 
 
-def test_shells_carry_voltages_that_have_derivatives():
-    """Of a bent layer, with respect to its nodes, by Taylor."""
+def test_voltages_of_shells_are_differentiable():
+    """Of a bent layer, with respect to its nodes, by Taylor remainders."""
     import equinox as eqx
 
     mesh = shell(bend(rectangle(0.1, 0.05, num_points=60), 0.05, axis="x"), 0.01, 1)

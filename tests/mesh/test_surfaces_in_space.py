@@ -1,4 +1,4 @@
-"""Triangles in space: measures, gradients, sides, edges, and what is wrong with surfaces that are none."""
+"""Triangles in space: measures, gradients, orientation, edges, and faulty surfaces."""
 
 import time
 
@@ -38,7 +38,7 @@ def ball(number, seed=0):
 
 
 def strip(turns, count=24, width=0.02):
-    """A closed strip with so many half turns in it: with one, a Möbius strip."""
+    """A closed strip with this number of half turns; with one, a Möbius strip."""
     angle = 2 * np.pi * np.arange(count) / count
     across = turns * angle / 2
     middle = 0.1 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
@@ -51,7 +51,7 @@ def strip(turns, count=24, width=0.02):
     return np.concatenate([middle - width / 2 * out, middle + width / 2 * out]), cells
 
 
-def test_a_plate_in_space_is_the_plate():
+def test_a_plate_in_space_equals_the_plane_plate():
     assert (PLATE.dimension, PLATE.space_dimension, PLATE.is_surface) == (2, 3, True)
     assert (FLAT.dimension, FLAT.space_dimension, FLAT.is_surface) == (2, 2, False)
     np.testing.assert_array_equal(PLATE.cells, FLAT.cells)
@@ -83,7 +83,7 @@ def test_voltages_and_jacobian_of_a_plate_in_space():
     scale = float(np.abs(flat.voltages(conductivity)).max())
     np.testing.assert_allclose(plate.voltages(conductivity), flat.voltages(conductivity), atol=1e-11 * scale)
     np.testing.assert_allclose(plate.jacobian(conductivity), flat.jacobian(conductivity), atol=1e-11 * scale)
-    # Tensors lie in the plane of each triangle; what they are across it does not matter.
+    # Tensors act in the plane of each triangle; their components across it do not matter.
     tensor = np.broadcast_to([[2.0, 0.3], [0.3, 0.7]], (FLAT.num_cells, 2, 2))
     turned = TURN[:, :2] @ tensor @ TURN[:, :2].T
     np.testing.assert_allclose(plate.voltages(turned), flat.voltages(tensor), atol=1e-11 * scale)
@@ -127,14 +127,14 @@ def test_batches_of_surfaces_are_loops():
     np.testing.assert_allclose(jax.jit(jax.vmap(moved))(steps), each, rtol=0, atol=1e-10 * np.abs(each).max())
 
 
-def test_neighbours_agree_and_closed_surfaces_face_outward():
+def test_orientation_of_neighbours_agrees_and_closed_surfaces_face_outward():
     points, cells = ball(500)
     rng = np.random.default_rng(5)
     mixed = np.where(rng.random(len(cells))[:, None] < 0.4, cells[:, ::-1], cells)
     mesh = Mesh.create(points, mixed)
     assert ((np.asarray(normals(mesh)) * np.asarray(centroids(mesh))).sum(axis=1) > 0).all()
     assert mesh.facets.shape == (0, 2)
-    # An open one keeps the side that most triangles gave, either.
+    # An open surface keeps the orientation of most of its triangles.
     for side in (1, -1):
         given = np.asarray(PLATE.cells)[:, ::side].copy()
         given[:20] = given[:20, ::-1]
@@ -142,13 +142,13 @@ def test_neighbours_agree_and_closed_surfaces_face_outward():
         np.testing.assert_allclose(normals(open_one), np.broadcast_to(side * TURN[:, 2], (len(given), 3)), atol=1e-12)
 
 
-def test_inside_out_is_told_and_turned():
+def test_inside_out_meshes_are_reported_and_turned():
     with pytest.warns(UserWarning, match="inside out"):
         mesh = Mesh.create(TETRAHEDRON, OUTWARD[:, ::-1])
     assert ((np.asarray(centroids(mesh)) - 0.025) * np.asarray(normals(mesh))).sum(axis=1).min() > 0
 
 
-def test_a_strip_with_a_whole_turn_is_a_surface():
+def test_a_strip_with_a_full_turn_is_a_surface():
     mesh = Mesh.create(*strip(2))
     starts = np.flatnonzero(np.asarray(mesh.facets)[1:, 0] != np.asarray(mesh.facets)[:-1, 1])
     assert len(starts) == 1  # two edges
@@ -208,12 +208,12 @@ def _pinched():
     points = np.concatenate([low, high])
     first, second = np.arange(7), np.arange(7) + 8
     cells = np.concatenate([np.stack([first, first + 1, second], 1), np.stack([first + 1, second + 1, second], 1)])
-    # The strip's last lower node becomes its first.
+    # The last lower node of the strip becomes its first.
     return np.delete(points, 7, axis=0), np.where(cells == 7, 0, np.where(cells > 7, cells - 1, cells))
 
 
 def _crossing(below):
-    """A sheet folded to a U whose one end is bent back to the other leaf, and through it."""
+    """A sheet folded to a U, with one end bent back to and through the other leaf."""
     x = [0.0, 0.1, 0.1, 0.05]
     z = [0.0, 0.0, 0.05, -below]
     points = np.array([[a, y, b] for a, b in zip(x, z, strict=True) for y in (0.0, 0.1)])
@@ -229,7 +229,7 @@ def test_faults(case):
         make()
 
 
-def test_millimetres_and_inches_are_noticed():
+def test_millimetres_and_inches_give_a_warning():
     with pytest.warns(UserWarning, match=r"millimetres.*inches.*scale="):
         Mesh.create(1000 * TETRAHEDRON, OUTWARD)
 
@@ -243,8 +243,8 @@ def test_twenty_thousand_triangles_are_checked_in_seconds():
     assert time.process_time() - begun < 5  # 0.7 s on two cores
 
 
-def test_crossings_are_found_among_cells_of_all_sizes():
-    """Two balls, one through the other's skin, joined by nothing but a seam far off: large and small triangles."""
+def test_intersections_are_detected_among_cells_of_all_sizes():
+    """Two intersecting balls, joined by nothing but a distant seam, with large and small triangles."""
     points, cells = ball(800)
     small, other = ball(400, seed=7)
     both = np.concatenate([points, 0.02 * small + [0.1, 0, 0]])

@@ -1,4 +1,5 @@
-"""Surfaces unfolded round places: lengths as in the plane where they can be laid into one; and where they cannot be."""
+"""Surfaces unfolded round places: distances as in the plane if the surface is developable, and the result if it is
+not."""
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ WEIGHTS = np.array([[1.0, 0, 0], [0.2, 0.3, 0.5]])
 
 
 def bent_and_flat(radius=0.03, axis="y", sheet=None):
-    """A sheet rolled round a cylinder, and the plane mesh with the same cells; and places on both."""
+    """A sheet rolled round a cylinder, the plane mesh with the same cells, and places on both."""
     sheet = rectangle(0.12, 0.1, cell_size=4e-3) if sheet is None else sheet
     bent, flat = bend(sheet, radius, axis=axis), bend(sheet, np.inf, axis=axis)
     plane = Mesh.create(np.asarray(flat.points)[:, :2], flat.cells)
@@ -28,7 +29,7 @@ def bent_and_flat(radius=0.03, axis="y", sheet=None):
 
 @pytest.mark.parametrize("axis", ["x", "y"])
 @pytest.mark.parametrize("radius", [0.025, -0.04, 0.5])
-def test_lengths_on_a_bent_sheet_are_those_on_the_flat_one(axis, radius):
+def test_lengths_on_a_bent_sheet_equal_those_on_the_flat_one(axis, radius):
     bent, plane, places, centres = on_host(bent_and_flat(radius, axis))
     around = unfold(bent, places, np.full((9, 1), 0.02))
     assert around.exact.all()
@@ -41,7 +42,7 @@ def test_lengths_on_a_bent_sheet_are_those_on_the_flat_one(axis, radius):
     np.testing.assert_allclose(found[known], exact[known], atol=1e-13)
 
 
-def test_discs_of_a_bent_sheet_are_those_of_the_flat_one():
+def test_discs_on_a_bent_sheet_equal_those_on_the_flat_one():
     bent, plane, places, centres = on_host(bent_and_flat())
     found = on_host(SurfaceDiscs(places, 5e-3, 1e-3)).contact(bent)
     exact = on_host(SheetDiscs(centres, 5e-3, 1e-3)).contact(plane)
@@ -50,7 +51,7 @@ def test_discs_of_a_bent_sheet_are_those_of_the_flat_one():
 
 
 @pytest.mark.slow
-def test_discs_in_a_batch_are_those_of_a_loop():
+def test_discs_in_a_batch_equal_those_of_a_loop():
     bent, _, places, _ = on_host(bent_and_flat())
     found = on_host(SurfaceDiscs(places, 5e-3, 1e-3)).contact(bent)
     through = SurfaceDiscs(places, 5e-3, 1e-3)
@@ -63,7 +64,7 @@ def test_discs_in_a_batch_are_those_of_a_loop():
 
 @jax.jit
 def load_and_slope(cells, points, nodes, places, along):
-    """Of discs on a surface whose nodes and places move."""
+    """Contact loads of discs on a surface whose nodes and places move, and their derivative."""
 
     def load(size):
         return SurfaceDiscs(places + size * along, 6e-3, 1e-3).contact(moved(cells, points + size * nodes)).load
@@ -78,8 +79,8 @@ def moved(surface, points):
 @pytest.mark.parametrize(
     "kind", ["bent", "domed", *(pytest.param(one, marks=pytest.mark.slow) for one in ("tube", "forearm", "sphere"))]
 )
-def test_contacts_have_derivatives_in_places_and_nodes(kind):
-    """On a sheet that is bent, and so laid into a plane, and on the same sheet as a dome, which cannot be."""
+def test_contacts_are_differentiable_in_places_and_nodes(kind):
+    """On a bent sheet, which is developable, and on the same sheet as a dome, which is not."""
     surface, dome = None, None
     if kind in ("bent", "domed"):
         surface, flat, _, _ = bent_and_flat()
@@ -103,7 +104,7 @@ def test_contacts_have_derivatives_in_places_and_nodes(kind):
     base, slope = load_and_slope(surface, points, nodes, np.asarray(places.points), along)
 
     def load(size):
-        """In NumPy."""
+        """The load in NumPy."""
         discs = on_host(SurfaceDiscs(np.asarray(places.points) + size * along, 6e-3, 1e-3))
         return discs.contact(on_host(moved(surface, points + size * nodes))).load
 
@@ -113,7 +114,7 @@ def test_contacts_have_derivatives_in_places_and_nodes(kind):
     assert errors[1] < 0.01 * 1e-5 * float(np.abs(slope).max())
 
 
-def test_says_where_a_surface_is_no_bent_sheet():
+def test_message_where_a_surface_is_no_bent_sheet():
     ball, sleeve, cone = (
         sphere(0.04, num_points=900),
         tube(0.03, 0.1, num_points=900),
@@ -131,8 +132,8 @@ def test_says_where_a_surface_is_no_bent_sheet():
         assert around.reached.sum() > 5
 
 
-def test_nothing_of_the_other_side_of_a_narrow_gap():
-    """Of a sheet bent so far that its edges all but meet."""
+def test_contacts_do_not_cross_a_narrow_gap():
+    """A sheet bent so far that its edges almost meet."""
     bent, plane, _, _ = bent_and_flat(0.0193, sheet=rectangle(0.12, 0.08, cell_size=4e-3))
     points = np.asarray(plane.points)
     at = np.abs(points - [0.057, 0.0]).sum(axis=1).argmin()

@@ -1,4 +1,4 @@
-"""The interactive view, drawn off screen: what is in the scene, and that there is something to be seen."""
+"""The interactive view, rendered off screen: the objects in the scene, and an image that is not empty."""
 
 import os
 import socket
@@ -32,20 +32,20 @@ window.Render()
 @pytest.fixture(scope="module")
 def pyvista():
     found = pytest.importorskip("pyvista", reason="PyVista is not installed (extra 'view')")
-    # VTK ends the process where it finds nothing to draw with: ask another.
+    # VTK ends the process if it finds no way to render, so test it in another process.
     tried = subprocess.run([sys.executable, "-c", _DRAWS], capture_output=True, timeout=120, env=os.environ)
     if tried.returncode:
         pytest.skip("VTK cannot draw off screen here")
     return found
 
 
-def test_without_pyvista_it_says_what_to_install(monkeypatch):
+def test_error_without_pyvista_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     with pytest.raises(ImportError, match=r"pip install 'jeit\[view\]'"):
         view_solid(TANK, IMAGE)
 
 
-def test_bad_input_is_said_before_pyvista_is_asked_for(monkeypatch):
+def test_invalid_input_is_refused_before_pyvista_is_imported(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     with pytest.raises(ValueError, match="values has shape"):
         view_solid(TANK, np.zeros(3))
@@ -61,8 +61,8 @@ def test_a_window_needs_a_display(monkeypatch):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="displays of X11 on Linux")
-def test_a_display_that_nothing_answers_at_is_none(monkeypatch):
-    """As a terminal keeps that of a screen that is gone: no window opened, and no pictures were made."""
+def test_a_display_that_does_not_answer_is_none(monkeypatch):
+    """A terminal may keep the name of a display that is gone: then no window opened and no pictures were made."""
     monkeypatch.setattr(interactive, "find_spec", lambda name: name)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":4242.0")
@@ -73,7 +73,7 @@ def test_a_display_that_nothing_answers_at_is_none(monkeypatch):
         assert can_view() == ""
 
 
-def test_the_scene_has_all_that_is_asked_for(pyvista, tmp_path):
+def test_the_scene_contains_every_requested_object(pyvista, tmp_path):
     ball = Inclusion(1, (0.03, -0.05, 0.1), 1e-4, 1e-3)
     form = SolidForm((0.0, 0.0, 0.085), ((0.03, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.085)), True)
     found = [ball, Inclusion(1, (0.0, 0.0, 0.085), 1e-4, 1e-3, form=form)]

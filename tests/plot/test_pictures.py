@@ -1,4 +1,4 @@
-"""Pictures, judged by what was drawn: colours, limits, labels, places."""
+"""Pictures of images and electrodes, checked by the drawn artists: colours, limits, labels, positions."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -64,7 +64,7 @@ def test_differences_are_centred_at_zero(mesh, electrodes, ax):
     assert colour_bar_label(ax) == "Change of sheet conductivity (mS)"
     red, _, blue, _ = cells.to_rgba(2.0)
     assert red > blue  # conductive is red
-    assert np.allclose(cells.to_rgba(0.0)[:3], 1, atol=0.05)  # nothing is white
+    assert np.allclose(cells.to_rgba(0.0)[:3], 1, atol=0.05)  # no change is white
 
 
 def test_conductivity_is_sequential_and_spans_its_range(mesh, ax):
@@ -75,11 +75,11 @@ def test_conductivity_is_sequential_and_spans_its_range(mesh, ax):
     assert colour_bar_label(ax) == "Conductivity (S/m)"
 
 
-def test_electrodes_stand_at_their_place_and_width(mesh, electrodes, ax):
+def test_electrodes_are_drawn_at_their_position_and_width(mesh, electrodes, ax):
     draw_electrodes(mesh, electrodes, ax=ax)
     (arcs,) = [c for c in ax.collections if isinstance(c, LineCollection)]
     for arc, position in zip(arcs.get_segments(), np.asarray(electrodes.position), strict=True):
-        # On a polygon inscribed in the circle: within the sagitta of an edge.
+        # On a polygon inscribed in the circle, within the sagitta of an edge.
         length = np.linalg.norm(np.diff(arc, axis=0), axis=1).sum()
         assert length == pytest.approx(0.012, rel=1e-6)
         assert np.linalg.norm(arc.mean(axis=0) - position) < 0.03 * RADIUS
@@ -97,8 +97,8 @@ OUTLINES = {
 
 
 @pytest.mark.parametrize("name", OUTLINES)
-def test_numbers_stand_outside_opposite_their_electrodes(name, ax):
-    """Along the normal, whatever the outline: 0.058 of its size from the electrode, and from the rest no less."""
+def test_numbers_are_outside_opposite_their_electrodes(name, ax):
+    """Along the normal of any outline: 0.058 of its size from the electrode, and no nearer to the rest."""
     outline = OUTLINES[name]
     places = perimeter(outline, 12, start=0.02)
     size = np.ptp(np.asarray(outline.mesh(num_points=200).points), axis=0).max()
@@ -109,7 +109,7 @@ def test_numbers_stand_outside_opposite_their_electrodes(name, ax):
         assert -outline.signed_distance(place[None])[0] == pytest.approx(0.058 * size, rel=1e-3)
 
 
-def test_numbers_in_a_narrow_notch_stand_inside_in_a_rim(ax):
+def test_numbers_in_a_narrow_notch_are_inside(ax):
     slit = Polygon([[0, 0], [0.2, 0], [0.2, 0.1], [0.102, 0.1], [0.102, 0.02], [0.098, 0.02], [0.098, 0.1], [0, 0.1]])
     electrodes = BoundaryElectrodes([[0.102, 0.06], [0.05, 0.0]], 0.01, 0.1)
     draw_electrodes(slit.mesh(num_points=300), electrodes, ax=ax)
@@ -121,14 +121,15 @@ def test_numbers_in_a_narrow_notch_stand_inside_in_a_rim(ax):
     assert not outside.get_path_effects()
 
 
-def test_circles_of_inclusions_are_of_their_area_or_volume(ax):
+def test_circles_of_inclusions_have_their_area_or_volume(ax):
     flat, round_ = Inclusion(1, (0.0, 0.0), np.pi * 0.02**2, 1.0), Inclusion(-1, (0.0, 0.0, 0.1), 4e-6 * np.pi / 3, 1.0)
     draw_inclusions([flat, round_], ax=ax)
     assert [patch.radius for patch in ax.patches] == pytest.approx([0.02, 0.01])
 
 
-def test_intervals_face_the_middle_and_do_not_cover_each_other(ax):
-    """Below a body in the upper half, above one in the lower half; on the other side where a label is already."""
+def test_intervals_are_placed_inward_without_overlap(ax):
+    """Below a body in the upper half, above one in the lower half, and on the other side if a label is there
+    already."""
     known = Quantities(2.0, (1.5, 2.5), 1e-4, (0.5e-4, 2e-4), 0.5e-4, (0.4e-4, 0.6e-4))
     angle = 2 * np.pi * np.arange(32) / 32
     round_body = 0.01 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -142,7 +143,7 @@ def test_intervals_face_the_middle_and_do_not_cover_each_other(ax):
     assert [one.get_va() for one in (upper, lower, beside)] == ["top", "bottom", "top"]
 
 
-def test_an_electrode_over_the_start_of_the_outline_is_one_piece(mesh, ax):
+def test_an_electrode_across_the_start_of_the_outline_is_one_line(mesh, ax):
     across = BoundaryElectrodes(jnp.array([[RADIUS, 0.0], [-RADIUS, 0.0]]), 0.02, 0.1)
     draw_electrodes(mesh, across, ax=ax)
     (arcs,) = [c for c in ax.collections if isinstance(c, LineCollection)]
@@ -151,12 +152,12 @@ def test_an_electrode_over_the_start_of_the_outline_is_one_piece(mesh, ax):
     assert arc[:, 1].min() == pytest.approx(-arc[:, 1].max(), rel=1e-6)
 
 
-def test_rings_round_a_tank_share_the_places_of_their_numbers(ax):
+def test_numbers_of_rings_round_a_tank_are_combined(ax):
     tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=1200)
     rings = np.concatenate([ring(RADIUS, 4, height=height) for height in (0.01, 0.03)])
     draw_electrodes(tank, FaceDiscs(rings, 0.008, 0.1), ax=ax)
     assert [text.get_text() for text in ax.texts] == ["1, 5", "2, 6", "3, 7", "4, 8"]
-    assert not [c for c in ax.collections if isinstance(c, PatchCollection)]  # on the wall a disc is seen from its side
+    assert not [c for c in ax.collections if isinstance(c, PatchCollection)]  # a disc on the wall is seen from its side
     draw_electrodes(tank, FacePatches(rings[:4], 0.01, 0.01, 0.1), ax=ax)
     assert not [c for c in ax.collections if isinstance(c, PatchCollection)]
 
@@ -168,7 +169,7 @@ def test_rings_round_a_tank_share_the_places_of_their_numbers(ax):
         pytest.param(Rectangle(0.15, 0.2), (4.0, 3.6), id="rectangle"),
     ],
 )
-def test_numbers_of_rings_lie_beside_their_electrodes(outline, inches, ax):
+def test_numbers_of_rings_are_beside_their_electrodes(outline, inches, ax):
     tank = Solid(outline, 0.04).mesh(num_points=600)
     level = ring(RADIUS, 16)
     if isinstance(outline, Rectangle):
@@ -187,14 +188,14 @@ def test_numbers_of_rings_lie_beside_their_electrodes(outline, inches, ax):
         assert ax.bbox.x0 <= box.x0 < box.x1 <= ax.bbox.x1  # not under the colour bar
 
 
-def test_a_slice_through_a_solid_has_its_outline(ax):
+def test_a_section_of_a_solid_has_its_outline(ax):
     tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=1200)
     plot_image(tank, np.zeros(tank.num_cells), ax=ax)
     (outline,) = [c for c in ax.collections if isinstance(c, ContourSet)]
     np.testing.assert_allclose(np.linalg.norm(outline.get_paths()[0].vertices, axis=1), RADIUS, rtol=0.02)
 
 
-def test_other_electrodes(ax):
+def test_other_kinds_of_electrodes(ax):
     sheet = rectangle(0.2, 0.1, num_points=200)
     combined = CombinedElectrodes(
         BoundaryElectrodes(jnp.array([[-0.1, 0.0]]), 0.02, 0.1), SheetDiscs([[0.0, 0.0]], 0.01, 0.1)
@@ -217,7 +218,7 @@ def test_electrodes_of_an_outline_with_a_hole(ax):
         np.testing.assert_allclose(arc[:, 0], x, atol=1e-12)
 
 
-def test_scale_bar_is_as_long_as_it_says(mesh, ax):
+def test_length_of_the_scale_bar(mesh, ax):
     plot_image(mesh, np.ones(mesh.num_cells), ax=ax)
     (bar,) = ax.lines
     assert np.ptp(bar.get_xdata()) == pytest.approx(0.02)
@@ -231,7 +232,7 @@ def test_inclusions_are_marked(mesh, ax):
     assert circle.get_radius() == pytest.approx(0.01)
 
 
-def test_raster_lies_as_its_extent_says(ax):
+def test_extent_of_rasters(ax):
     raster = np.full((4, 8), np.nan)
     raster[0, 0] = -5.0
     plot_raster(raster, (0.0, 0.08, 0.0, 0.04), ax=ax)
@@ -252,30 +253,30 @@ def test_slice_of_a_solid(ax):
         plot_image(solid, lower, height=1.0)
 
 
-@pytest.mark.parametrize(("number", "titles"), [(4, 2), (5, 2), (6, 3)])
-def test_too_few_frames_have_no_spectrum(mesh, number, titles):
-    """Five have one frequency, which is no line."""
+@pytest.mark.parametrize(("number", "further"), [(4, 2), (5, 2), (6, 3)])
+def test_too_few_frames_have_no_spectrum(mesh, number, further):
+    """Five frames have a single frequency, which is no line."""
     swing = np.cos(np.arange(number))[:, None] * np.ones(mesh.num_cells)
     drawn = plot_series(ImageSeries(mesh, swing, 0.1 * np.arange(number)), {"all": np.ones(mesh.num_cells, bool)})
-    said = [ax.get_title() for ax in drawn.axes if ax.get_title()]
-    assert said[:number] == [f"{one:.2f} s" for one in 0.1 * np.arange(number)]
-    assert said[number:] == ["functional image", "regions over time", "their spectra"][:titles]
-    assert all(len(ax.lines[0].get_xdata()) > 1 for ax in drawn.axes if ax.get_title() in said[number + 1 :])
+    titles = [ax.get_title() for ax in drawn.axes if ax.get_title()]
+    assert titles[:number] == [f"{one:.2f} s" for one in 0.1 * np.arange(number)]
+    assert titles[number:] == ["functional image", "regions over time", "their spectra"][:further]
+    assert all(len(ax.lines[0].get_xdata()) > 1 for ax in drawn.axes if ax.get_title() in titles[number + 1 :])
 
 
-def test_a_functional_image_of_a_solid_says_where_it_is_cut():
+def test_a_functional_image_of_a_solid_states_the_plane():
     tank = Solid(Disk(RADIUS), 0.04).mesh(num_points=600)
     series = ImageSeries(tank, np.ones((2, tank.num_cells)), np.arange(2.0))
-    for height, said in ((None, "20.0"), (0.03, "30.0")):
+    for height, place in ((None, "20.0"), (0.03, "30.0")):
         titles = [ax.get_title() for ax in plot_series(series, {}, height=height).axes]
-        assert f"functional image, slice at z = {said} mm" in titles
+        assert f"functional image, slice at z = {place} mm" in titles
 
 
-def test_sensitivity_is_least_in_the_middle(mesh, electrodes, ax):
+def test_sensitivity_is_lowest_in_the_middle(mesh, electrodes, ax):
     plot_sensitivity(ForwardModel(mesh, electrodes, adjacent(8)), 1e-3, ax=ax)
     (cells,) = [c for c in ax.collections if c.get_array() is not None]
     middle = np.argmin(np.linalg.norm(np.asarray(centroids(mesh)), axis=1))
-    assert cells.get_array()[middle] < -20  # decibels under the edge: adjacent drives hardly see the middle
+    assert cells.get_array()[middle] < -20  # decibels relative to the edge: adjacent drives hardly reach the middle
     assert cells.get_array().max() == 0
 
 
@@ -296,7 +297,7 @@ def test_masked_channels_are_left_out(ax):
     np.testing.assert_array_equal(ax.child_axes[0].lines[0].get_xdata(), [0, 2])
 
 
-def test_a_figure_is_made_where_no_axes_are_given(mesh, electrodes):
+def test_a_figure_is_made_without_axes(mesh, electrodes):
     import matplotlib
 
     matplotlib.use("Agg")

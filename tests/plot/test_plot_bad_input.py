@@ -1,4 +1,4 @@
-"""What pictures say of things of another kind, before any axes are made."""
+"""Plot functions refuse arguments of another type before any axes are made."""
 
 import matplotlib
 import numpy as np
@@ -58,7 +58,7 @@ SKIN = Rectangle(0.2, 0.2)
         (lambda: plot_travel(MAP), "optimisation must be an Optimisation"),
     ],
 )
-def test_things_of_another_kind_are_refused(draw, message):
+def test_arguments_of_another_type_are_refused(draw, message):
     pyplot.close("all")
     with pytest.raises(ValueError, match=message):
         draw()

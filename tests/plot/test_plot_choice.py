@@ -1,4 +1,4 @@
-"""The pictures of parameter choice, judged by what was drawn: the curve, the point, the names."""
+"""Pictures of hyperparameter choices, checked by the drawn artists: the curve, the point, the names."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +16,7 @@ from jeit.plot.imaging.hyperparameter import COLOURS
 
 @pytest.fixture(scope="module")
 def choices():
-    """Of a problem with as many unknowns as the mesh has cells, and eigenvalues over six decades."""
+    """Choices for a diagonal problem with as many unknowns as the mesh has cells, and eigenvalues over six decades."""
     mesh = disk(0.1, num_points=60)
     rng = np.random.default_rng(0)
     directions = np.linalg.qr(rng.normal(size=(mesh.num_cells, 12)))[0].T
@@ -42,7 +42,7 @@ def points(ax):
 
 
 @pytest.mark.parametrize("rule", [name for name in RULES if name != "l-curve"])
-def test_one_rule_is_its_criterion_against_the_hyperparameter(rule, choices, ax):
+def test_one_rule_shows_its_criterion_against_the_hyperparameter(rule, choices, ax):
     choice = choices[rule]
     assert plot_choice(choice, ax=ax) is ax
     x, y = ax.lines[0].get_data()
@@ -57,7 +57,7 @@ def test_one_rule_is_its_criterion_against_the_hyperparameter(rule, choices, ax)
         assert any(np.allclose(line.get_ydata(), choice.target) for line in ax.lines)
 
 
-def test_the_l_curve_is_penalty_against_residual(choices, ax):
+def test_the_l_curve_shows_penalty_against_residual(choices, ax):
     choice = choices["l-curve"]
     plot_choice(choice, ax=ax)
     x, y = ax.lines[0].get_data()
@@ -70,7 +70,7 @@ def test_the_l_curve_is_penalty_against_residual(choices, ax):
     assert "Penalty" in ax.get_ylabel()
 
 
-def test_several_are_marked_on_one_l_curve_with_a_panel_each(choices, ax):
+def test_several_rules_are_marked_on_one_l_curve_with_a_panel_each(choices, ax):
     everything = {**choices, "mine": Choice.given(float(choices["gcv"].hyperparameter))}
     plot_choice(everything, ax=ax)
     curve, *panels = ax.child_axes
@@ -83,8 +83,8 @@ def test_several_are_marked_on_one_l_curve_with_a_panel_each(choices, ax):
         assert sum(np.ptp(line.get_xdata()) == 0 and np.size(line.get_xdata()) == 2 for line in panel.lines) == 6
 
 
-def test_names_on_the_l_curve_are_apart(choices, ax):
-    """Decades of λ that change nothing lie on one point of the curve: one of them is named."""
+def test_labels_on_the_l_curve_do_not_overlap(choices, ax):
+    """Decades of λ without effect lie on one point of the curve, and only one of them is labelled."""
     plot_choice(choices["l-curve"], ax=ax)
     ax.figure.draw_without_rendering()
     decades = [text for text in ax.texts if "10^" in text.get_text()]
@@ -95,7 +95,7 @@ def test_names_on_the_l_curve_are_apart(choices, ax):
         assert box.x0 > ax.get_window_extent().x0
 
 
-def test_a_choice_at_the_edge_is_hollow_and_says_so(choices, ax):
+def test_a_choice_at_the_edge_is_hollow_with_a_note(choices, ax):
     choice = choices["gcv"]
     edge = Choice.among("gcv", choice.candidates, 0, choice.criterion, (choice.residual, choice.penalty))
     plot_choice(edge, ax=ax)
@@ -112,6 +112,6 @@ def test_without_data_there_is_no_l_curve(choices, ax):
 
 
 @pytest.mark.parametrize("choices", [Choice.given(1.0), {"given": Choice.given(1.0)}, {}], ids=["one", "some", "none"])
-def test_a_given_number_has_nothing_to_draw(choices, ax):
+def test_a_given_number_is_refused(choices, ax):
     with pytest.raises(ValueError, match="curve"):
         plot_choice(choices, ax=ax)

@@ -1,4 +1,4 @@
-"""The picture of the figures of merit: what is drawn, in which unit, and what is refused."""
+"""The picture of the figures of merit: its plots, units and refused input."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,7 +10,8 @@ from jeit.plot import plot_figures_of_merit
 
 
 def merit(error):
-    """Of targets at 0, 20, 20 and 40 mm in a body of 100 mm radius; the last one is not seen."""
+    """Figures of targets at 0, 20, 20 and 40 mm in a body of 100 mm radius; the last one does not appear in the
+    image."""
     distance = jnp.array([0.0, 0.02, 0.02, 0.04])
     value = jnp.array([0.1, 0.2, 0.4, jnp.nan])
     return FiguresOfMerit(jnp.ones(4), error * jnp.ones(4), value, value, value, distance, jnp.full(4, 0.1))

@@ -1,4 +1,4 @@
-"""Surfaces and solids in space, judged by what was drawn: order, colours, places."""
+"""Surfaces and solids in space, checked by the drawn artists: order, colours, positions."""
 
 import numpy as np
 import pytest
@@ -51,13 +51,13 @@ def pieces(ax) -> PolyCollection:
         ((-90, 90), (0, 0, 1), (1, 0, 0), (0, 1, 0)),
     ],
 )
-def test_cameras_look_where_they_are_told(angles, toward, right, up):
+def test_camera_directions(angles, toward, right, up):
     camera = Camera(*angles)
     for seen, wanted in ((camera.toward, toward), (camera.right, right), (camera.up, up)):
         np.testing.assert_allclose(seen, wanted, atol=1e-15)
 
 
-def test_what_is_nearer_is_drawn_later(ax):
+def test_nearer_pieces_are_drawn_later(ax):
     points = np.array([[0, 0, z] for z in (0.3, 0.1, 0.2)])[:, None] + [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     scene = Scene(Camera(0, 90))
     for k, colour in enumerate(np.eye(3)):
@@ -66,13 +66,13 @@ def test_what_is_nearer_is_drawn_later(ax):
     np.testing.assert_allclose(pieces(ax).get_facecolor()[:, :3], np.eye(3)[[1, 2, 0]])
 
 
-def test_lengths_across_the_view_are_true(ax):
+def test_lengths_across_the_view_are_to_scale(ax):
     camera = Camera(33, 47)
     ends = np.stack([np.zeros(3), 0.05 * camera.up])
     np.testing.assert_allclose(camera.on_page(ends)[1], [0, 0.05], atol=1e-15)
 
 
-def test_values_become_colours_and_the_light_does_not_change_which(ax):
+def test_shading_does_not_change_the_sign_of_colours(ax):
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.2]])
     plot_surface(points, [[0, 1, 2], [1, 3, 2]], [2e-3, -2e-3], ax=ax)
     red, blue = sorted(pieces(ax).get_facecolor(), key=lambda colour: colour[2])
@@ -95,7 +95,7 @@ def test_a_surface_without_values_has_no_colour_bar(ax):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ((np.zeros((3, 2)), [[0, 1, 2]]), "points has shape"),
         ((np.full((3, 3), np.nan), [[0, 1, 2]]), "points must be finite"),
@@ -106,18 +106,18 @@ def test_a_surface_without_values_has_no_colour_bar(ax):
         ((np.eye(3), [[0, 1, 2]], [np.inf]), "finite"),
     ],
 )
-def test_surfaces_that_cannot_be(arguments, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_surfaces(arguments, message):
+    with pytest.raises(ValueError, match=message):
         plot_surface(*arguments)
 
 
 @pytest.mark.parametrize("angles", [(np.nan, 0), ("left", 0), (0, 91)])
-def test_cameras_that_cannot_be(angles):
+def test_invalid_cameras(angles):
     with pytest.raises(ValueError, match=r"azimuth|elevation"):
         Camera(*angles)
 
 
-def test_scales_and_cameras_of_another_kind():
+def test_scales_and_cameras_of_another_type():
     with pytest.raises(ValueError, match="camera must be a Camera"):
         plot_surface(np.eye(3), [[0, 1, 2]], camera=30)
     with pytest.raises(ValueError, match="scale must be"):
@@ -135,7 +135,7 @@ def tank():
 
 @pytest.fixture(scope="module")
 def image(tank):
-    """A conductive ball and a resistive one, half as strong."""
+    """A conductive ball and a resistive one of half its strength."""
     place = np.asarray(centroids(tank))
     balls = [np.exp(-(np.linalg.norm(place - middle, axis=1) ** 2) / 0.03**2) for middle in MIDDLES]
     return 2e-3 * balls[0] - 1e-3 * balls[1]
@@ -154,7 +154,7 @@ def shown(ax) -> list[str]:
 
 
 def area(corners):
-    """Of a polygon in space."""
+    """Area of a polygon in space."""
     return 0.5 * np.linalg.norm(sum(np.cross(a, b) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)))
 
 
@@ -176,10 +176,10 @@ def test_strips_are_bent_round_a_cylinder():
     (corners,) = shapes_of(tank, FacePatches([[0.075, 0.0, 0.05]], 0.05, 0.08, 1e-3)).polygons()
     radius = np.hypot(corners[:, 0], corners[:, 1])
     assert np.abs(radius - 0.075).max() < 1e-3
-    assert np.ptp(corners[:, 0]) > 0.003  # a flat one would leave the wall by 4.3 mm
+    assert np.ptp(corners[:, 0]) > 0.003  # a flat one would be 4.3 mm off the wall
 
 
-def test_facets_points_and_parts_are_drawn_as_what_they_are(tank):
+def test_facets_points_and_segments_are_drawn_by_their_kind(tank):
     faces = shapes_of(tank, plates(tank, ["left", "right"], 1e-3))
     total = [sum(area(one) for one, k in zip(faces.polygons(), faces.electrode, strict=True) if k == e) for e in (0, 1)]
     np.testing.assert_allclose(total, BOX[1] * BOX[2])
@@ -198,7 +198,7 @@ def test_arcs_of_a_sheet_are_lines_along_its_edge():
 
 
 def nearness_of(ax, colour) -> np.ndarray:
-    """Where in the order of drawing the pieces lie whose face is about a colour."""
+    """Positions in the drawing order of the pieces whose face has about this colour."""
     faces = pieces(ax).get_facecolor()
     return np.flatnonzero(colour(faces))
 
@@ -207,7 +207,7 @@ def is_metal(faces):
     return (faces[:, 0] > 1.3 * faces[:, 1]) & (faces[:, 1] > 3 * faces[:, 2]) & (faces[:, 3] == 1)
 
 
-def test_electrodes_in_front_are_over_what_is_inside_and_those_behind_under_it(tank, image, patches, ax):
+def test_electrodes_in_front_are_drawn_after_the_interior_and_those_behind_before_it(tank, image, patches, ax):
     camera = Camera(azimuth=0, elevation=0)
     plot_isosurfaces(tank, image, patches, camera=camera, scale=ColourScale(bar=False), ax=ax)
     metal = nearness_of(ax, is_metal)
@@ -215,18 +215,18 @@ def test_electrodes_in_front_are_over_what_is_inside_and_those_behind_under_it(t
     drawn, seen = pieces(ax).get_paths(), []
     for k in metal:
         seen.append((drawn[k].vertices[:, 0].mean(), k > inside.max(), k < inside.min()))
-    # Patches 1 and 2 are on the wall looked at, 4 on the one behind; 3 is seen edge on.
+    # Patches 1 and 2 are on the front wall and 4 on the back wall; 3 is seen from its edge.
     for place, wanted in ((0.04, (True, False)), (-0.01, (False, True))):
         on_it = {one[1:] for one in seen if abs(one[0] - place) < 0.006}
         assert on_it == {wanted}
 
 
-def test_one_looks_through_electrodes_that_hide_a_body(tank, image, ax):
+def test_electrodes_that_hide_a_body_are_transparent(tank, image, ax):
     whole = plates(tank, ["left", "right", "front", "back", "bottom", "top"], 1e-3)
     plot_isosurfaces(tank, image, whole, camera=Camera(), scale=ColourScale(bar=False), ax=ax)
     brown = pieces(ax).get_facecolor()
     brown = brown[(brown[:, 0] > 1.3 * brown[:, 1]) & (brown[:, 1] > 3 * brown[:, 2])]
-    # Three faces in front as glass, drawn last, and three behind.
+    # Three transparent faces in front, drawn last, and three behind.
     assert set(np.round(brown[-100:, 3], 2)) == {0.16}
     assert set(np.round(brown[:100, 3], 2)) == {1.0}
     assert np.mean(brown[:, 3] < 1) == pytest.approx(0.5, abs=0.1)
@@ -246,7 +246,7 @@ def test_each_sign_has_its_own_surface(tank, image):
     assert 5e-3 < value < 6.5e-3
 
 
-def test_a_slice_has_the_colours_of_the_cells_it_passes(tank, image, patches, ax):
+def test_a_slice_has_the_colours_of_the_cells_that_it_cuts(tank, image, patches, ax):
     plot_slice(tank, image, Plane.at("x", 0.03), patches, ax=ax)
     (cells,) = [one for one in ax.collections if isinstance(one, PolyCollection)]
     values = np.asarray(cells.get_array())
@@ -258,7 +258,7 @@ def test_a_slice_has_the_colours_of_the_cells_it_passes(tank, image, patches, ax
     assert {"y", "z", "50 mm"} <= set(shown(ax))
 
 
-def test_a_slice_shows_electrodes_that_it_passes_and_cuts_balls(tank, image, patches, ax):
+def test_a_slice_shows_the_electrodes_and_balls_that_it_cuts(tank, image, patches, ax):
     inclusions = [Inclusion(1, (0.03, -0.05, 0.1), 4 / 3 * np.pi * 0.03**3, 1e-3)]
     plot_slice(tank, image, Plane.at("z", 0.1 + 0.018), patches, inclusions=inclusions, ax=ax)
     assert "2" in shown(ax)
@@ -271,7 +271,7 @@ def test_a_slice_shows_electrodes_that_it_passes_and_cuts_balls(tank, image, pat
     assert not other.patches
 
 
-def test_bodies_that_were_fitted_are_outlined_as_what_they_are(tank, image, ax):
+def test_fitted_bodies_are_outlined_by_their_shapes(tank, image, ax):
     form = SolidForm((0.02, -0.05, 0.085), ((0.03, 0.0, 0.0), (0.0, 0.01, 0.0), (0.0, 0.0, 0.085)), True)
     column = Inclusion(1, (0.02, -0.05, 0.085), 1e-4, 1e-3, form=form, contrast_interval=(1.5, None))
     plot_slice(tank, image, Plane.at("z", 0.02), inclusions=[column], ax=ax)
@@ -299,11 +299,11 @@ def test_grids_have_one_scale(tank, image, patches):
     assert len(limits) == 1
     assert len({panel.get_xlim() for panel in panels}) == 1
     assert figure.axes[-1].get_ylabel() == "Change of conductivity (mS/m)"
-    told = plot_slices(tank, image, axis="z", at=[0.02, 0.03])
-    assert [one.get_title() for one in told.axes if one.get_title()] == ["z = 20 mm", "z = 30 mm"]
+    figure = plot_slices(tank, image, axis="z", at=[0.02, 0.03])
+    assert [one.get_title() for one in figure.axes if one.get_title()] == ["z = 20 mm", "z = 30 mm"]
 
 
-def test_the_overview_cuts_through_what_is_strongest(tank, image, patches):
+def test_the_overview_cuts_through_the_strongest_change(tank, image, patches):
     figure = plot_solid(tank, image, patches)
     titles = {one.get_title() for one in figure.axes} - {""}
     strongest = np.asarray(centroids(tank))[np.abs(image).argmax()]
@@ -323,7 +323,7 @@ def test_a_constant_image_is_drawn(tank):
 
 
 @pytest.mark.parametrize(
-    ("draw", "said"),
+    ("draw", "message"),
     [
         (lambda tank: plot_isosurfaces(tank, np.zeros(tank.num_cells), levels=(1.5,)), "levels must be shares"),
         (lambda tank: plot_isosurfaces(tank, np.zeros(tank.num_cells), levels=()), "levels must be shares"),
@@ -338,8 +338,8 @@ def test_a_constant_image_is_drawn(tank):
         (lambda tank: plot_solid(disk(0.1, num_points=50), np.zeros(70)), "plane mesh"),
     ],
 )
-def test_solids_that_cannot_be_drawn(tank, draw, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_solids(tank, draw, message):
+    with pytest.raises(ValueError, match=message):
         draw(tank)
 
 
@@ -352,7 +352,7 @@ def test_electrodes_on_a_surface_are_numbered_and_those_behind_it_hidden():
     plot_surface(sleeve.points, wall, None, shapes, camera=Camera(0, 0), ax=ax)
     metal = np.flatnonzero(is_metal(pieces(ax).get_facecolor()))
     number = len(pieces(ax).get_facecolor())
-    # Half of the pieces of metal come first, under the wall in front, and half last.
+    # Half of the pieces of electrodes come first, under the front wall, and half last.
     assert (metal < 0.45 * number).sum() == (metal > 0.55 * number).sum() == len(metal) / 2
     assert {"1"} <= set(shown(ax))
     assert "2" not in shown(ax)
@@ -360,16 +360,17 @@ def test_electrodes_on_a_surface_are_numbered_and_those_behind_it_hidden():
         plot_surface(sleeve.points, wall, None, FaceDiscs(places, 0.012, 1e-3))
 
 
-def test_electrodes_behind_each_other_share_a_place_for_their_numbers(ax):
+def test_electrodes_behind_each_other_share_a_label(ax):
     rings = np.concatenate([ring(0.05, 8, height=height) for height in (0.01, 0.03)])
     body = cylinder(0.05, 0.04, num_points=600)
     plot_isosurfaces(body, np.zeros(body.num_cells), FaceDiscs(rings, 0.006, 1e-3), camera=Camera(-90, 90), ax=ax)
-    told = {one for one in shown(ax) if one[:1].isdigit() and "mm" not in one}
-    assert told == {f"{k}, {k + 8}" for k in range(1, 9)}
+    labels = {one for one in shown(ax) if one[:1].isdigit() and "mm" not in one}
+    assert labels == {f"{k}, {k + 8}" for k in range(1, 9)}
 
 
-def test_numbers_behind_each_other_stand_beside_the_body(tank):
-    """From the front, of walls seen from their edge: away from the body, runs of numbers from first to last."""
+def test_labels_of_electrodes_behind_each_other_are_beside_the_body(tank):
+    """Seen from the front, walls appear from their edge: labels are outside of the body, as ranges from first to
+    last."""
     low, high = np.asarray(tank.points).min(axis=0), np.asarray(tank.points).max(axis=0)
     sides = [[x, y, 0.5 * (low[2] + high[2])] for x in (low[0], high[0]) for y in np.linspace(low[1], high[1], 6)[1:-1]]
     ax = Figure().subplots()
@@ -382,24 +383,24 @@ def test_numbers_behind_each_other_stand_beside_the_body(tank):
     assert found["5–8"][1] == "left"
 
 
-def test_a_group_of_facets_has_one_rim(tank, ax):
+def test_a_group_of_facets_has_one_outline(tank, ax):
     plot_isosurfaces(tank, np.zeros(tank.num_cells), plates(tank, ["top"], 1e-3), camera=Camera(0, 90), ax=ax)
     lines = np.abs(np.array(pieces(ax).get_linewidths()) - 0.5) < 1e-9
     edges = np.array([np.linalg.norm(np.ptp(one.vertices, axis=0)) for one in np.array(pieces(ax).get_paths())[lines]])
     assert edges.sum() == pytest.approx(2 * (BOX[0] + BOX[1]))
     faces = pieces(ax).get_facecolor()
     hull = np.flatnonzero((faces[:, 3] > 0) & (faces[:, 3] < 0.2))
-    assert np.flatnonzero(is_metal(faces)).min() > hull.max()  # over the wall that it is on
+    assert np.flatnonzero(is_metal(faces)).min() > hull.max()  # outside of its wall
 
 
-def test_electrodes_on_the_far_side_are_under_the_wall_that_they_are_on(tank, ax):
+def test_electrodes_on_the_far_side_are_under_their_wall(tank, ax):
     plot_isosurfaces(tank, np.zeros(tank.num_cells), plates(tank, ["bottom"], 1e-3), camera=Camera(0, 90), ax=ax)
     faces = pieces(ax).get_facecolor()
     hull = np.flatnonzero((faces[:, 3] > 0) & (faces[:, 3] < 0.2))
     assert np.flatnonzero(is_metal(faces)).max() < hull.min()
 
 
-def test_the_legend_of_a_curved_skin_is_clear_of_the_axes_letters(ax):
+def test_the_legend_of_a_curved_skin_does_not_overlap_axis_labels(ax):
     layout = SurfaceLayout.spread(tube(0.03, 0.12, num_points=150), 6, 8e-3)
     marks = {"touched": [[0.03, 0.0, 0.06]], "found": [[0.0, -0.03, 0.06]]}
     for elevation in (25, 60):

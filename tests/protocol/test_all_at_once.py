@@ -1,4 +1,4 @@
-"""Currents on all electrodes at once: Haar, optimal, and what is read of all potentials."""
+"""Currents on all electrodes: Haar and optimal patterns, and measurements of all potentials."""
 
 import numpy as np
 import pytest
@@ -49,26 +49,26 @@ def test_haar_of_a_power_of_two():
     np.testing.assert_array_equal(protocol.haar(8, current=1.0).drive, expected)
 
 
-def test_the_best_currents_of_a_disk_are_trigonometric(bodies):
-    """Isaacson 1986: the eigenvectors of a disk's transfer impedance, in pairs of a frequency each."""
+def test_optimal_currents_of_a_disk_are_trigonometric(bodies):
+    """Isaacson 1986: the eigenvectors of a disk's transfer impedance, in pairs of one frequency each."""
     best = unit(np.asarray(protocol.optimal(bodies[0]).drive))
     waves = unit(np.asarray(protocol.trigonometric(NUMBER).drive))
     for pair in range(5):
         rows = slice(2 * pair, 2 * pair + 2)
-        # Both span the same plane; the mesh is no disk to 1e-2.
+        # Both pairs span the same plane; the mesh approximates a disk to 1e-2.
         np.testing.assert_allclose(np.linalg.svd(best[rows] @ waves[rows].T)[1], 1, atol=1e-2)
 
 
-def test_no_current_tells_two_bodies_better(bodies):
+def test_optimal_currents_distinguish_two_bodies_best(bodies):
     first, second = bodies
     chosen = np.asarray(protocol.optimal(first, second, current=1e-3).drive)
-    told = [np.linalg.norm((first - second) @ one) / np.linalg.norm(one) for one in chosen]
+    distinguishability = [np.linalg.norm((first - second) @ one) / np.linalg.norm(one) for one in chosen]
     largest = np.linalg.svd(first - second)[1]
-    np.testing.assert_allclose(told[:5], largest[:5], rtol=1e-7)
+    np.testing.assert_allclose(distinguishability[:5], largest[:5], rtol=1e-7)
     np.testing.assert_allclose(np.abs(chosen).max(axis=1), 1e-3)
 
 
-def test_no_current_of_a_power_tells_two_bodies_better(bodies):
+def test_optimal_currents_at_fixed_power_distinguish_two_bodies_best(bodies):
     first, second = bodies
     chosen = np.asarray(protocol.optimal(first, second, power=1e-6).drive)
     np.testing.assert_allclose([one @ first @ one for one in chosen], 1e-6)
@@ -77,19 +77,19 @@ def test_no_current_of_a_power_tells_two_bodies_better(bodies):
     others[:500] = chosen[0] + 3e-4 * others[:500] * np.abs(chosen[0]).max()
     others -= others.mean(axis=1, keepdims=True)
     others *= np.sqrt(1e-6 / np.einsum("si,ij,sj->s", others, first, others))[:, None]
-    told = np.linalg.norm(others @ (first - second), axis=1)
-    assert told.max() < best
-    assert told.max() > (1 - 1e-5) * best  # those beside it are hardly worse
+    distinguishability = np.linalg.norm(others @ (first - second), axis=1)
+    assert distinguishability.max() < best
+    assert distinguishability.max() > (1 - 1e-5) * best  # neighbouring currents are almost as good
 
 
-def test_a_number_of_them_are_the_first(bodies):
+def test_a_given_number_selects_the_first_currents(bodies):
     some, every = protocol.optimal(*bodies, number=3), protocol.optimal(*bodies)
     np.testing.assert_array_equal(some.drive, np.asarray(every.drive)[:3])
     assert some.num_measurements == 3 * NUMBER
 
 
 @pytest.mark.parametrize("measurement", ["adjacent", "mean", "mean-removed", "against"])
-def test_readings_of_potentials(measurement):
+def test_measurements_of_potentials(measurement):
     potentials = np.random.default_rng(1).normal(size=7)
     rows = protocol.measurement_patterns(7, measurement)
     expected = {

@@ -1,4 +1,4 @@
-"""The named protocols: their counts in the literature, and what holds for every one."""
+"""The named protocols: channel counts of the literature, and properties of every protocol."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def case(request):
     return PROTOCOLS[request.param]
 
 
-def test_counts_of_the_literature(case):
+def test_channel_counts_of_the_literature(case):
     chosen, count = case
     assert chosen.num_measurements == count
 
@@ -51,14 +51,14 @@ def test_currents_and_weights_sum_to_zero(case):
     assert np.abs(chosen.drive).max() == pytest.approx(1e-3)
 
 
-def test_no_channel_is_there_twice(case):
+def test_channels_are_unique(case):
     chosen, _ = case
     channels = np.stack([chosen.drive_index, chosen.measurement_index], axis=1)
     assert len(np.unique(channels, axis=0)) == chosen.num_measurements
 
 
-def test_rotating_order_starts_behind_the_driven_pair():
-    # The order of the 6 cm tank's files: row 13 i + t reads the pair that starts at electrode i + 2 + t.
+def test_rotating_order_starts_after_the_driven_pair():
+    # The order of the 6 cm tank's files: row 13 i + t measures the pair that starts at electrode i + 2 + t.
     rows = np.asarray(protocol.adjacent(16).channel_measurement).argmax(axis=1)
     drive, step = np.divmod(np.arange(208), 13)
     np.testing.assert_array_equal(rows, (drive + 2 + step) % 16)
@@ -69,7 +69,7 @@ def test_fixed_order_starts_at_the_first_electrode():
     np.testing.assert_array_equal(rows[13 * 5 : 13 * 6], [0, 1, 2, 3, *range(7, 16)])
 
 
-def test_driven_electrodes_are_left_out_unless_asked_for():
+def test_driven_electrodes_are_excluded_by_default():
     assert not protocol.adjacent(8).channels_on_driven_electrodes().any()
     assert protocol.adjacent(8, driven_electrodes=True).channels_on_driven_electrodes().sum() == 3 * 8
     assert protocol.two_terminal(4).channels_on_driven_electrodes().all()
@@ -148,7 +148,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_patterns_are_refused_with_a_lesson(name):
+def test_invalid_patterns_are_refused_with_advice(name):
     build, lesson = BAD[name]
     with pytest.raises(ValueError, match=lesson):
         build()

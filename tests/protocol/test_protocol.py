@@ -1,4 +1,4 @@
-"""A protocol as an object: reciprocity, masks, subsets, and life under JAX's transformations."""
+"""Properties of a protocol: reciprocity, masks, subsets, and JAX transformations."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jeit.protocol.reciprocity import transfer_between_drives
 
 
 def voltages(chosen, seed=0):
-    """Voltages of an arbitrary body: any symmetric transfer impedance does."""
+    """Voltages of an arbitrary body, which is any symmetric transfer impedance."""
     factor = np.random.default_rng(seed).normal(size=(chosen.num_electrodes,) * 2)
     potentials = np.asarray(chosen.drive) @ (factor @ factor.T)
     return np.einsum("kl,kl->k", chosen.channel_measurement, potentials[np.asarray(chosen.drive_index)])
@@ -27,14 +27,14 @@ def voltages(chosen, seed=0):
         (protocol.reference_electrode(16), 0),
     ],
 )
-def test_reciprocal_pairs_have_the_ratio_promised(chosen, count):
+def test_voltages_of_reciprocal_pairs_have_the_stated_ratio(chosen, count):
     pairs, ratio = chosen.reciprocal_pairs()
     assert len(pairs) == count
     measured = voltages(chosen)
     np.testing.assert_allclose(measured[pairs[:, 1]], ratio * measured[pairs[:, 0]], rtol=1e-10)
 
 
-def test_reciprocity_knows_unequal_currents_and_reversed_pairs():
+def test_reciprocity_with_unequal_currents_and_reversed_pairs():
     drive = np.diag([1e-3, -2e-3, 5e-4, 1e-3]) @ np.asarray(protocol.adjacent(4).measurement)
     chosen = protocol.from_matrices(drive, protocol.adjacent(4).measurement)
     pairs, ratio = chosen.reciprocal_pairs()
@@ -45,7 +45,7 @@ def test_reciprocity_knows_unequal_currents_and_reversed_pairs():
 
 
 def test_transfer_between_drives_is_symmetric_where_known():
-    # Skip-1 drives are sums of two neighbours, so that adjacent measurement spans them all.
+    # Skip-1 drives are sums of two neighbours, so that adjacent measurements span all of them.
     chosen = protocol.skip(8, 1, measurement_skipped=0, driven_electrodes=True)
     transfer, known, gain = transfer_between_drives(
         np.asarray(chosen.drive),
@@ -70,7 +70,7 @@ def test_channels_touching_an_electrode():
     np.testing.assert_array_equal(chosen.channels_touching([3, 7]), uses[:, 3] | uses[:, 7])
 
 
-def test_subset_reads_the_same_voltages():
+def test_subset_gives_the_same_voltages():
     chosen = protocol.adjacent(16)
     keep = chosen.mask_without([0, 5])
     fewer = chosen.subset(keep)
@@ -94,14 +94,14 @@ def test_bad_subsets(keep, lesson):
         protocol.adjacent(8).subset(keep)
 
 
-def test_electrode_that_does_not_exist():
+def test_electrodes_that_do_not_exist():
     with pytest.raises(ValueError, match="0 to 7"):
         protocol.adjacent(8).channels_touching(8)
 
 
 def test_jit_vmap_and_grad_pass_through():
     def power(current):
-        # Built inside the transformation: checks of values must not look at tracers.
+        # Built inside the transformation: checks of values must not evaluate tracers.
         chosen = protocol.adjacent(8, current=current)
         return jnp.sum(chosen.channel_drive**2)
 

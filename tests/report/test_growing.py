@@ -1,4 +1,4 @@
-"""What a stream of any length leaves: whole lines, rows that grow on disk, memory that does not."""
+"""Results of streams of any length: complete lines, rows written to disk one by one, and constant memory."""
 
 import csv
 import tracemalloc
@@ -20,13 +20,13 @@ from jeit.report.stream import _StreamSummary
 
 @pytest.fixture(scope="module")
 def calibrated():
-    """What `write_stream` asks of a calibration: a model, and its conductivity, 1 S."""
+    """The parts of a calibration that `write_stream` uses: a model, and its conductivity, 1 S."""
     model = ForwardModel(Disk(0.05).mesh(num_points=200), BoundaryElectrodes(ring(0.05, 8), 0.01, 0.1), adjacent(8))
     return SimpleNamespace(model=model, conductivity=np.asarray(1.0))
 
 
 def images(calibration, number, imaged=lambda one: True):
-    """Of a spot that grows stronger; the others are refused."""
+    """Images of a spot that grows stronger; the others are refused."""
     cells, usable = calibration.model.mesh.num_cells, np.ones(40, bool)
     for one in range(number):
         if imaged(one):
@@ -37,9 +37,9 @@ def images(calibration, number, imaged=lambda one: True):
 
 
 def test_a_stream_is_written_as_it_was_imaged(calibrated, tmp_path):
-    told = []
+    progress = []
     written = write_stream(
-        images(calibrated, 40, lambda one: one % 3 != 1), calibrated, tmp_path, film=None, drawing=told.append
+        images(calibrated, 40, lambda one: one % 3 != 1), calibrated, tmp_path, film=None, drawing=progress.append
     )
     with np.load(tmp_path / "images.npz") as held:
         assert sorted(held.files) == ["background", "cells", "conductivity", "points"]
@@ -50,7 +50,7 @@ def test_a_stream_is_written_as_it_was_imaged(calibrated, tmp_path):
         np.testing.assert_array_equal(held["cells"], calibrated.model.mesh.cells)
     assert (written.number, written.counts) == (40, {"imaged": 27, "refused": 13})
     np.testing.assert_allclose(written.latency, 1e-3 * np.array([one for one in range(40) if one % 3 != 1]))
-    assert told == ["images", "contact sheet"]
+    assert progress == ["images", "contact sheet"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames.csv", "frames.png", "images.npz"]
 
 
@@ -67,8 +67,8 @@ def test_an_unchanged_frame_has_no_peak(calibrated, tmp_path):
     assert all(still[name] == "" and pressed[name] != "" for name in peaks)
 
 
-def test_noise_does_not_fill_the_colours(calibrated):
-    """Where no frame has changed, the scale ends at 1 % of the background; else at the largest change."""
+def test_the_colour_scale_does_not_amplify_noise(calibrated):
+    """If no frame has changed, the scale ends at 1 % of the background; otherwise at the largest change."""
     noise = 1 + np.full(calibrated.model.mesh.num_cells, 1e-6)
     unchanged = FrameImage(0, noise, FrameStatus.UNCHANGED, "no change", np.ones(40, bool), 0.5, 0, 1e-3)
     seen = _StreamSummary(calibrated)
@@ -79,8 +79,8 @@ def test_noise_does_not_fill_the_colours(calibrated):
     assert seen.limit == pytest.approx(1e-3, rel=1e-3)
 
 
-def test_one_frame_that_was_imaged_is_shown(calibrated, tmp_path, monkeypatch):
-    """Though none of those that would be drawn was."""
+def test_the_only_imaged_frame_is_drawn(calibrated, tmp_path, monkeypatch):
+    """Even if it is not among the frames that are drawn by default."""
     monkeypatch.setattr("jeit.report.stream.FILM_FRAMES", 4)
     written = write_stream(images(calibrated, 100, lambda one: one == 3), calibrated, tmp_path, film="film.gif")
     assert written.counts == {"refused": 99, "imaged": 1}
@@ -104,19 +104,19 @@ def test_memory_does_not_grow_with_a_stream(calibrated, tmp_path):
 
     peak(10)
     first, second = peak(1000), peak(4000)
-    assert second - first < 5e5  # their images are 5 MB
+    assert second - first < 5e5  # the images take 5 MB
     with np.load(tmp_path / "images.npz") as held:
         assert held["conductivity"].nbytes > 5e6
 
 
-def test_what_is_not_drawn_any_more_leaves_the_rest(calibrated, tmp_path):
+def test_results_without_drawings_are_complete(calibrated, tmp_path):
     with pytest.raises(InterruptedError):
         write_stream(images(calibrated, 5), calibrated, tmp_path, drawing=no_pictures)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["frames.csv", "images.npz"]
 
 
 def limited(size):
-    """A context in which no file may be larger than this many bytes."""
+    """A context in which no file may be larger than this number of bytes."""
     resource = pytest.importorskip("resource")
 
     class Limited:
@@ -130,7 +130,7 @@ def limited(size):
     return Limited()
 
 
-def test_a_full_disk_leaves_whole_lines(tmp_path):
+def test_a_full_disk_leaves_complete_lines(tmp_path):
     with GrowingTable(tmp_path / "a.csv", ("one", "two")) as table, limited(40):
         table.write((1, "first"))
         with pytest.raises(OSError, match="File too large"):
@@ -138,7 +138,7 @@ def test_a_full_disk_leaves_whole_lines(tmp_path):
     assert (tmp_path / "a.csv").read_bytes() == b"one,two\r\n1,first\r\n"
 
 
-def test_a_full_disk_says_what_is_left(calibrated, tmp_path):
+def test_the_error_of_a_full_disk_names_the_results_written(calibrated, tmp_path):
     with (
         limited(20_000),
         pytest.raises(OSError, match=r"File too large: what came .* frames\.csv has the \d+ frames until then"),
@@ -151,7 +151,7 @@ def test_a_full_disk_says_what_is_left(calibrated, tmp_path):
     assert all(None not in row.values() for row in rows)
 
 
-def test_a_link_is_not_written_through(tmp_path):
+def test_a_link_is_not_followed(tmp_path):
     (tmp_path / "letter.txt").write_text("dear")
     (tmp_path / "a.csv").symlink_to(tmp_path / "letter.txt")
     with GrowingTable(tmp_path / "a.csv", ("one",)):
@@ -160,7 +160,7 @@ def test_a_link_is_not_written_through(tmp_path):
     assert (tmp_path / "a.csv").read_text() == "one\n"
 
 
-def test_rows_are_read_where_they_are_wanted(tmp_path):
+def test_single_rows_are_read_from_the_file(tmp_path):
     with GrowingRows(tmp_path, (2, 3)) as rows:
         for one in range(5000):
             rows.append(np.full((2, 3), one))
@@ -168,7 +168,7 @@ def test_rows_are_read_where_they_are_wanted(tmp_path):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_sample_is_even_and_small():
+def test_a_sample_of_rows_is_evenly_spaced_and_limited():
     sample = Sample()
     for one in range(1000):
         sample.append(one)

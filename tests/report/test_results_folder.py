@@ -1,4 +1,4 @@
-"""Writers of results say what is wrong with the folder before they look at the results."""
+"""Writers of results report a faulty folder before they use the results."""
 
 import pytest
 
@@ -20,7 +20,7 @@ every_writer = pytest.mark.parametrize("write", WRITERS.values(), ids=WRITERS)
 
 
 @every_writer
-def test_a_file_is_no_folder(write, tmp_path):
+def test_a_file_in_place_of_the_folder(write, tmp_path):
     file = tmp_path / "report.json"
     file.write_text("{}", "utf-8")
     with pytest.raises(ValueError, match=r"^folder \S+report\.json is a file; give a folder for the results\.$"):
@@ -31,7 +31,7 @@ def test_a_file_is_no_folder(write, tmp_path):
 
 
 @every_writer
-def test_a_folder_in_the_place_of_a_result(write, tmp_path):
+def test_a_folder_in_place_of_a_result(write, tmp_path):
     name = next(name for name, writer in WRITERS.items() if writer is write)
     (tmp_path / name).mkdir()
     with pytest.raises(ValueError, match=f"a folder named {name} in it|is a folder; give a file"):

@@ -1,4 +1,4 @@
-"""An image on disk is had back as it was, and files that are none say so."""
+"""Saved images are read back unchanged, and other files are refused with the reason."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def content(mesh=TANK, electrodes=PATCHES, inclusions=FOUND, **changed):
     return {name: value for name, value in arrays.items() if value is not None}
 
 
-def test_a_solid_comes_back(tmp_path):
+def test_round_trip_of_a_solid(tmp_path):
     np.savez(tmp_path / "image.npz", **content())
     image = read_image(tmp_path / "image.npz")
     np.testing.assert_array_equal(image.mesh.points, TANK.points)
@@ -40,7 +40,7 @@ def test_a_solid_comes_back(tmp_path):
     np.testing.assert_allclose(image.electrodes.middles(), PATCHES.position, atol=1e-12)
 
 
-def test_bodies_that_were_fitted_come_back_with_their_forms(tmp_path):
+def test_round_trip_of_fitted_bodies(tmp_path):
     axes = ((0.01, 0.0, 0.0), (0.0, 0.02, 0.0), (0.0, 0.0, 0.03))
     forms = [SolidForm((0.0, 0.01, 0.03), axes, column) for column in (True, False)]
     found = tuple(Inclusion(1, (0.0, 0.01, 0.03), 1e-6, 2e-3, form=form) for form in forms)
@@ -48,13 +48,13 @@ def test_bodies_that_were_fitted_come_back_with_their_forms(tmp_path):
     np.savez(tmp_path / "image.npz", **arrays)
     assert read_image(tmp_path / "image.npz").inclusions == found
     bad = {"inclusion_axes": np.full((2, 3, 3), np.nan)}, {"inclusion_columns": np.array([True])}
-    for changed, said in zip(bad, ("not finite", "not of every inclusion"), strict=True):
+    for changed, message in zip(bad, ("not finite", "not of every inclusion"), strict=True):
         np.savez(tmp_path / "image.npz", **arrays | changed)
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             read_image(tmp_path / "image.npz")
 
 
-def test_a_sheet_and_a_complex_image_come_back(tmp_path):
+def test_round_trip_of_a_sheet_and_of_a_complex_image(tmp_path):
     values = np.linspace(0, 1, SHEET.num_cells) * (1 + 0.5j)
     arrays = content(SHEET, ARCS, (), conductivity=values, background=np.array(0.1 + 0.01j))
     np.savez(tmp_path / "image.npz", **arrays)
@@ -65,7 +65,7 @@ def test_a_sheet_and_a_complex_image_come_back(tmp_path):
     assert image.electrodes.number == 4
 
 
-def test_files_of_before_have_neither_electrodes_nor_inclusions(tmp_path):
+def test_files_of_earlier_versions_have_neither_electrodes_nor_inclusions(tmp_path):
     arrays = {name: value for name, value in content().items() if not name.startswith(("electrode", "inclusion"))}
     np.savez(tmp_path / "image.npz", raster=np.zeros((4, 4)), extent=np.zeros(4), **arrays)
     image = read_image(tmp_path / "image.npz")
@@ -73,7 +73,7 @@ def test_files_of_before_have_neither_electrodes_nor_inclusions(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"conductivity": None}, "no array 'conductivity'"),
         ({"conductivity": np.zeros(3)}, "there are .* cells"),
@@ -94,13 +94,13 @@ def test_files_of_before_have_neither_electrodes_nor_inclusions(tmp_path):
         ({"images": np.zeros(2), "conductivity": None}, "many frames"),
     ],
 )
-def test_what_does_not_fit_is_said(changed, said, tmp_path):
+def test_inconsistent_content_is_reported(changed, message, tmp_path):
     np.savez(tmp_path / "image.npz", **content(**changed))
-    with pytest.raises(ValueError, match=rf"^image\.npz: .*{said}"):
+    with pytest.raises(ValueError, match=rf"^image\.npz: .*{message}"):
         read_image(tmp_path / "image.npz")
 
 
-def test_other_files(tmp_path):
+def test_other_files_are_refused(tmp_path):
     (tmp_path / "report.json").write_text("{}")
     with pytest.raises(ValueError, match="not an image that jeit wrote"):
         read_image(tmp_path / "report.json")

@@ -1,4 +1,4 @@
-"""Pictures of a stream: a contact sheet and a film, on one colour scale, where refused frames are shown as refused."""
+"""Pictures of a stream: a contact sheet and a film with one colour scale, in which refused frames are marked."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ ELECTRODES = BoundaryElectrodes(ring(RADIUS, 8), 0.01, 0.1)
 
 
 def changes(number: int, refused: tuple[int, ...] = ()) -> np.ndarray:
-    """A spot that goes round, twice as strong in the last frame."""
+    """A spot that moves in a circle, twice as strong in the last frame."""
     angle = np.linspace(0, 5, number)
     place = 0.025 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     away = np.linalg.norm(np.asarray(centroids(MESH)) - place[:, None], axis=-1)
@@ -28,11 +28,11 @@ def changes(number: int, refused: tuple[int, ...] = ()) -> np.ndarray:
 
 
 def pictures(figure):
-    """Axes with an image, the colour bar's not among them."""
+    """Axes with an image, except those of colour bars."""
     return [ax for ax in figure.axes if ax.get_title()]
 
 
-def test_chosen_frames_are_even_and_have_both_ends():
+def test_chosen_frames_are_evenly_spaced_with_both_ends():
     assert chosen_frames(5, 12) == [0, 1, 2, 3, 4]
     assert chosen_frames(100, 4) == [0, 33, 66, 99]
 
@@ -45,8 +45,8 @@ def test_a_contact_sheet_has_one_scale_times_and_refusals():
     assert {ax.images[1].get_clim() for ax in shown} == {shown[0].images[1].get_clim()}
     assert shown[0].images[1].get_clim()[1] == pytest.approx(2, rel=0.1)  # mS: of all frames, the last is strongest
     assert [ax.images[1].get_visible() for ax in shown] == [False] + 11 * [True]
-    said = [[text.get_visible() for text in ax.texts if text.get_text() == "refused"] for ax in shown]
-    assert said == [[True], *11 * [[False]]]
+    marked = [[text.get_visible() for text in ax.texts if text.get_text() == "refused"] for ax in shown]
+    assert marked == [[True], *11 * [[False]]]
     assert figure.get_supxlabel() == "12 of 30 frames; 2 of 30 refused: 0.0 s, 0.4 s"
     assert any("mS" in ax.get_ylabel() for ax in figure.axes)  # the colour bar
     bars = [text.get_text() for text in shown[0].texts]
@@ -54,7 +54,7 @@ def test_a_contact_sheet_has_one_scale_times_and_refusals():
     np.testing.assert_allclose(np.nanmax(shown[-1].images[1].get_array()), 2, rtol=0.1)
 
 
-def test_a_solid_is_cut_half_way_up():
+def test_a_solid_is_cut_at_half_its_height():
     mesh = Solid(Disk(RADIUS), 0.04).mesh(num_points=600)
     figure = plot_frames(mesh, np.ones((2, mesh.num_cells)))
     assert figure.get_supxlabel() == "slices at z = 20.0 mm"
@@ -73,9 +73,9 @@ def test_bad_input(given, options, message):
         plot_frames(MESH, given, **options)
 
 
-def test_a_film_has_every_frame_at_the_pace_of_the_stream(tmp_path):
-    told = []
-    write_film(tmp_path / "a.gif", MESH, changes(6, (2,)), ELECTRODES, rate=5.0, progress=told.append)
+def test_a_film_has_every_frame_at_the_rate_of_the_stream(tmp_path):
+    reported = []
+    write_film(tmp_path / "a.gif", MESH, changes(6, (2,)), ELECTRODES, rate=5.0, progress=reported.append)
     with Image.open(tmp_path / "a.gif") as shown:
         assert (shown.n_frames, shown.info["duration"]) == (6, 200)
         assert max(shown.size) <= 400
@@ -84,28 +84,28 @@ def test_a_film_has_every_frame_at_the_pace_of_the_stream(tmp_path):
             shown.seek(number)
             frames.append(np.asarray(shown.convert("RGB")).astype(int))
     red = [int((frame[..., 0] - frame[..., 2] > 100).sum()) for frame in frames]
-    assert red[2] < min(red[:2] + red[3:])  # nothing of an image is left where a frame was refused
-    assert told == [f"{k} of 6" for k in range(1, 7)]
+    assert red[2] < min(red[:2] + red[3:])  # no image is left where a frame was refused
+    assert reported == [f"{k} of 6" for k in range(1, 7)]
     assert (tmp_path / "a.gif").stat().st_size < 300_000
 
 
-def test_long_streams_make_short_films(tmp_path, monkeypatch):
+def test_films_of_long_streams_are_short(tmp_path, monkeypatch):
     monkeypatch.setattr(series, "FILM_FRAMES", 4)
     write_film(tmp_path / "a.gif", MESH, changes(40), rate=1000.0)
     with Image.open(tmp_path / "a.gif") as shown:
         assert (shown.n_frames, shown.info["duration"]) == (4, 40)  # no faster than 25 a second
 
 
-def test_a_film_of_a_solid_says_where_its_slices_are(tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr("matplotlib.figure.Figure.supxlabel", lambda _, said, **__: told.append(said))
+def test_a_film_of_a_solid_states_the_planes_of_its_slices(tmp_path, monkeypatch):
+    labels = []
+    monkeypatch.setattr("matplotlib.figure.Figure.supxlabel", lambda _, text, **__: labels.append(text))
     solid = Solid(Disk(RADIUS), 0.04).mesh(num_points=600)
     write_film(tmp_path / "a.gif", solid, np.ones((1, solid.num_cells)))
     write_film(tmp_path / "b.gif", MESH, changes(1))
-    assert told == ["slice at z = 20.0 mm"]
+    assert labels == ["slice at z = 20.0 mm"]
 
 
-def test_films_of_other_kinds_are_refused(tmp_path, monkeypatch):
+def test_unknown_kinds_of_films_are_refused(tmp_path, monkeypatch):
     from matplotlib.animation import FFMpegWriter
 
     for name in ("a.avi", "there/a.gif"):

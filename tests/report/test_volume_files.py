@@ -1,4 +1,4 @@
-"""Files that other programs look into: read back as they were written, whole or not there."""
+"""Files for other visualisation programs: read back unchanged, and written completely or not at all."""
 
 import xml.etree.ElementTree as Tree
 
@@ -24,7 +24,7 @@ def frames(tank):
     return np.random.default_rng(3).normal(size=(len(TIMES), tank.num_cells))
 
 
-def test_one_file_holds_the_image_and_where_the_electrodes_are(tank, frames, tmp_path):
+def test_one_file_holds_the_image_and_the_electrode_positions(tank, frames, tmp_path):
     electrodes = plates(tank, ["left", "top"], 1e-3)
     heat = np.arange(tank.num_points) * 0.5
     write_vtu(
@@ -51,7 +51,7 @@ def test_one_file_holds_the_image_and_where_the_electrodes_are(tank, frames, tmp
 
 
 @pytest.mark.parametrize("kind", ["discs", "patches", "points"])
-def test_nodes_under_electrodes_are_those_near_them(tank, kind):
+def test_nodes_under_electrodes_are_near_them(tank, kind):
     places = np.array([[0.05, 0.0, 0.03], [-0.05, 0.01, 0.03]])
     electrodes = {
         "discs": FaceDiscs(places, 0.02, 1e-3),
@@ -66,7 +66,7 @@ def test_nodes_under_electrodes_are_those_near_them(tank, kind):
         np.testing.assert_allclose(nodes[:, 0], place[0])
 
 
-def test_a_series_is_one_file_for_each_frame_and_one_that_names_them(tank, frames, tmp_path):
+def test_a_series_has_one_file_per_frame_and_an_index(tank, frames, tmp_path):
     write_vtk_series(tmp_path / "breath.pvd", tank, TIMES, {"change": frames})
     sets = list(Tree.parse(tmp_path / "breath.pvd").iter("DataSet"))
     assert [float(one.attrib["timestep"]) for one in sets] == TIMES
@@ -88,12 +88,12 @@ def test_xdmf_is_one_file_with_all_frames(tank, body, tmp_path):
         np.testing.assert_array_equal(cells[0].data, mesh.cells)
         assert read.num_steps == len(TIMES)
         for k, time in enumerate(TIMES):
-            told, _, data = read.read_data(k)
-            assert told == time
+            stored, _, data = read.read_data(k)
+            assert stored == time
             np.testing.assert_array_equal(data["change"][0], values[k])
 
 
-def test_what_does_not_fit_is_said_and_leaves_no_file(tank, frames, tmp_path):
+def test_inconsistent_input_is_reported_and_leaves_no_file(tank, frames, tmp_path):
     wrong = {
         "must end in .vtu": lambda: write_vtu(tmp_path / "a.vtk", tank, {"change": frames[0]}),
         "one value per cell": lambda: write_vtu(tmp_path / "a.vtu", tank, {"change": frames[0][1:]}),
@@ -104,7 +104,7 @@ def test_what_does_not_fit_is_said_and_leaves_no_file(tank, frames, tmp_path):
         "cell_data is empty": lambda: write_xdmf(tmp_path / "a.xdmf", tank, TIMES, {}),
         "must end in .xdmf": lambda: write_xdmf(tmp_path / "a.h5", tank, TIMES, {"change": frames}),
     }
-    for said, write in wrong.items():
-        with pytest.raises(ValueError, match=said):
+    for message, write in wrong.items():
+        with pytest.raises(ValueError, match=message):
             write()
     assert list(tmp_path.iterdir()) == []

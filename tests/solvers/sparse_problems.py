@@ -1,4 +1,4 @@
-"""Sparse symmetric positive definite systems of many shapes, and their dense twins, for the solver tests."""
+"""Sparse symmetric positive definite systems of many shapes, and their dense equivalents, for tests of solvers."""
 
 import jax
 import numpy as np
@@ -39,17 +39,17 @@ def element_matrices(num_elements, nodes, seed=0):
 
 def from_cells(points, cells, seed=0):
     pattern = SparsityPattern.from_elements([cells], len(points))
-    # In NumPy: of JAX's arrays, each operation would be compiled for each problem.
+    # In NumPy, because JAX would compile each operation for each problem.
     return pattern, jax.device_put(pattern.assemble(element_matrices(*cells.shape, seed))), points
 
 
 def dense(pattern, values):
-    """The matrix as NumPy's array, which takes no program compiled for each size."""
+    """The matrix as an array of NumPy, which needs no program for each size."""
     return pattern.to_scipy(values).toarray()
 
 
 def _from_dense(matrix):
-    """As of `SparsityPattern.from_matrix`, but added up in NumPy."""
+    """As `SparsityPattern.from_matrix`, but assembled in NumPy."""
     rows, columns = np.nonzero(np.tril(matrix))
     pattern = SparsityPattern.from_entries(rows, columns, len(matrix))
     return pattern, jax.device_put(pattern.assemble(matrix[rows, columns])), None
@@ -106,7 +106,7 @@ def small_dense():
 
 
 def large_dense():
-    """One front of 300 rows: the nested block loop of the dense factorisation."""
+    """One front of 300 rows, for the nested block loop of the dense factorisation."""
     rng = np.random.default_rng(4)
     square = rng.standard_normal((300, 300))
     return _from_dense(square @ square.T + 30 * np.eye(300))

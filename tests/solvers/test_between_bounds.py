@@ -1,4 +1,4 @@
-"""Minimisation between bounds against the answer by hand, how it ends, and the one module that knows jaxopt."""
+"""Minimisation with bounds against exact solutions, its status, and the one module that imports jaxopt."""
 
 import ast
 from pathlib import Path
@@ -16,7 +16,7 @@ LOWER, UPPER = np.zeros(3), np.ones(3)
 
 
 def squares(x):
-    """Least at `AIM`, between the bounds at its nearest point."""
+    """A function with its minimum at `AIM`; within bounds, at the nearest point."""
     return jnp.sum(np.array([1.0, 4.0, 9.0]) * (x - AIM) ** 2)
 
 
@@ -32,7 +32,7 @@ def test_the_nearest_point_in_a_box(solver):
     assert not bool(run(0.5 * UPPER, max_steps=1).converged)
 
 
-def test_scipy_keeps_the_shape_and_says_how_it_ended():
+def test_scipy_solver_keeps_the_shape_and_reports_its_status():
     seen = []
     of_rows = jax.jit(jax.value_and_grad(lambda x: squares(x[0]) + squares(x[1])))
     start = np.full((2, 3), 0.5)
@@ -46,8 +46,8 @@ def test_scipy_keeps_the_shape_and_says_how_it_ended():
     assert status == Status.STEP_LIMIT
 
 
-def test_one_module_knows_jaxopt():
-    """It is no longer maintained; what takes its place has one place to go."""
+def test_one_module_imports_jaxopt():
+    """jaxopt is no longer maintained; with one importing module it can be replaced in one place."""
     found = set()
     for path in [*(ROOT / "jeit").rglob("*.py"), *(ROOT / "solvers").rglob("*.py")]:
         text = path.read_text("utf-8")

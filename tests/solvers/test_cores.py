@@ -1,4 +1,4 @@
-"""Work of NumPy's that is shared between cores: the same whoever does it, and the BLAS as it was before."""
+"""Work of NumPy shared between cores: results do not depend on the threads, and the BLAS settings are restored."""
 
 import threading
 import warnings
@@ -18,7 +18,7 @@ def threads_of_blas():
     return [one["num_threads"] for one in blas().info()]
 
 
-def test_every_part_is_done_with_one_thread_of_blas_and_its_own_parts_at_once():
+def test_every_part_uses_one_thread_of_blas_and_nested_parts_run_serially():
     found, threads = np.zeros((6, 3)), []
 
     def part(row):
@@ -38,7 +38,7 @@ def test_every_part_is_done_with_one_thread_of_blas_and_its_own_parts_at_once():
 
 
 def test_any_thread_may_limit_the_blas():
-    """Also one after the other, and where the first to begin is not the last to end."""
+    """Also one after the other, and if the first to begin is not the last to end."""
     with one_thread_of_blas():
         pass
     begun, ended, seen = threading.Event(), threading.Event(), []
@@ -61,7 +61,7 @@ def test_any_thread_may_limit_the_blas():
             assert set(threads_of_blas()) == {1}
         assert set(seen[0]) == {1}
         assert threads_of_blas() == before
-    # Limits of others hold, and are taken back, whoever used ours meanwhile.
+    # Limits set by others hold and are restored, even if the limit of jeit_solvers was used meanwhile.
     with threadpoolctl.threadpool_limits(2, user_api="blas"):
         with threadpoolctl.threadpool_limits(1, user_api="blas"):
             other = threading.Thread(target=lambda: on_cores(lambda _: None, range(2)))
@@ -71,7 +71,7 @@ def test_any_thread_may_limit_the_blas():
         assert threads_of_blas() == before
 
 
-def test_a_part_that_fails_is_told_of_and_the_blas_has_its_threads_again():
+def test_an_error_in_a_part_is_raised_and_the_blas_threads_are_restored():
     def part(number):
         if number == 2:
             raise ValueError("the second")
@@ -104,7 +104,7 @@ def test_parts_for_cores_cover_all_once(number):
 
 
 @pytest.mark.parametrize("case", [sparse_problems.box, sparse_problems.disk])
-def test_a_factor_does_not_depend_on_how_its_fronts_are_shared(case, monkeypatch):
+def test_a_factor_does_not_depend_on_the_distribution_of_its_fronts(case, monkeypatch):
     pattern, values, coordinates = case()
     plan, values = on_host((analyse(pattern, coordinates), values))
     alone = factorise(plan, values)

@@ -1,4 +1,4 @@
-"""The dense inverse Cholesky factor, on every route it takes by size and batch."""
+"""The dense inverse Cholesky factor, by every algorithm that it selects by size and batch."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def test_inverse_factor(route, dtype):
     inverse = np.asarray(jax.jit(inverse_cholesky)(jnp.asarray(matrices)))
     assert inverse.dtype == dtype
     np.testing.assert_array_equal(inverse, np.tril(inverse))
-    # The condition numbers are below 10, so a few units of roundoff for each row.
+    # The condition numbers are below 10, so that the error is a few units of roundoff for each row.
     tolerance = 10 * size * np.finfo(dtype).eps
     unity = inverse @ matrices @ inverse.transpose(0, 2, 1)
     np.testing.assert_allclose(unity, np.broadcast_to(np.eye(size), unity.shape), rtol=0, atol=tolerance)
@@ -40,7 +40,7 @@ def test_inverse_factor(route, dtype):
         pytest.param(2, 13, np.float64, marks=pytest.mark.slow),
     ],
 )
-def test_indefinite_matrices_give_nan_and_leave_the_others_alone(batch, size, dtype):
+def test_indefinite_matrices_give_nan_without_affecting_others(batch, size, dtype):
     matrices = np.broadcast_to(np.eye(size, dtype=dtype), (batch, size, size)).copy()
     matrices[1, -1, -1] = -1
     inverse = jax.jit(inverse_cholesky)(jnp.asarray(matrices))

@@ -30,9 +30,9 @@ def uncorrelated(size):
 compiled_step = jax.jit(ridge_step)
 
 
-# Unknowns more than data, fewer, and as many.
+# More unknowns than data, fewer, and equally many.
 @pytest.mark.parametrize("shape", [(5, 40), (40, 5), (30, 30)])
-def test_ridge_step_in_either_space(shape):
+def test_ridge_step_in_data_and_parameter_space(shape):
     jacobian, residual, point = normal(*shape), normal(shape[0], seed=4), normal(shape[1], seed=5)
     for covariance, precision in (correlated(shape[0]), uncorrelated(shape[0])):
         expected = np.linalg.solve(
@@ -42,7 +42,7 @@ def test_ridge_step_in_either_space(shape):
         np.testing.assert_allclose(step, expected, rtol=1e-9, atol=1e-11)
 
 
-def test_ridge_step_where_the_ridge_is_tiny():
+def test_ridge_step_with_a_tiny_ridge():
     jacobian, residual = 1e6 * normal(5, 40), normal(5, seed=4)
     expected = -np.linalg.pinv(jacobian) @ residual
     step = compiled_step(jacobian, residual, np.zeros(40), *uncorrelated(5), 1.0)
@@ -75,7 +75,7 @@ def minimise(solver, start, matrix, expand=None):
 
 
 def test_the_model_along_its_step():
-    """Slope and curvature are those of the cost, for a residual that is linear."""
+    """Slope and curvature equal those of the cost for a linear residual."""
     covariance, precision = correlated(6)
     matrix, point = normal(6, 9), np.arange(9.0)
 
@@ -121,15 +121,15 @@ def test_a_linear_problem_takes_one_gauss_newton_step():
     np.testing.assert_allclose(solution.value, expected, rtol=1e-9)
 
 
-def test_steps_below_the_rounding_of_the_cost_are_taken():
-    """Close to the minimum the cost only rounds up and down, and the model still points there."""
+def test_steps_below_the_rounding_of_the_cost_are_accepted():
+    """Close to the minimum the cost changes by rounding only, while the model still decreases."""
 
     def rounded(c, _):
         away = c - 1.0
         cost = 1.0 + 0.5 * away @ away + 3e-15 * np.cos(1e9 * away).sum()
 
         def step(damping):
-            direction = -0.9 * away  # of a model that is a tenth off
+            direction = -0.9 * away  # of a model with an error of a tenth
             return direction, away @ direction, direction @ direction / 0.9
 
         return cost, step
@@ -139,12 +139,12 @@ def test_steps_below_the_rounding_of_the_cost_are_taken():
     np.testing.assert_allclose(point, 1.0, rtol=0, atol=1e-11)
 
 
-def test_a_start_that_cannot_be_evaluated_is_said_so():
+def test_a_start_with_invalid_cost_is_reported():
     solution = minimise(Descent(rtol=1e-14), np.full(9, np.nan), normal(6, 9), expand=expand)
     assert solution.result != optx.RESULTS.successful
 
 
-def test_batches_give_what_a_loop_gives():
+def test_batches_equal_loops():
     matrices, solver = normal(3, 6, 9), Descent(rtol=1e-14)
 
     def run(matrix):
@@ -154,6 +154,6 @@ def test_batches_give_what_a_loop_gives():
     np.testing.assert_allclose(jax.vmap(run)(matrices), each, atol=1e-10)
 
 
-def test_the_expansion_is_asked_for():
+def test_the_expansion_is_required():
     with pytest.raises(ValueError, match="expand"):
         minimise(Descent(), np.zeros(9), normal(6, 9))

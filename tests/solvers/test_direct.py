@@ -32,13 +32,13 @@ TOLERANCE = {"float32": 3e-6, "float64": 5e-15, "complex128": 5e-15}
 
 def as_type(values, dtype):
     if dtype == "complex128":
-        # Any symmetric imaginary part will do; this one is not a multiple of the real part.
+        # Any symmetric imaginary part is suitable; this one is not a multiple of the real part.
         rng = np.random.default_rng(5)
         return values + 0.5j * values * jnp.asarray(rng.uniform(-1, 1, values.shape))
     return values.astype(dtype)
 
 
-# Compiled, problems take a second each: the quick ones have fronts in stages, of all sizes, and one alone.
+# Compiling takes a second for each problem: the quick tests have fronts in stages, of all sizes, and a single one.
 COMPILED = [
     pytest.param(case, "float64", marks=() if case is sparse_problems.diagonal else pytest.mark.slow)
     for case in sparse_problems.PROBLEMS
@@ -51,7 +51,8 @@ def name_of(value):
 
 
 def everything(plan, values, vectors, rows):
-    """Of one factorisation: itself, solutions, bᵀA⁻¹b, half-solutions, entries and a root of the inverse."""
+    """All results of one factorisation: itself, solutions, bᵀA⁻¹b, half-solutions, entries and a root of the
+    inverse."""
     factor = factorise(plan, values)
     form, half = quadratic_form(plan, factor, vectors), half_solve(plan, factor, vectors)
     inverse = inverse_entries(plan, factor), inverse_root(plan, factor, rows)
@@ -78,12 +79,12 @@ def assert_solves_to_roundoff(case, dtype, engine):
     matrix = dense(pattern, values)
     residual = np.linalg.norm(matrix @ solution - vectors) / np.linalg.norm(matrix) / np.linalg.norm(solution)
     assert residual < TOLERANCE[dtype]
-    # Forward errors may be larger, by the condition numbers, which are below 1e3.
-    loose = 1e3 * TOLERANCE[dtype]
-    np.testing.assert_allclose(form, vectors.T @ solution, rtol=0, atol=loose * abs(form).max())
-    np.testing.assert_allclose(half.T @ half, form, rtol=0, atol=loose * abs(form).max())
+    # Forward errors may be larger by the condition numbers, which are below 1e3.
+    tolerance = 1e3 * TOLERANCE[dtype]
+    np.testing.assert_allclose(form, vectors.T @ solution, rtol=0, atol=tolerance * abs(form).max())
+    np.testing.assert_allclose(half.T @ half, form, rtol=0, atol=tolerance * abs(form).max())
     inverse = np.linalg.inv(matrix)
-    least = loose * abs(inverse).max() if dtype == "float32" else 1e-12 * abs(inverse).max()
+    least = tolerance * abs(inverse).max() if dtype == "float32" else 1e-12 * abs(inverse).max()
     rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
     np.testing.assert_allclose(entries, inverse[rows, columns], rtol=0, atol=least)
     np.testing.assert_allclose(root @ root.T, inverse, rtol=0, atol=least)
@@ -101,7 +102,7 @@ def test_compiled_code_solves_problems_to_roundoff(case, dtype):
     assert_solves_to_roundoff(case, dtype, on_device)
 
 
-def test_the_inverse_has_entries_where_elements_have_nodes():
+def test_entries_of_the_inverse_at_pairs_of_nodes_of_an_element():
     points, cells = sparse_problems.disk_cells(30)
     pattern, values, _ = on_host(sparse_problems.from_cells(points, cells))
     inverse = np.linalg.inv(dense(pattern, values))
@@ -111,7 +112,7 @@ def test_the_inverse_has_entries_where_elements_have_nodes():
     np.testing.assert_allclose(between, inverse[cells[:, row], cells[:, column]].T, rtol=1e-11)
 
 
-def test_roots_are_refused_of_rows_of_another_order():
+def test_roots_are_refused_for_rows_in_another_order():
     pattern, values, coordinates = on_host(sparse_problems.disk())
     plan = on_host(analyse(pattern, coordinates))
     with pytest.raises(ValueError, match="inverse_root: rows"):
@@ -148,11 +149,11 @@ def test_one_executable_serves_all_values():
     plan = analyse(pattern, coordinates)
     jitted = jax.jit(factorise)
     jitted(plan, values)
-    jitted(analyse(pattern, coordinates), 2 * values)  # another plan, equal in structure
+    jitted(analyse(pattern, coordinates), 2 * values)  # another plan of equal structure
     assert jitted._cache_size() == 1
 
 
-def test_a_batch_is_solved_and_tells_which_matrix_failed():
+def test_a_batch_is_solved_and_reports_which_matrix_failed():
     pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
     plan = analyse(pattern, coordinates)
     batch = np.asarray(values) * (1 + 0.1 * np.random.default_rng(0).uniform(0.5, 2.0, (4, pattern.num_entries)))
@@ -203,7 +204,8 @@ def test_lineax_throws_on_an_indefinite_matrix():
 
 @pytest.mark.slow
 def test_nested_batches_and_gradients_of_batches():
-    """The energy bᵀA⁻¹b falls by x_i x_j with entry (i, j), and by as much with (j, i), x being the solution."""
+    """The derivative of the energy bᵀA⁻¹b in entry (i, j) is −x_i x_j, and the same in (j, i), where x is the
+    solution."""
     pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
     plan = analyse(pattern, coordinates)
     batch = np.asarray(values) * np.linspace(1.0, 2.0, 6).reshape(2, 3, 1)
@@ -222,8 +224,8 @@ def test_nested_batches_and_gradients_of_batches():
     np.testing.assert_allclose(slope, expected, rtol=0, atol=1e-9 * abs(vectors).max() ** 2)
 
 
-def test_the_order_of_elimination_hangs_neither_on_size_nor_place():
-    """Nor on what rounding makes of equal coordinates: a body twice as large has the same plan, and compiled code."""
+def test_the_elimination_order_does_not_depend_on_scale_or_position():
+    """Nor on rounding of equal coordinates: a scaled body has the same plan and compiled code."""
     points = np.stack(np.meshgrid(np.arange(24.0), np.arange(24.0)), axis=-1).reshape(-1, 2)
     corner = (np.arange(23)[:, None] * 24 + np.arange(23)).ravel()
     cells = np.concatenate([corner[:, None] + [0, 1, 25], corner[:, None] + [0, 25, 24]])
@@ -235,8 +237,8 @@ def test_the_order_of_elimination_hangs_neither_on_size_nor_place():
         np.testing.assert_array_equal(other.indices, plan.indices)
 
 
-def test_a_plan_serves_all_that_have_its_tree_while_any_uses_it():
-    gc.freeze()  # what was there before has no part in it, and takes long to look through
+def test_a_plan_is_shared_between_equal_trees_while_it_is_used():
+    gc.freeze()  # existing objects do not matter and would slow down the collection
     pattern, values, coordinates = sparse_problems.box()
     plan = analyse(pattern, coordinates)
     again = SparsityPattern.from_elements([np.stack([pattern.rows, pattern.columns], 1)[pattern.size :]], pattern.size)
@@ -254,8 +256,8 @@ def test_a_plan_serves_all_that_have_its_tree_while_any_uses_it():
     np.testing.assert_allclose(solve(plan, factorise(plan, values), vector), expected, rtol=1e-12)
 
 
-def test_patterns_of_one_tree_but_other_entries_share_no_plan():
-    """Eliminated in the same order, all in one front, but read from other places."""
+def test_patterns_with_equal_trees_but_other_entries_share_no_plan():
+    """They have the same elimination order in one front, but their values are read from other positions."""
     size, random = 12, np.random.default_rng(0)
     row, column = np.tril_indices(size, -1)
     kept = []

@@ -1,4 +1,4 @@
-"""Fronts of their own size: found, eliminated and solved as dense algebra does it, at hand and in compiled programs."""
+"""Fronts of exact size: found, eliminated and solved as in dense algebra, in NumPy and in compiled programs."""
 
 import threading
 from dataclasses import replace
@@ -30,7 +30,7 @@ SPREAD = (sparse_problems.disk, sparse_problems.box)
 
 
 def of_many_fronts(monkeypatch):
-    """Leaves of a few rows, so that small problems have trees of several levels, and threads for any work."""
+    """Use leaves of a few rows, so that small problems have several levels, and threads for any amount of work."""
     monkeypatch.setattr(exact_fronts, "_LEAF_SIZE", 8)
     monkeypatch.setattr(exact_fronts_numpy, "_MIN_PARALLEL_OPERATIONS", 0)
     monkeypatch.setattr(exact_fronts_numpy, "_ADDED_ROWS", 3)
@@ -61,7 +61,7 @@ def test_every_problem_is_solved_to_roundoff(case, small_fronts, monkeypatch):
 
 
 @pytest.mark.parametrize("case", SPREAD)
-def test_fronts_are_a_tree_that_holds_every_entry_once(case, monkeypatch):
+def test_fronts_form_a_tree_that_holds_every_entry_once(case, monkeypatch):
     of_many_fronts(monkeypatch)
     pattern, _, coordinates, _ = problem(case)
     found = exact_fronts._build_fronts(
@@ -79,7 +79,7 @@ def test_fronts_are_a_tree_that_holds_every_entry_once(case, monkeypatch):
     assert starts == sorted(starts)
     assert len(found.steps) == 4
     assert sum(one.pivots for one in found.fronts) == pattern.size
-    # No row that elimination changes is left out of a border.
+    # No row that elimination changes is missing in a border.
     lower = np.linalg.cholesky(dense(pattern, np.asarray(case()[1]))[np.ix_(found.order, found.order)])
     for one in found.fronts:
         below = lower[one.first + one.pivots :, one.first : one.first + one.pivots]
@@ -88,7 +88,7 @@ def test_fronts_are_a_tree_that_holds_every_entry_once(case, monkeypatch):
     assert "operations)" in repr(found)
 
 
-def test_known_fronts_are_found_again_and_others_are_unlike():
+def test_known_fronts_are_reused_and_others_are_not():
     pattern, _, coordinates, _ = problem(sparse_problems.disk)
     found = find_fronts(pattern, coordinates)
     assert find_fronts(pattern, coordinates) is found
@@ -147,8 +147,8 @@ def test_compiled_programs_and_their_derivatives():
     np.testing.assert_allclose(single, energy, rtol=1e-5)
 
 
-def test_eight_threads_solve_each_its_own_matrix():
-    """Compiled programs that wait for NumPy, while others run and factorise other matrices."""
+def test_eight_threads_solve_separate_matrices():
+    """Compiled programs that wait for NumPy while others run and factorise other matrices."""
     solved = jax.jit(Compiled.energy)
     vector, found = jnp.asarray(Compiled.vectors[:, 0]), np.full(8, np.nan)
 
@@ -167,8 +167,8 @@ def test_eight_threads_solve_each_its_own_matrix():
 
 
 def test_more_programs_than_cores_may_call_numpy_at_once(monkeypatch):
-    """From threads of XLA's, where programs have work beside them; with arrays of over 100 kB, which JAX copies in such
-    threads; inside parts on cores and outside."""
+    """Calls come from threads of XLA when programs run other operations besides, with arrays of over 100 kB, which JAX
+    copies in such threads, inside and outside of parts on cores."""
     of_many_fronts(monkeypatch)
     monkeypatch.setattr(exact_fronts, "_LEAF_SIZE", 128)
     size = 8000
@@ -215,7 +215,7 @@ def test_right_hand_sides_of_every_kind():
         factorise_fronts(Compiled.solver.fronts, Compiled.values[1:])
 
 
-def test_the_last_factor_serves_again_unless_it_is_large(monkeypatch):
+def test_the_last_factor_is_reused_unless_it_is_large(monkeypatch):
     made = []
     monkeypatch.setattr(exact_fronts_numpy, "_LAST_FACTOR", LastMatrix())
     plain = factorise_fronts
@@ -238,7 +238,7 @@ def test_fronts_of_another_pattern_are_refused():
         Compiled.solver.init(SparseSymmetric(jnp.asarray(values), other), {})
 
 
-def test_the_choice_follows_size_memory_and_device(monkeypatch):
+def test_the_choice_depends_on_size_memory_and_device(monkeypatch):
     pattern, values, coordinates, vectors = problem(sparse_problems.box)
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     small = choose_solver(pattern, coordinates)

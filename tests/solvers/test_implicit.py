@@ -1,4 +1,4 @@
-"""Derivatives of a minimum against differences of minima, which NumPy finds to rounding."""
+"""Derivatives of a minimum against differences of minima computed to rounding in NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ def cost(x, problem):
 
 
 def steps(problem, number):
-    """So many of Newton's steps from zero, in NumPy."""
+    """This number of Newton steps from zero, in NumPy."""
     x = np.zeros(4)
     for _ in range(number):
         curve = np.tanh(MATRIX @ x)
@@ -38,12 +38,12 @@ NEAR = steps(PROBLEM, 2)
 
 
 def minimum(problem):
-    """From a point that is near, not there, and that changes with the problem in a way that says nothing."""
+    """A point near the minimum, whose dependence on the problem is arbitrary and must not enter the derivatives."""
     return as_minimum(NEAR * (1 + 0.1 * (problem["weight"] - 0.7)), problem, jax.grad(cost), precondition)
 
 
 def differences(function, step):
-    """First and second derivative at zero, by central differences of fourth order."""
+    """First and second derivative at zero, by fourth-order central differences."""
     far_behind, behind, here, ahead, far_ahead = (function(by * step) for by in (-2, -1, 0, 1, 2))
     first = (8 * (ahead - behind) - (far_ahead - far_behind)) / (12 * step)
     return first, (16 * (ahead + behind) - (far_ahead + far_behind) - 30 * here) / (12 * step**2)
@@ -59,7 +59,7 @@ def test_first_derivatives(mode):
     np.testing.assert_allclose(found["weight"], expected, rtol=0, atol=1e-8)
 
 
-def test_the_point_itself_is_as_it_was_found():
+def test_the_point_itself_is_returned_unchanged():
     np.testing.assert_array_equal(minimum(PROBLEM), NEAR)
 
 

@@ -1,4 +1,5 @@
-"""k-means against NumPy's Lloyd step by step, against scikit-learn's inertia, and against what a clustering must be."""
+"""k-means against Lloyd's algorithm in NumPy step by step, against scikit-learn's inertia, and by properties of
+clusterings."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from jeit_solvers.clustering import _lloyd
 
 
 def blobs(seed=0, count=30, number=400, d=24):
-    """Points round `count` corners that are 100 times as far apart as the points of one."""
+    """Points round `count` corners whose distances are 100 times the spread of a cluster."""
     rng = np.random.default_rng(seed)
     truth = rng.permutation(np.arange(number) % count)
     corners = 100 * np.concatenate([np.eye(d), -np.eye(d)])[:count]
@@ -18,7 +19,7 @@ def blobs(seed=0, count=30, number=400, d=24):
 
 
 def skin(side=20, sensors=24, seed=1):
-    """Responses (side², sensors) of sensors scattered on a square, each felt nearby: vectors along a smooth surface."""
+    """Responses (side², sensors) of sensors scattered on a square to nearby touches: vectors along a smooth surface."""
     rng = np.random.default_rng(seed)
     places = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, side)]), axis=-1).reshape(-1, 2)
     square = np.sum((places[:, None] - rng.random((sensors, 2))) ** 2, axis=2)
@@ -42,7 +43,7 @@ def lloyd(points, centres, steps):
     return squared_distances(points, centres).argmin(axis=1), centres
 
 
-# How many steps are allowed, a program does not care.
+# One program for any number of steps.
 _descent = jax.jit(_lloyd)
 
 
@@ -63,7 +64,8 @@ SETS, KEYS = np.stack([skin(seed=seed) for seed in (1, 2, 3)]), (0, 6, 7)
 
 @pytest.fixture(scope="module")
 def together():
-    """Clusters of three sets in a batch, and the derivatives of their inertias: one program, which takes long."""
+    """Clusters of three sets in a batch, and the derivatives of their inertias, in one program, which takes long to
+    compile."""
 
     def inertia(points, key):
         found = kmeans(points, 30, key)
@@ -74,8 +76,8 @@ def together():
 
 
 @pytest.mark.parametrize("steps", [1, 2, 5, 9])
-def test_every_step_is_lloyds(steps):
-    """Also of the later steps, in which only the centres that moved are looked at again."""
+def test_every_step_equals_lloyd(steps):
+    """Also the later steps, in which only the centres that moved are examined."""
     points = skin()
     start = points[np.random.default_rng(2).choice(len(points), 30, replace=False)]
     ended, centres = descend(points, start, steps)
@@ -86,8 +88,8 @@ def test_every_step_is_lloyds(steps):
     assert float(ended.inertia) == pytest.approx(squared_distances(points, expected).min(axis=1).sum(), rel=1e-10)
 
 
-def test_empty_clusters_get_the_farthest_points():
-    """Two of the centres start where no point is nearest: they jump to the two points farthest from their centres."""
+def test_empty_clusters_take_the_farthest_points():
+    """No point is nearest to two of the centres: they jump to the two points farthest from their centres."""
     points = skin()
     rng = np.random.default_rng(3)
     start = points[rng.choice(len(points), 10, replace=False)]
@@ -124,7 +126,7 @@ def test_blobs_are_recovered():
     assert float(found.inertia) == pytest.approx(np.sum((points - means[labels]) ** 2), rel=1e-12)
 
 
-def test_ends_where_another_step_changes_nothing(found):
+def test_converged_centres_are_a_fixed_point(found):
     points = skin()
     assert found.converged
     labels, centres = lloyd(points, np.asarray(found.centres), 1)
@@ -132,8 +134,8 @@ def test_ends_where_another_step_changes_nothing(found):
     np.testing.assert_allclose(found.centres, centres, rtol=1e-10, atol=1e-13)
 
 
-def test_no_worse_than_numpy(found):
-    """Than the best of ten random starts, drawn without any skill, and clearly better than most of them."""
+def test_inertia_is_no_worse_than_in_numpy(found):
+    """Compared with the best of ten simple random starts, and clearly better than most of them."""
     points, rng = skin(), np.random.default_rng(5)
     inertia = []
     for _ in range(10):
@@ -143,8 +145,8 @@ def test_no_worse_than_numpy(found):
     assert found.inertia < 0.97 * np.median(inertia)
 
 
-def test_inertia_is_scikit_learns():
-    """Within 1 %, with as many restarts: the median of a few keys and seeds, which differ by that much themselves."""
+def test_inertia_equals_scikit_learn():
+    """Within 1 % with as many restarts: the median of a few keys and seeds, whose scatter is of this size."""
     reason = "scikit-learn, of the extra test, is not installed"
     cluster = pytest.importorskip("sklearn.cluster", reason=reason)
     # Its threads would wait for those of XLA.
@@ -156,15 +158,15 @@ def test_inertia_is_scikit_learns():
     assert np.median(mine) == pytest.approx(np.median(theirs), rel=0.01)
 
 
-def test_where_the_origin_is_does_not_matter():
+def test_translation_does_not_matter():
     points = skin()
     near, far = (kmeans(points + shift, 30, jax.random.key(2)) for shift in (0.0, 1e6))
     np.testing.assert_array_equal(far.labels, near.labels)
-    # A millionth of a millionth of the digits is lost in the points already.
+    # The relative offset of 1e12 removes as many digits from the points themselves.
     assert float(far.inertia) == pytest.approx(float(near.inertia), rel=1e-6)
 
 
-def test_the_key_decides():
+def test_results_depend_on_the_key_alone():
     points = skin()
     first, again, other = (kmeans(points, 30, jax.random.key(seed)) for seed in (3, 3, 4))
     for mine, same in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
@@ -172,7 +174,7 @@ def test_the_key_decides():
     assert first.inertia != other.inertia
 
 
-def test_a_batch_gives_what_a_loop_gives(together):
+def test_batches_equal_loops(together):
     _, batch = together
     for index, seed in enumerate(KEYS):
         alone = kmeans(SETS[index], 30, jax.random.key(seed))
@@ -182,7 +184,7 @@ def test_a_batch_gives_what_a_loop_gives(together):
         assert bool(batch.converged[index]) == bool(alone.converged)
 
 
-def test_the_tolerance_stops_it_sooner():
+def test_a_larger_tolerance_takes_fewer_steps():
     points = skin()
     whole = kmeans(points, 30, jax.random.key(6))
     sooner = kmeans(points, 30, jax.random.key(6), tolerance=0.02)
@@ -201,14 +203,14 @@ def test_as_many_clusters_as_points():
 
 
 @pytest.mark.slow
-def test_one_cluster_lies_at_the_mean():
+def test_one_cluster_is_at_the_mean():
     points = skin(side=4)
     one = kmeans(points, 1, jax.random.key(7), restarts=1)
     np.testing.assert_allclose(one.centres[0], points.mean(axis=0))
 
 
-def test_more_clusters_than_points_that_differ():
-    """Every point is at its centre, and none is torn from its doubles to no avail for ever."""
+def test_more_clusters_than_distinct_points():
+    """Every point is at its centre, and the iteration ends although duplicate points could be exchanged for ever."""
     points = np.repeat(skin(side=2), 4, axis=0)
     found = kmeans(points, 16, jax.random.key(8), restarts=1)
     assert found.converged
@@ -216,8 +218,8 @@ def test_more_clusters_than_points_that_differ():
     assert float(found.inertia) == pytest.approx(0, abs=1e-20)
 
 
-def test_inertia_has_a_derivative(together):
-    """dI/dx = 2 (x - c): means are where it does not depend on the centres."""
+def test_inertia_is_differentiable(together):
+    """dI/dx = 2 (x - c): at the means, the derivative in the centres is zero."""
     slopes, found = together
     nearest = np.stack([centres[labels] for centres, labels in zip(found.centres, found.labels, strict=True)])
     np.testing.assert_allclose(slopes, 2 * (SETS - nearest), rtol=1e-10, atol=1e-12)
@@ -240,7 +242,7 @@ def test_inertia_has_a_derivative(together):
         (r"jax.random.key\(0\)", {"key": 0}),
     ],
 )
-def test_refuses_what_makes_no_sense(match, change):
+def test_invalid_input_is_refused(match, change):
     arguments = {"points": np.arange(18.0).reshape(9, 2), "num_clusters": 3, "key": jax.random.key(0)} | change
     with pytest.raises(ValueError, match=match):
         kmeans(**arguments)

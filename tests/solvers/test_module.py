@@ -1,4 +1,4 @@
-"""`Module`: its bound methods are those of Equinox, and are not made anew each time."""
+"""`Module`: its bound methods equal those of Equinox, and are cached."""
 
 import copy
 import pickle
@@ -12,7 +12,7 @@ from jeit_solvers.module import Module
 
 
 class Line(eqx.Module):
-    """As Equinox binds."""
+    """A method bound by Equinox."""
 
     slope: np.ndarray
     offset: np.ndarray
@@ -23,7 +23,7 @@ class Line(eqx.Module):
 
 
 class QuickLine(Module):
-    """The same, bound quickly."""
+    """The same method, bound quickly."""
 
     slope: np.ndarray
     offset: np.ndarray
@@ -45,7 +45,7 @@ def test_methods_belong_to_their_own_object():
     assert second.__self__ is OTHER
 
 
-def test_bound_methods_are_those_of_equinox():
+def test_bound_methods_equal_those_of_equinox():
     """The same type, name, docstring and leaves, so that they pass through transformations of JAX."""
     quick, slow = ONE.at, Line(ONE.slope, ONE.offset).at
     assert type(quick) is type(slow)
@@ -60,13 +60,13 @@ def test_bound_methods_are_those_of_equinox():
         assert other.__self__ is not ONE
 
 
-def test_fields_that_are_functions_stay_what_they_are():
+def test_fields_that_are_functions_stay_unbound():
     assert ONE.then is abs
     assert ONE.__class__ is QuickLine
 
 
-def test_binding_does_not_check_the_object_anew(monkeypatch):
-    """Equinox looks at every leaf of the object whenever it binds a method."""
+def test_binding_does_not_check_the_object_again(monkeypatch):
+    """Equinox examines every leaf of the object whenever it binds a method."""
     slow, looked = Line(ONE.slope, ONE.offset), []
     assert ONE.at(0.0) == 1.0
     leaves = jax.tree_util.tree_leaves

@@ -1,5 +1,5 @@
-"""Multigrid: its solutions are those of dense algebra, at hand, in compiled programs and in derivatives; its steps do
-not grow with the mesh; and where there is no solution there is none."""
+"""Multigrid: solutions equal those of dense algebra in NumPy, in compiled programs and in derivatives; the number of
+steps does not grow with the mesh; and unsolvable systems give NaN."""
 
 import threading
 
@@ -19,7 +19,7 @@ pytest.importorskip("pyamg", reason="PyAMG, of the extra `large`, is not install
 
 @pytest.fixture(autouse=True)
 def of_many_levels(monkeypatch):
-    """Small problems get three levels, and groups of few columns."""
+    """Give small problems three levels, and groups of few columns."""
     monkeypatch.setattr(multigrid, "_MAX_COARSEST_SIZE", 3)
     monkeypatch.setattr(multigrid, "_MAX_COLUMNS", 2)
     monkeypatch.setattr(multigrid, "_LAST_HIERARCHY", multigrid.LastMatrix())
@@ -42,7 +42,7 @@ def test_every_problem_is_solved_to_the_tolerance(case):
 
 
 def grid(size, contrast):
-    """A square grid of size × size nodes with conductances that are so many times apart, grounded at one node."""
+    """A square grid of size × size nodes with a given ratio of conductances, grounded at one node."""
     number = np.arange(size * size).reshape(size, size)
     pairs = np.concatenate([
         np.stack([number[:, 1:].ravel(), number[:, :-1].ravel()], axis=1),
@@ -68,8 +68,8 @@ def steps(pattern, values):
     return enough
 
 
-def test_steps_grow_neither_with_the_mesh_nor_with_the_contrast():
-    """Where the number of steps with the diagonal alone, for example, is proportional to the size."""
+def test_steps_depend_neither_on_the_mesh_nor_on_the_contrast():
+    """With a diagonal preconditioner, for example, the number of steps is proportional to the size."""
     few = steps(*grid(12, 1.0))
     assert few < 25
     assert steps(*grid(96, 1.0)) < 2 * few
@@ -85,7 +85,7 @@ def test_right_hand_sides_of_every_kind():
 
 
 def test_complex_loads_whose_squares_cancel():
-    """Of a real system; the conjugate orthogonal variant breaks down at once."""
+    """The loads of a real system; the conjugate orthogonal variant breaks down at once."""
     pattern, values, _ = problem(sparse_problems.diagonal)
     load = np.zeros((pattern.size, 1), complex)
     load[[0, 1], 0] = 1, 1j * np.sqrt(2)
@@ -116,7 +116,7 @@ def test_an_indefinite_matrix_with_a_positive_diagonal_gives_nan():
     assert np.isnan(Multigrid().solve_columns(SparseSymmetric(values, pattern), vectors)).any()
 
 
-def test_columns_that_take_more_steps_than_allowed_are_nan():
+def test_columns_that_exceed_the_maximum_of_steps_are_nan():
     pattern, values, vectors = problem(sparse_problems.disk)
     vectors[:, 3] = 0
     found = Multigrid(max_steps=2).solve_columns(SparseSymmetric(values, pattern), vectors)
@@ -146,7 +146,7 @@ def test_compiled_programs_and_their_derivatives():
     np.testing.assert_allclose(batch, energy / (1 + np.arange(3)), rtol=1e-12)
 
 
-def test_eight_threads_solve_each_its_own_matrix():
+def test_eight_threads_solve_separate_matrices():
     solved = jax.jit(Compiled.energy)
     vector, found = jnp.asarray(Compiled.vectors[:, 0]), np.full(8, np.nan)
 
@@ -162,7 +162,7 @@ def test_eight_threads_solve_each_its_own_matrix():
     np.testing.assert_allclose(found * (1 + np.arange(8)), found[0], rtol=1e-12)
 
 
-def test_what_cannot_be_asked_is_refused(monkeypatch):
+def test_invalid_requests_are_refused(monkeypatch):
     with pytest.raises(ValueError, match="`tolerance` must be between 0 and 1; got 1"):
         Multigrid(1.0)
     with pytest.raises(ValueError, match="`max_steps` must be positive; got 0"):
@@ -174,7 +174,7 @@ def test_what_cannot_be_asked_is_refused(monkeypatch):
         Multigrid()
 
 
-def test_it_is_chosen_where_a_factor_does_not_fit_or_takes_longer(monkeypatch):
+def test_chosen_where_a_factor_does_not_fit_or_takes_longer(monkeypatch):
     pattern, values, vectors = problem(sparse_problems.box)
     too_large = choose_solver(pattern, memory_limit=1e3)
     assert isinstance(too_large, Multigrid)

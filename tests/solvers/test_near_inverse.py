@@ -1,4 +1,4 @@
-"""Entries of the inverse near its diagonal, beside the dense inverse."""
+"""Entries of the inverse near its diagonal, compared with the dense inverse."""
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ from jeit_solvers import SparseSymmetric, SparsityPattern, Strips, near_inverse
 
 
 def three_disks():
-    """Three parts that are not coupled, side by side and beyond each other."""
+    """Three uncoupled parts, side by side and beyond each other."""
     points, cells = disk_cells(60)
     moves = np.array([[0.0, 0.0], [1.5, 3.0], [9.0, 0.0]])
     everywhere = (points + moves[:, None]).reshape(-1, 2)
@@ -36,7 +36,7 @@ def blocks(inverse, places):
 
 
 def all_pairs(strips, inverse, wanted, reach):
-    """Pairs of wanted unknowns that lie near enough, and G between them."""
+    """Pairs of wanted unknowns that are near enough, and the entries of G between them."""
     place = strips.place[wanted]
     strip = place // strips.selected_per_strip
     first, second = np.nonzero(np.abs(strip[:, None] - strip) <= reach)
@@ -44,7 +44,7 @@ def all_pairs(strips, inverse, wanted, reach):
     return wanted[first], wanted[second], np.asarray(found)[:, 0, 1]
 
 
-# Of shapes (a disk: where products are added), reaches, and all unknowns or some, every two; each needs a program.
+# By shapes (a disk, where products are added), reaches, and all or every second unknown; each needs a program.
 QUICK = {("box", 1, 0.3), ("three disks", 3, 0.3), ("one row", 50, 1.0)}
 SLOW = {
     *(("disk", 1, 1.0), ("disk", 3, 0.3), ("disk", 50, 1.0)),
@@ -56,7 +56,7 @@ CASES = [*sorted(QUICK), *(pytest.param(*case, marks=pytest.mark.slow) for case 
 
 
 @pytest.mark.parametrize(("name", "reach", "share"), CASES)
-def test_entries_are_those_of_the_dense_inverse(name, reach, share):
+def test_entries_equal_those_of_the_dense_inverse(name, reach, share):
     pattern, values, coordinates = PROBLEMS[name]()
     chosen = np.random.default_rng(0).random(pattern.size) < share
     strips = Strips.create(pattern, coordinates, chosen)
@@ -67,7 +67,7 @@ def test_entries_are_those_of_the_dense_inverse(name, reach, share):
     np.testing.assert_allclose(entries, expected[rows, columns], rtol=0, atol=1e-13 * np.abs(expected).max())
 
 
-def test_strips_are_coupled_to_the_next_only_and_hold_all():
+def test_strips_are_coupled_to_the_next_only_and_contain_all():
     for problem in PROBLEMS.values():
         pattern, _, coordinates = problem()
         strips = Strips.create(pattern, coordinates, np.ones(pattern.size, bool))
@@ -90,7 +90,7 @@ def test_products_are_added():
     np.testing.assert_allclose(entries, expected[rows, columns], rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
-def test_what_is_not_positive_definite_is_not_a_number():
+def test_matrices_that_are_not_positive_definite_give_nan():
     pattern, values, coordinates = PROBLEMS["disk"]()
     values = np.array(values)
     values[3] = -1.0

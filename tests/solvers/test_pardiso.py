@@ -1,4 +1,4 @@
-"""PARDISO: its solutions and derivatives are those of dense algebra, and where there is no solution there is none."""
+"""PARDISO: solutions and derivatives equal those of dense algebra, and unsolvable systems give NaN."""
 
 import threading
 
@@ -25,7 +25,7 @@ def problem(case):
 @installed
 @pytest.mark.parametrize("case", sparse_problems.PROBLEMS, ids=lambda case: case.__name__)
 def test_every_problem_is_solved(case):
-    """Real and complex matrices, of real and complex loads."""
+    """Real and complex matrices with real and complex loads."""
     pattern, values, vectors = problem(case)
     for given in (values, values * (1 + 0.3j * np.sin(np.arange(len(values))))):
         for load in (vectors, vectors * (1 + 2j), vectors[:, :1], vectors[:, ::-1]):
@@ -81,7 +81,7 @@ def test_threads_do_not_disturb_each_other():
         np.testing.assert_allclose(factor * found[number], found[0], rtol=1e-12)
 
 
-def test_without_the_package_it_is_named(monkeypatch):
+def test_error_without_the_package_names_it(monkeypatch):
     monkeypatch.setattr(pardiso, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"Pardiso needs pypardiso: pip install 'jeit\[mkl\]'"):
         Pardiso()

@@ -1,4 +1,5 @@
-"""Patterns, assembly and the lineax operator: against matrices added up entry by entry, and bad input explained."""
+"""Patterns, assembly and the lineax operator against matrices assembled entry by entry, and errors for invalid
+input."""
 
 from itertools import combinations
 
@@ -31,8 +32,8 @@ def added_up(groups, matrices, size):
     return total
 
 
-def test_fronts_hold_the_factor_and_the_factor_holds_the_matrix():
-    """Counts by which the direct solver is chosen, or an iterative one."""
+def test_numbers_of_entries_of_fronts_and_factor():
+    """Counts by which a direct or an iterative solver is chosen."""
     points, cells = sparse_problems.disk_cells(300)
     pattern = SparsityPattern.from_elements([cells], 300)
     fronts = find_fronts(pattern, points)
@@ -51,8 +52,8 @@ def groups():
 
 
 @pytest.mark.parametrize("imaginary", [0.0, 1.0])
-def test_assembly_adds_up_groups(groups, imaginary):
-    """In NumPy, and in compiled code."""
+def test_assembly_of_groups(groups, imaginary):
+    """In NumPy and in compiled code."""
     matrices = [sparse_problems.element_matrices(*group.shape) * (1 + 1j * imaginary) for group in groups]
     if not imaginary:
         matrices = [matrix.real for matrix in matrices]
@@ -130,7 +131,7 @@ def test_conjugate_solves_the_conjugate_system():
         assert np.linalg.norm(residual) < 1e-11 * np.linalg.norm(vector)
 
 
-def test_from_entries_keeps_the_callers_order_and_adds_duplicates():
+def test_from_entries_keeps_the_given_order_and_adds_duplicates():
     pattern = SparsityPattern.from_entries([0, 2, 1, 0, 2, 1], [0, 2, 1, 1, 0, 1], 3)
     values = pattern.assemble(np.array([4.0, 5.0, 6.0, 0.1, 0.2, 0.5]))
     np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""Results that are kept: known again by the very arrays and the kind of tree they came of, and only so many."""
+"""A cache of results: looked up by the identity of arrays and the structure of their tree, and limited in number."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from jeit_solvers.engines import Recent
 
 
-def test_the_same_arrays_in_the_same_tree_are_known_again():
+def test_the_same_arrays_in_the_same_tree_are_found():
     made = []
 
     def make(tree):
@@ -21,7 +21,7 @@ def test_the_same_arrays_in_the_same_tree_are_known_again():
 
 
 @pytest.mark.parametrize("size", [1, 3])
-def test_no_more_results_are_kept_than_asked_for(size):
+def test_the_number_of_results_is_limited(size):
     keep = Recent(lambda array: object(), size)
     arrays = [np.ones(1) for _ in range(5)]
     results = [keep(array) for array in arrays]
@@ -30,7 +30,7 @@ def test_no_more_results_are_kept_than_asked_for(size):
     assert not any(again[size:])
 
 
-def test_the_same_arguments_are_not_looked_into(monkeypatch):
+def test_identical_arguments_are_not_examined(monkeypatch):
     keep, tree = Recent(lambda tree: object()), {"a": np.ones(2)}
     kept = keep(tree)
     monkeypatch.setattr("jax.tree.flatten", None)

@@ -1,4 +1,4 @@
-"""Small systems in batches against NumPy's own, and small minimisations between bounds against SciPy's."""
+"""Batches of small systems against NumPy, and of small minimisations with bounds against SciPy."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from jeit_solvers import gradient_small, hessian_small, inverse_small, minimise_
 
 
 def definite(number, batch, seed=0, spread=3.0):
-    """Symmetric positive definite matrices (batch, n, n), of condition numbers up to some thousand."""
+    """Symmetric positive definite matrices (batch, n, n), with condition numbers up to some thousand."""
     rng = np.random.default_rng(seed)
     turn = np.linalg.qr(rng.normal(size=(batch, number, number)))[0]
     return (turn * np.exp(spread * rng.random((batch, 1, number)) * np.log(10) / 2)) @ turn.transpose(0, 2, 1)
@@ -32,15 +32,15 @@ def test_systems_are_solved(number):
     np.testing.assert_allclose(np.moveaxis(np.asarray(inverse), -1, 0), np.linalg.inv(matrices), rtol=1e-9, atol=1e-10)
 
 
-def test_scales_do_not_matter_to_systems():
-    """Unknowns of units as unlike as metres and logarithms: the matrix is scaled by D on both sides."""
+def test_systems_do_not_depend_on_scaling():
+    """Unknowns in units as different as metres and logarithms: the matrix is scaled by D on both sides."""
     matrix, right = definite(4, 1)[0], np.arange(1.0, 5.0)
     scale = np.array([1e-9, 1.0, 1e6, 1e12])
     solved, _ = solved_and_inverted((matrix * np.outer(scale, scale))[:, :, None], (right * scale)[:, None])
     np.testing.assert_allclose(np.asarray(solved)[:, 0] * scale, np.linalg.solve(matrix, right), rtol=1e-10)
 
 
-def test_only_the_broken_system_of_a_batch_is_nan():
+def test_only_the_singular_system_of_a_batch_is_nan():
     matrices = np.array(definite(3, 4))
     matrices[2] = -matrices[2]
     solved = np.asarray(solved_and_inverted(matrices.transpose(1, 2, 0), np.ones((3, 4)))[0])
@@ -48,7 +48,7 @@ def test_only_the_broken_system_of_a_batch_is_nan():
     np.testing.assert_allclose(solved[:, [0, 1, 3]].T, np.linalg.solve(matrices[[0, 1, 3]], np.ones((3, 3, 1)))[..., 0])
 
 
-def test_systems_can_be_differentiated():
+def test_systems_are_differentiable():
     """d(A⁻¹ b) = -A⁻¹ dA A⁻¹ b + A⁻¹ db."""
     matrix, change = definite(3, 2)
     right, shift = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -1.0])
@@ -62,16 +62,16 @@ def test_systems_can_be_differentiated():
     np.testing.assert_allclose(slope, expected, rtol=1e-10)
 
 
-# A quarter of the batch is enough for those that need more steps to be gathered.
+# A quarter of the batch is enough to gather those that need more steps.
 NUMBER, BATCH = 3, 200
 LOW, HIGH = np.array([-1.0, -0.5, -2.0]), np.array([1.0, 0.8, 0.3])
 
 
 @pytest.fixture(scope="module")
 def problems():
-    """Σ log cosh(A (x - c)) + ½ ridge: not quadratic, convex, with minima inside the box, on sides, in corners."""
+    """Σ log cosh(A (x - c)) + ½ ridge: not quadratic, convex, with minima inside the box, on sides, and in corners."""
     rng = np.random.default_rng(2)
-    # The batch is the last axis of what is handed on.
+    # The batch is the last axis of the arguments.
     return rng.normal(size=(5, NUMBER, BATCH)), 1.5 * rng.normal(size=(NUMBER, BATCH))
 
 
@@ -108,7 +108,7 @@ def descended(start, problems, skip, max_steps):
 
 
 def descend(start, problems, skip=None, max_steps=100):
-    """By one program for all that is skipped and any number of steps."""
+    """By one program for any skipped problems and any number of steps."""
     return descended(start, problems, np.zeros(start.shape[1], bool) if skip is None else skip, max_steps)
 
 
@@ -119,7 +119,7 @@ def found(problems):
 
 
 def test_same_minimum_as_scipy(problems, found):
-    """Inside the box, on its sides and in its corners: the problems hold all of them."""
+    """Inside the box, on its sides and in its corners: the problems include all of these."""
     x = np.asarray(found[1].x).T
     assert found[1].converged.all()
     for k in range(30):
@@ -132,7 +132,7 @@ def test_same_minimum_as_scipy(problems, found):
             method="L-BFGS-B",
             options={"ftol": 1e-15, "gtol": 1e-9, "maxiter": 1000},
         )
-        # SciPy differentiates numerically: its minimum is good to about 1e-5.
+        # SciPy differentiates numerically, so that its minimum is accurate to about 1e-5.
         np.testing.assert_allclose(mine, theirs.x, atol=3e-5)
         assert value <= theirs.fun + 1e-10
         assert float(value) == pytest.approx(value_of(mine, matrix, centre), rel=1e-12)
@@ -141,7 +141,7 @@ def test_same_minimum_as_scipy(problems, found):
 
 
 def test_first_order_conditions(problems, found):
-    """The gradient is zero where x is free, and points out of the box where it is held."""
+    """The gradient is zero where x is free, and points out of the box where x is at a bound."""
     x = np.asarray(found[1].x)
     gradient = np.asarray(expanded(x, problems)[1])
     free = (x > LOW[:, None]) & (x < HIGH[:, None])
@@ -151,11 +151,11 @@ def test_first_order_conditions(problems, found):
 
 
 def test_the_start_does_not_matter(problems, found):
-    far = np.full((NUMBER, BATCH), 50.0)  # beyond the bounds
+    far = np.full((NUMBER, BATCH), 50.0)  # outside of the bounds
     np.testing.assert_allclose(descend(far, problems).x, found[1].x, atol=1e-6)
 
 
-def test_a_batch_gives_what_a_loop_gives(problems, found):
+def test_batches_equal_loops(problems, found):
     start, x = found[0], np.asarray(found[1].x)
     for k in range(0, BATCH, 40):
         alone = descend(start[:, k : k + 1], tuple(part[..., k : k + 1] for part in problems))
@@ -166,8 +166,8 @@ def test_a_batch_gives_what_a_loop_gives(problems, found):
     np.testing.assert_allclose(shuffled.x, x[:, order], atol=1e-12)
 
 
-def test_a_start_that_is_not_finite_stays_and_is_said(problems, found):
-    """And does no harm to the others."""
+def test_a_start_that_is_not_finite_is_kept_and_reported(problems, found):
+    """It does not affect the others."""
     matrix = problems[0].copy()
     matrix[..., 7] = np.nan
     start = found[0]
@@ -179,7 +179,7 @@ def test_a_start_that_is_not_finite_stays_and_is_said(problems, found):
     np.testing.assert_allclose(np.asarray(result.x)[:, others], np.asarray(found[1].x)[:, others], atol=1e-12)
 
 
-def test_what_is_skipped_stays_and_is_not_converged(problems, found):
+def test_skipped_problems_keep_their_start_and_are_not_converged(problems, found):
     skip = np.random.default_rng(5).random(BATCH) < 0.6
     start = found[0]
     result = descend(start, problems, skip)
@@ -191,8 +191,8 @@ def test_what_is_skipped_stays_and_is_not_converged(problems, found):
     assert int(nothing.steps) == 0
 
 
-def test_none_takes_more_steps_than_allowed(problems, found):
-    """Nor of those that are gathered after the first steps: then some are not converged, and none lies about it."""
+def test_the_maximum_of_steps_is_not_exceeded(problems, found):
+    """Nor for those gathered after the first steps: some are then reported as not converged."""
     some = descend(found[0], problems, max_steps=8)
     assert int(some.steps) == 8
     assert 0 < int(some.converged.sum()) < BATCH
@@ -201,7 +201,8 @@ def test_none_takes_more_steps_than_allowed(problems, found):
 
 
 def test_a_step_cut_off_at_a_bound_is_still_a_descent():
-    """The second unknown's bound cuts the Newton step so that what is left of it points up: that is no minimum."""
+    """The second unknown's bound cuts off the Newton step so that the remainder points uphill, away from the
+    minimum."""
     matrix, target = np.array([[8.55, -2.94], [-2.94, 1.14]]), np.array([[0.5], [2.3]])
 
     def expand(x, _):
@@ -210,13 +211,13 @@ def test_a_step_cut_off_at_a_bound_is_still_a_descent():
 
     limit = np.ones((2, 1))
     result = minimise_small(expand, np.zeros((2, 1)), lower=-limit, upper=limit, largest_step=np.inf * limit)
-    # At y = 1 the least is where the first slope is nothing: 8.55 (x - 0.5) = 2.94 (1 - 2.3).
+    # At y = 1 the minimum is where the first slope is zero: 8.55 (x - 0.5) = 2.94 (1 - 2.3).
     np.testing.assert_allclose(result.x[:, 0], [0.5 - 2.94 * 1.3 / 8.55, 1.0], atol=1e-6)
     assert result.converged.all()
 
 
 def test_a_quadratic_takes_few_steps():
-    """Newton: the damping of a thousandth leaves a thousandth of the error a step, at first."""
+    """With Newton steps, the initial damping of a thousandth leaves a thousandth of the error in each step."""
     matrix, target = np.asarray(definite(2, 1)[0]), np.array([0.3, -0.2])
 
     def expand(x, _):
@@ -230,8 +231,8 @@ def test_a_quadratic_takes_few_steps():
     np.testing.assert_allclose(result.x[:, 0], target, atol=1e-7)
 
 
-def test_steps_are_no_longer_than_asked():
-    """Where curvature promises a step of a thousand, one of at most 0.25 is made in each: after four, at most one."""
+def test_steps_do_not_exceed_the_given_length():
+    """Curvature suggests a step of a thousand; each step is at most 0.25, and four steps are at most one."""
 
     def expand(x, _):
         slope = np.full_like(x, -1.0)
@@ -246,8 +247,8 @@ def test_steps_are_no_longer_than_asked():
     assert int(result.steps) == 4
 
 
-def test_never_higher_than_the_start():
-    """Along a valley that turns (Rosenbrock's), where full steps would go up; compared with SciPy's place, (1, 1)."""
+def test_the_result_is_never_higher_than_the_start():
+    """In Rosenbrock's curved valley, where full steps would go uphill; compared with SciPy's solution, (1, 1)."""
 
     def expand(x, _):
         off = np.stack([1 - x[0], 10 * (x[1] - x[0] ** 2)])
@@ -273,7 +274,7 @@ def test_never_higher_than_the_start():
 
 
 def test_numpy_and_compiled_code_agree(problems, found):
-    """The same steps, though NumPy gathers all that are left at once."""
+    """They take the same steps, although NumPy gathers all remaining problems at once."""
     start = found[0]
     limits = [bound[:, None] for bound in (LOW, HIGH)]
     options = {"lower": limits[0], "upper": limits[1], "largest_step": np.full((NUMBER, 1), 0.5), "tolerance": 1e-14}

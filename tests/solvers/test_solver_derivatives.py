@@ -1,7 +1,7 @@
-"""Both solvers through lineax, transform by transform, against the derivatives of A⁻¹b in closed form.
+"""Both solvers with lineax in every transformation, against the derivatives of A⁻¹b in closed form.
 
-With x = A⁻¹b: dx = A⁻¹(db − dA x), and for weights w of x and λ = A⁻¹w, entry (i, j) has the derivative
-−(λ_i x_j + λ_j x_i), a diagonal one −λ_i x_i, and b has λ. Without conjugation: so it is for complex numbers, too.
+With x = A⁻¹b: dx = A⁻¹(db − dA x). For weights w of x and λ = A⁻¹w, the derivative in entry (i, j) is −(λ_i x_j + λ_j
+x_i), in a diagonal entry −λ_i x_i, and in b it is λ. There is no conjugation, so this holds for complex numbers, too.
 """
 
 import jax
@@ -13,7 +13,7 @@ import sparse_problems
 
 from jeit_solvers import ConjugateGradient, SparseCholesky, SparseSymmetric, analyse, factorise, quadratic_form, solve
 
-# Each solver and each kind of number once; the other pairs are slow.
+# Each solver and each number type once; the other pairs are slow.
 CASES = [
     pytest.param(("direct", "float64"), id="direct-float64"),
     pytest.param(("direct", "complex128"), id="direct-complex128", marks=pytest.mark.slow),
@@ -26,7 +26,7 @@ CASES = [
 def case(request):
     """x(values, vector), the pattern, a point, and a direction."""
     route, dtype = request.param
-    # Two stages of fronts: as small as a system can be that exercises everything.
+    # Two stages of fronts: the smallest system that uses every part of the solver.
     pattern, values, coordinates = sparse_problems.from_cells(*sparse_problems.disk_cells(30))
     values, random = np.asarray(values), np.random.default_rng(0)
     if dtype == "complex128":
@@ -45,7 +45,8 @@ def case(request):
 
 
 def closed_form(pattern, point, direction):
-    """x, dx, and a function of weights and their change: the derivative of values and vector, and its change."""
+    """x, dx, and a function of weights and their change that returns the derivative in values and vector, and its
+    change."""
     rows, columns = np.asarray(pattern.rows), np.asarray(pattern.columns)
     matrix, change = (sparse_problems.dense(pattern, one[0]) for one in (point, direction))
     x = np.linalg.solve(matrix, point[1])
@@ -64,13 +65,14 @@ def closed_form(pattern, point, direction):
 
 
 def assert_close(actual, expected, tolerance=1e-9):
-    """To 1e-9 of the largest number: derivatives multiply the condition number, about 1e4, into the roundoff."""
+    """To 1e-9 of the largest number, because derivatives multiply the roundoff by the condition number of about 1e4."""
     for a, e in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(a, e, rtol=0, atol=tolerance * abs(e).max())
 
 
 def test_derivatives_in_forward_and_reverse_mode_and_of_a_gradient(case):
-    """The value, its derivative in a direction, weighted ones, and a product with the Hessian: one program."""
+    """The value, its derivative in a direction, weighted derivatives, and a product with the Hessian, in one
+    program."""
     solution, pattern, point, direction = case
     x, dx, pulled = closed_form(pattern, point, direction)
     weights = direction[1]
@@ -146,6 +148,6 @@ def test_state_is_reused():
     state = initialise(values)
     vector = jnp.arange(1.0, pattern.size + 1)
     reused = lineax.linear_solve(operator, vector, solver, state=state).value
-    # The state is what solves: with another matrix's factor the answer is the other matrix's.
+    # The solution is that of the state: with another matrix's factor it is that matrix's solution.
     doubled = lineax.linear_solve(operator, vector, solver, state=initialise(2 * values))
     np.testing.assert_allclose(doubled.value, reused / 2, rtol=1e-12)

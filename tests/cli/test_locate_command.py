@@ -1,4 +1,5 @@
-"""`jeit calibrate-microphones` and `jeit locate`: files in, files out, and every bad input in one line."""
+"""`jeit calibrate-microphones` and `jeit locate`: the files that they read and write, and one line for every invalid
+input."""
 
 import contextlib
 import csv
@@ -39,8 +40,8 @@ def received(places, strength=1.0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Taps and recordings, as intensities and as samples."""
-    folder = tmp_path_factory.mktemp("hearing")
+    """A folder of taps and recordings, as intensities and as samples."""
+    folder = tmp_path_factory.mktemp("locate")
     random = np.random.default_rng(1)
     places = grid(0.16, 0.16, 5, 5)
     geometry = {"microphones": MICROPHONES, "outline": OUTLINE, "positions": places}
@@ -51,7 +52,7 @@ def folder(tmp_path_factory):
     intensity[25:] = 0
     np.savez(folder / "recording.npz", intensity=intensity, times=times)
     np.save(folder / "path.npy", path)
-    # Noise of a touch in the second half of each recording; a little of the microphones' own throughout.
+    # Noise of a touch in the second half of each recording, and weak noise of the microphones throughout.
     burst = np.r_[np.zeros(800), np.ones(800)]
 
     def sound(place):
@@ -71,7 +72,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def sounded(folder):
-    """The same folder, with a calibration on samples."""
+    """The same folder, with a calibration from samples."""
     command = ["calibrate-microphones", str(folder / "sounds.npz"), "-o", str(folder / "sound.json"), "-q"]
     assert main([*command, "--decay", "inverse-square"]) == 0
     return folder
@@ -84,7 +85,7 @@ def rows(folder):
 
 @pytest.fixture(scope="module")
 def off(folder, tmp_path_factory):
-    """Taps whose intensities are off by a third."""
+    """Taps whose intensities have errors of a third."""
     random = np.random.default_rng(3)
     with np.load(folder / "taps.npz") as file:
         taps = {name: file[name] for name in file.files}
@@ -95,40 +96,40 @@ def off(folder, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_a_large_error_of_the_models_is_noted(folder, off, tmp_path, capsys):
-    """Of intensities off by a third; with what it means for a touch, which is told of every calibration."""
-    told = {"exact": " ".join((folder / "cal.txt").read_text("utf-8").split())}
+def test_large_model_errors_are_noted(folder, off, tmp_path, capsys):
+    """Intensities with errors of a third; the report of every calibration states the resulting error of location."""
+    printed = {"exact": " ".join((folder / "cal.txt").read_text("utf-8").split())}
     assert main(["calibrate-microphones", str(off), "--output", str(tmp_path / "off.json")]) == 0
-    told["off"] = " ".join(capsys.readouterr().out.split())
-    assert "the models miss" not in told["exact"]
+    printed["off"] = " ".join(capsys.readouterr().out.split())
+    assert "the models miss" not in printed["exact"]
     assert re.search(
-        r"decay model inverse-square: locates taps left out of the fit to 0\.0 mm, median \(", told["exact"]
+        r"decay model inverse-square: locates taps left out of the fit to 0\.0 mm, median \(", printed["exact"]
     )
-    assert "the models miss the recorded levels by" in told["off"]
-    assert "in another way here than in any decay model." in told["off"]
-    exact, miss = (float(re.search(r"error of location ± ([\d.]+) mm", one)[1]) for one in told.values())
+    assert "the models miss the recorded levels by" in printed["off"]
+    assert "in another way here than in any decay model." in printed["off"]
+    exact, miss = (float(re.search(r"error of location ± ([\d.]+) mm", one)[1]) for one in printed.values())
     assert exact < 0.2
     assert miss > 2
 
 
 @pytest.mark.slow
-def test_another_decay_model_is_advised_where_one_was_asked_for(folder, off, tmp_path, capsys):
-    """Of intensities off by a third; of exact ones the best law is named, and no error of it."""
+def test_another_decay_model_is_suggested_where_one_was_given(folder, off, tmp_path, capsys):
+    """Intensities with errors of a third. For exact intensities the report names the best decay model and no errors."""
     assert main(["calibrate-microphones", str(off), "-o", str(tmp_path / "one.json"), "--decay", "exponential"]) == 0
-    spoilt, exact = (
+    uneven, exact = (
         " ".join(one.split()) for one in (capsys.readouterr().out, (folder / "cal.txt").read_text("utf-8"))
     )
-    assert "the models miss the recorded levels by" in spoilt
-    assert "try another --decay, or auto." in spoilt
+    assert "the models miss the recorded levels by" in uneven
+    assert "try another --decay, or auto." in uneven
     assert "the models miss" not in exact
     assert re.search(r"decay model inverse-square: locates taps left out of the fit to 0\.0 mm, median \(", exact)
-    small, large = (float(re.search(r"error of location ± ([\d.]+) mm", one)[1]) for one in (exact, spoilt))
+    small, large = (float(re.search(r"error of location ± ([\d.]+) mm", one)[1]) for one in (exact, uneven))
     assert small < 0.2
     assert large > 2
 
 
-def test_intensities_to_a_track(folder, tmp_path, capsys):
-    """Exact intensities: every place to a micrometre, silence called silence, all three files."""
+def test_locate_from_intensities(folder, tmp_path, capsys):
+    """Exact intensities: positions to a micrometre, silent frames as "no touch", and all three files."""
     assert (folder / "cal.png").stat().st_size > 10_000
     status = main(
         ["locate", str(folder / "recording.npz"), "--calibration", str(folder / "cal.json"), "-o", str(tmp_path)]
@@ -146,15 +147,15 @@ def test_intensities_to_a_track(folder, tmp_path, capsys):
     assert len(report["touches"]) == 1
     assert report["touches"][0]["offset_s"] == pytest.approx(1.2)
     assert (tmp_path / "track.png").stat().st_size > 10_000
-    said = " ".join(capsys.readouterr().out.split())
-    assert "25 touch, 15 no touch" in said
-    # A stroke: from (70, 0) mm to where it is 1.2 s later.
-    assert f"1 0.000 1.200 70.0 → {70 * np.cos(3.6):.1f} 0.0 → {60 * np.sin(3.6):.1f}" in said
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "25 touch, 15 no touch" in printed
+    # A stroke: from (70, 0) mm to the position 1.2 s later.
+    assert f"1 0.000 1.200 70.0 → {70 * np.cos(3.6):.1f} 0.0 → {60 * np.sin(3.6):.1f}" in printed
 
 
 @pytest.mark.parametrize("name", ["touch.npz", "touch.wav"])
-def test_samples_to_a_track(name, sounded, tmp_path):
-    """A burst of noise: found within three standard deviations and a centimetre, from its onset on."""
+def test_locate_from_samples(name, sounded, tmp_path):
+    """A burst of noise is located within five standard deviations and a centimetre, from its onset on."""
     assert main(["locate", str(sounded / name), "-c", str(sounded / "sound.json"), "-o", str(tmp_path), "-q"]) == 0
     table = [row for row in rows(tmp_path) if row["x_m"]]
     assert table
@@ -168,8 +169,8 @@ def test_samples_to_a_track(name, sounded, tmp_path):
 
 
 @pytest.mark.slow
-def test_python_functions_do_what_the_commands_do(folder, tmp_path):
-    """The same files, but for the picture's compression: calibration, table and report."""
+def test_python_functions_give_the_same_results(folder, tmp_path):
+    """The same calibration, table and report as the commands write; only the picture's compression may differ."""
     fit = calibrate_microphones(read_taps(folder / "taps.npz"))
     write_calibration(fit, tmp_path / "made" / "cal.json")
     assert (tmp_path / "made" / "cal.json").read_text("utf-8") == (folder / "cal.json").read_text("utf-8")
@@ -186,8 +187,8 @@ def test_python_functions_do_what_the_commands_do(folder, tmp_path):
     assert reports[0] == reports[1]
 
 
-def test_python_functions_refuse_what_does_not_fit(folder):
-    """Gaps that are none, and settings of samples where there are intensities."""
+def test_python_functions_refuse_invalid_options(folder):
+    """Gaps that are too short, and sample settings for recordings of intensities."""
     recording, known = read_recording(folder / "recording.npz"), Calibration.load(folder / "cal.json")
     for options, message in (({"gap": 0.0}, "gap must be"), ({"gap": 0.01}, "gap: frames are 0.05 s apart")):
         with pytest.raises(ValueError, match=message):
@@ -198,12 +199,12 @@ def test_python_functions_refuse_what_does_not_fit(folder):
         calibrate_microphones(read_taps(folder / "taps.npz"), intensity=IntensitySettings())
 
 
-def test_intensities_of_samples_are_smoothed_as_those_are(sounded, tmp_path):
-    """Written to a file, with their overlap: the same track, and as sure of it."""
-    heard = calibrated_intensities(read_recording(sounded / "touch.npz"), Calibration.load(sounded / "sound.json"))
-    assert heard.overlap == 4
-    write_recording(tmp_path / "heard.npz", heard)
-    for name, output in ((sounded / "touch.npz", "samples"), (tmp_path / "heard.npz", "intensities")):
+def test_intensities_of_samples_are_smoothed_alike(sounded, tmp_path):
+    """Intensities written to a file with their overlap give the same track with the same uncertainty."""
+    measured = calibrated_intensities(read_recording(sounded / "touch.npz"), Calibration.load(sounded / "sound.json"))
+    assert measured.overlap == 4
+    write_recording(tmp_path / "intensities.npz", measured)
+    for name, output in ((sounded / "touch.npz", "samples"), (tmp_path / "intensities.npz", "intensities")):
         command = ["locate", str(name), "-c", str(sounded / "sound.json"), "-o", str(tmp_path / output), "-q"]
         assert main(command) == 0
     assert rows(tmp_path / "samples") == rows(tmp_path / "intensities")
@@ -211,7 +212,7 @@ def test_intensities_of_samples_are_smoothed_as_those_are(sounded, tmp_path):
 
 @pytest.mark.slow
 def test_two_touches_are_both_printed(folder, tmp_path, capsys):
-    """The second beside the first, though for a moment it is the stronger."""
+    """The second touch is beside the first, and stronger for a moment."""
     places = np.array([[0.05, 0.04], [-0.04, -2e-5]])
     first, second = received(places)
     share = np.where(np.isin(np.arange(12), [4, 8]), 1.6, 0.6)[:, None]
@@ -220,13 +221,13 @@ def test_two_touches_are_both_printed(folder, tmp_path, capsys):
     assert main(command) == 0
     table = capsys.readouterr().out
     (line,) = [line for line in table.splitlines() if "1, other" in line]
-    assert " -40.0 0.0 " in " ".join(line.split())  # what rounds to nothing has no sign
+    assert " -40.0 0.0 " in " ".join(line.split())  # values that round to zero have no sign
     assert "12 two" in line
 
 
 @pytest.mark.slow
-def test_a_touch_without_pauses(sounded, tmp_path, capsys):
-    """Silence to a recording by itself, which is said; found with a recording of silence."""
+def test_a_touch_without_pauses_needs_a_recording_of_silence(sounded, tmp_path, capsys):
+    """Without a recording of silence the touch is taken for silence, which is reported; with one it is located."""
     random = np.random.default_rng(6)
     times = np.arange(4000) / RATE
     tones = np.sin(2 * np.pi * np.arange(100, 900, 20)[:, None] * times + random.uniform(0, 6, (40, 1))).sum(axis=0)
@@ -236,9 +237,9 @@ def test_a_touch_without_pauses(sounded, tmp_path, capsys):
     command = ["locate", str(tmp_path / "shaken.npz"), "-c", str(sounded / "sound.json"), "-o", str(tmp_path)]
     assert main(command) == 0
     assert {row["status"] for row in rows(tmp_path)} == {"no touch"}
-    told = " ".join(capsys.readouterr().out.split())
-    assert "never pauses" in told
-    assert "untouched (--silence)" in told
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "never pauses" in printed
+    assert "untouched (--silence)" in printed
     assert "silence=" in json.loads((tmp_path / "report.json").read_text("utf-8"))["notes"][0]
     assert main([*command, "--silence", str(tmp_path / "hush.npz"), "-q"]) == 0
     found = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows(tmp_path)])
@@ -246,16 +247,16 @@ def test_a_touch_without_pauses(sounded, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_the_papers_loss(folder, tmp_path):
-    """`--method consistency` finds exact places too."""
+def test_consistency_method(folder, tmp_path):
+    """`--method consistency` (the loss of Park et al. 2022) locates exact intensities too."""
     command = ["locate", str(folder / "recording.npz"), "-c", str(folder / "cal.json"), "-o", str(tmp_path), "-q"]
     assert main([*command, "--method", "consistency"]) == 0
     found = np.array([[float(row["x_m"]), float(row["y_m"])] for row in rows(tmp_path)[:25]])
     assert np.abs(found - np.load(folder / "path.npy")[:25]).max() < 1e-6
 
 
-def test_silence_is_no_error(sounded, tmp_path):
-    """All silent: a table of "no touch", a report, and a picture."""
+def test_a_silent_recording_is_no_error(sounded, tmp_path):
+    """All frames are silent: a table of "no touch", a report and a picture."""
     np.savez(tmp_path / "noise.npz", samples=0.01 * np.random.default_rng(5).standard_normal((9, 4000)), rate=RATE)
     command = ["locate", str(tmp_path / "noise.npz"), "-c", str(sounded / "sound.json"), "-o", str(tmp_path), "-q"]
     assert main(command) == 0
@@ -265,7 +266,7 @@ def test_silence_is_no_error(sounded, tmp_path):
 
 @pytest.mark.slow
 def test_exchanged_microphones_are_named(folder, tmp_path):
-    """Two plugs exchanged since the calibration: the report's notes name them."""
+    """Two microphones exchanged since the calibration are named in the report's notes."""
     with np.load(folder / "recording.npz") as arrays:
         intensity, times = arrays["intensity"], arrays["times"]
     intensity[:, [2, 6]] = intensity[:, [6, 2]]
@@ -278,7 +279,7 @@ def test_exchanged_microphones_are_named(folder, tmp_path):
 
 
 def _bad_files(folder):
-    """Files that are no calibration, no taps or no recording of these."""
+    """Write invalid calibrations, taps and recordings."""
     text = (folder / "cal.json").read_text("utf-8")
     (folder / "version.json").write_text(text.replace('"version": 1', '"version": 7'))
     (folder / "unit.json").write_text(text.replace('"length": "m"', '"length": "mm"'))
@@ -306,12 +307,12 @@ CALIBRATE = ["calibrate-microphones", "taps.npz", "-o", "new.json"]
 
 
 def instead(command, **changes):
-    """A command with some words changed."""
+    """A command with some words replaced."""
     return [changes.get(word.replace(".", "_"), word) for word in command]
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "expected"),
     [
         (instead(LOCATE, cal_json="version.json"), "version 7"),
         (instead(LOCATE, cal_json="unit.json"), "mm"),
@@ -345,14 +346,14 @@ def instead(command, **changes):
         (instead(CALIBRATE, new_json="."), "folder"),
     ],
 )
-def test_bad_input_is_explained(command, said, sounded, monkeypatch, capsys):
-    """Exit status 1, one line on standard error, and nothing like a traceback."""
+def test_bad_input_is_explained(command, expected, sounded, monkeypatch, capsys):
+    """Exit status 1 and one line on standard error, without a traceback."""
     monkeypatch.chdir(sounded)
     if not (sounded / "version.json").exists():
         _bad_files(sounded)
     assert main(command) == 1
-    told = capsys.readouterr().err
-    assert said in told
-    assert told.count("\n") == 1
-    assert "Traceback" not in told
-    assert "should not have happened" not in told
+    error = capsys.readouterr().err
+    assert expected in error
+    assert error.count("\n") == 1
+    assert "Traceback" not in error
+    assert "should not have happened" not in error
