@@ -1,4 +1,4 @@
-"""A long simulated recording of gestures: where loads are is where the skin changes, and nowhere else."""
+"""A long simulated recording of gestures: the skin changes where loads are, and nowhere else."""
 
 import jax
 import numpy as np
@@ -43,7 +43,7 @@ def test_the_skin_changes_where_it_is_touched(skin):
         ({"pause": -1.0}, "pause must be"),
     ],
 )
-def test_what_cannot_be_is_said(skin, change, said):
+def test_bad_arguments(skin, change, said):
     given = {"key": KEY, "skin": skin, "people": [Person.draw(KEY)], "number": 2, "pause": 1.0} | change
     with pytest.raises(ValueError, match=said):
         simulate_gesture_stream(
