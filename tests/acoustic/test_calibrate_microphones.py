@@ -157,8 +157,8 @@ def test_standard_errors_are_the_errors(exact):
     """
     fits = drawn(exact[2], DRAWS)
     errors = np.array([logarithms_of(fit) - scaled("inverse-square", exact[0])[0] for fit in fits])
-    said = np.array([fit.calibration.standard_errors for fit in fits])
-    z = np.sqrt(np.mean((errors / said) ** 2, axis=(0, 2)))
+    estimated = np.array([fit.calibration.standard_errors for fit in fits])
+    z = np.sqrt(np.mean((errors / estimated) ** 2, axis=(0, 2)))
     assert ((z > 0.8) & (z < 1.25)).all(), z
 
 
@@ -377,7 +377,7 @@ def test_few_microphones_share_the_noise():
 
 
 @pytest.mark.parametrize(
-    ("places", "said"),
+    ("places", "message"),
     [
         (np.repeat(PLACES[80:81], 20, axis=0), r"only 0 of \d+ microphones received taps from 4 distances"),
         (np.repeat(PLACES[[10, 80, 150]], 7, axis=0), r"tap all over the skin"),
@@ -385,9 +385,9 @@ def test_few_microphones_share_the_noise():
     ],
     ids=["one place", "three places", "another order"],
 )
-def test_uninformative_taps_are_refused(places, said, exact):
+def test_uninformative_taps_are_refused(places, message, exact):
     power = exact[2][: len(places)] * np.exp(0.2 * np.random.default_rng(5).normal(size=(len(places), COUNT)))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         calibrated(power, places)
 
 

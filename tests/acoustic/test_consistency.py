@@ -188,5 +188,5 @@ def test_covariance_is_that_of_draws(microphone_array):
         found = localise(quiet, power, "consistency")
         error = found["position"] - place
         # Each variance of 1,024 draws has a standard error of 4.4 %. The tolerance allows nearly three times that.
-        actual, said = error.T @ error / len(error), found["covariance"].mean(axis=0)
-        np.testing.assert_allclose(actual, said, atol=0.12 * np.trace(said) / 2)
+        actual, predicted = error.T @ error / len(error), found["covariance"].mean(axis=0)
+        np.testing.assert_allclose(actual, predicted, atol=0.12 * np.trace(predicted) / 2)

@@ -40,7 +40,7 @@ def changed(samples, where, value):
 
 
 @pytest.mark.parametrize(
-    ("samples", "said"),
+    ("samples", "message"),
     [
         (np.zeros(4000), "dead: every sample is 0"),
         (np.full(4000, 0.25), "dead: every sample is 0.25"),
@@ -48,13 +48,13 @@ def changed(samples, where, value):
         (changed(np.zeros(4000), slice(7), np.inf), "dead: every finite sample is 0"),
     ],
 )
-def test_dead(samples, said):
+def test_dead(samples, message):
     kind, dead = sample_faults(samples, RATE)
-    assert dead == said
+    assert dead == message
     usable, reason = window_faults(kind, dead, 2000, 500)
     assert usable.shape == (5,)
     assert not usable.any()
-    assert reason == said
+    assert reason == message
 
 
 @pytest.mark.parametrize("level", [0.0, 0.004, -1.0])
@@ -224,7 +224,7 @@ def test_intensities_without_samples():
 
 
 @pytest.mark.parametrize(
-    ("reasons", "said"),
+    ("reasons", "message"),
     [
         ((), ""),
         (("", ""), ""),
@@ -236,5 +236,5 @@ def test_intensities_without_samples():
         ),
     ],
 )
-def test_one_reason_is_reported_once(reasons, said):
-    assert describe_faults(reasons) == said
+def test_one_reason_is_reported_once(reasons, message):
+    assert describe_faults(reasons) == message

@@ -406,10 +406,10 @@ def test_the_overlap_of_windows_is_that_of_the_measurement(known, touches):
 
 
 @pytest.mark.parametrize(
-    ("scale", "said"),
+    ("scale", "beginning"),
     [(1e-9, "touches are 1e-08 times"), (1e9, "touches are 1e+08 times"), (1e-3, ""), (1e3, "")],
 )
-def test_another_unit_is_noted(scale, said, known, touches):
+def test_another_unit_is_noted(scale, beginning, known, touches):
     """Beyond 40 dB from the taps. A smaller difference may be a light touch or a blow."""
     typical = float(np.median(locate(intensities_of(touches[1]), known).strength))
     known_strengths = eqx.tree_at(
@@ -417,7 +417,9 @@ def test_another_unit_is_noted(scale, said, known, touches):
     )
     scaled = intensities_of(scale * touches[1], floor=scale * FLOOR)
     notes = locate(scaled, known_strengths).notes
-    assert [note.startswith(said) and note.endswith("same gain and unit?") for note in notes] == [True] * bool(said)
+    assert [note.startswith(beginning) and note.endswith("same gain and unit?") for note in notes] == [True] * bool(
+        beginning
+    )
     assert locate(scaled, known).notes == ()
 
 

@@ -155,7 +155,7 @@ MISSING = np.where(np.arange(10).reshape(5, 2) == 3, np.nan, 0.1)
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         ({"rate": 40e3, "sound": SAMPLES}, "neither 'samples' nor 'intensity'; the file holds rate, sound"),
         ({}, "neither"),
@@ -200,16 +200,16 @@ MISSING = np.where(np.arange(10).reshape(5, 2) == 3, np.nan, 0.1)
         ({**FRAMES, "overlap": [4.0, 4.0]}, "overlap must be one real number"),
     ],
 )
-def test_bad_recordings(tmp_path, arrays, said):
+def test_bad_recordings(tmp_path, arrays, message):
     np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(ValueError, match=said) as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         read_recording(tmp_path / "bad.npz")
     assert str(caught.value).startswith("bad.npz: ")
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         (SOUND, "no array 'microphones'"),
         (without(TAPS, "outline"), "no array 'outline'; the file holds microphones, positions, intensity"),
@@ -261,9 +261,9 @@ def test_bad_recordings(tmp_path, arrays, said):
         ),
     ],
 )
-def test_bad_taps(tmp_path, arrays, said):
+def test_bad_taps(tmp_path, arrays, message):
     np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(ValueError, match=said) as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         read_taps(tmp_path / "bad.npz")
     assert str(caught.value).startswith("bad.npz: ")
     assert "\n" not in str(caught.value)
@@ -298,14 +298,14 @@ def files(folder):
 
 
 def test_bad_files(tmp_path):
-    said = {}
+    messages = {}
     for path, word in files(tmp_path):
         with pytest.raises(ValueError, match=word) as caught:
             read_recording(path)
         assert str(caught.value).startswith(f"{path.name}: ")
         assert "\n" not in str(caught.value)
-        said[path.name] = str(caught.value)
-    assert len(said) == 12
+        messages[path.name] = str(caught.value)
+    assert len(messages) == 12
     with pytest.raises(ValueError, match="neither an NPZ"):
         read_taps(tmp_path / "good.wav")
     for read in (read_recording, read_taps):
@@ -314,7 +314,7 @@ def test_bad_files(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda: Recording([[1, 2, 3], [1, 2]], 8000), "rows differ in length"),
         (lambda: Taps(SQUARE, SQUARE, SQUARE, samples=np.zeros((4, 4, 9))), "rate is missing"),
@@ -324,6 +324,6 @@ def test_bad_files(tmp_path):
         (lambda: Intensities(TIMES, POWER, faults=("", "")), "one string a microphone"),
     ],
 )
-def test_bad_arguments(call, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(call, message):
+    with pytest.raises(ValueError, match=message):
         call()

@@ -108,7 +108,7 @@ def test_a_stroke_stays_on_the_skin_and_turns(skin):
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda skin: wind(skin, KEY, (0.5, 0.0)), "off the skin"),
         (lambda skin: wind(skin, KEY, WHERE, strength=0.0), "strength must be a positive"),
@@ -121,6 +121,6 @@ def test_a_stroke_stays_on_the_skin_and_turns(skin):
         (lambda skin: SoundingPerson({"pat": {}}), r"medians\['pat'\] must have strength"),
     ],
 )
-def test_bad_input_is_explained(call, said, skin):
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_explained(call, message, skin):
+    with pytest.raises(ValueError, match=message):
         call(skin)

@@ -26,12 +26,12 @@ def model():
 
 def test_unseen_people_are_classified_correctly(model):
     made, labels, _ = touches(people=3, each=6, seed=7)
-    said = model.predict(made)
-    assert np.mean(said.gesture == labels) > 0.9
-    assert said.names == tuple(sorted(KINDS))
-    np.testing.assert_allclose(said.probabilities.sum(axis=1), 1)
-    np.testing.assert_array_equal(said.probability, said.probabilities.max(axis=1))
-    assert np.mean(said.unlike) < 0.1
+    predicted = model.predict(made)
+    assert np.mean(predicted.gesture == labels) > 0.9
+    assert predicted.names == tuple(sorted(KINDS))
+    np.testing.assert_allclose(predicted.probabilities.sum(axis=1), 1)
+    np.testing.assert_array_equal(predicted.probability, predicted.probabilities.max(axis=1))
+    assert np.mean(predicted.unlike) < 0.1
     assert len(model.predict([])) == 0
 
 
@@ -145,7 +145,7 @@ def test_other_files_are_refused(model, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"labels": ["tap"]}, "names of 16 gestures"),
         ({"labels": range(16)}, "names of 16 gestures"),
@@ -158,10 +158,10 @@ def test_other_files_are_refused(model, tmp_path):
         ({"touches": "tap"}, "touches must be a list"),
     ],
 )
-def test_bad_training_data_are_refused(change, said):
+def test_bad_training_data_are_refused(change, message):
     made, labels, _ = touches(people=2, each=2)
     given = {"touches": made, "labels": labels, "method": "nearest"} | change
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         GestureModel.fit(**given)
 
 
@@ -181,10 +181,10 @@ def test_probabilities_of_a_support_vector_machine_differ_between_touches():
         SVC(kernel="poly", degree=2, coef0=1.0).fit(values[:300], right[:300])
     )
     odds = log_odds(machine, values[300:])
-    said = np.exp(odds - np.logaddexp.reduce(odds, axis=1, keepdims=True))
-    sure = said.max(axis=1)
+    predicted = np.exp(odds - np.logaddexp.reduce(odds, axis=1, keepdims=True))
+    sure = predicted.max(axis=1)
     assert np.quantile(sure, 0.9) - np.quantile(sure, 0.1) > 0.2
-    correct = said.argmax(axis=1) == right[300:]
+    correct = predicted.argmax(axis=1) == right[300:]
     assert correct[sure > np.median(sure)].mean() > correct[sure <= np.median(sure)].mean() + 0.1
     voted = machine.decision_function(values[300:]).argmax(axis=1)
     assert np.mean(voted == odds.argmax(axis=1)) > 0.9

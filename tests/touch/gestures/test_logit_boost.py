@@ -34,10 +34,10 @@ def by_hand(x, label, rounds):
             for feature in x.T:
                 for low, high in zip(np.unique(feature)[:-1], np.unique(feature)[1:], strict=True):
                     below = feature <= (low + high) / 2
-                    said = np.where(below, *(np.sum((w * z)[one]) / np.sum(w[one]) for one in (below, ~below)))
-                    error = np.sum(w * (z - said) ** 2)
+                    leaf_means = np.where(below, *(np.sum((w * z)[one]) / np.sum(w[one]) for one in (below, ~below)))
+                    error = np.sum(w * (z - leaf_means) ** 2)
                     if error < best - 1e-12:
-                        best, fitted[:, j] = error, said
+                        best, fitted[:, j] = error, leaf_means
         score = score + share * (fitted - fitted.mean(axis=1, keepdims=True))
         stages.append(np.exp(score) / np.exp(score).sum(axis=1, keepdims=True))
     return stages
@@ -124,7 +124,7 @@ def test_a_constant_feature_adds_no_information():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"y": ["a"] * 4}, "one class only, 'a'"),
         ({"X": [[np.nan], [1.0], [2.0], [3.0]]}, "NaN"),
@@ -133,9 +133,9 @@ def test_a_constant_feature_adds_no_information():
         ({"learning_rate": 1.5}, "learning_rate must be above 0"),
     ],
 )
-def test_bad_training_data_are_refused(change, said):
+def test_bad_training_data_are_refused(change, message):
     given = {"X": [[0.0], [1.0], [2.0], [3.0]], "y": ["a", "a", "b", "b"]}
     settings = {name: value for name, value in change.items() if name not in given}
     given |= {name: value for name, value in change.items() if name in given}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         LogitBoostClassifier(**settings).fit(**given)

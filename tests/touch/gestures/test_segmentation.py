@@ -139,7 +139,7 @@ def test_the_level_is_five_deviations_above_untouched_peaks():
 
 
 @pytest.mark.parametrize(
-    ("action", "said"),
+    ("action", "message"),
     [
         (lambda: TouchLevel(MESH, 0.0), "level must be positive"),
         (lambda: TouchLevel(None, 1.0), "mesh must be a Mesh"),
@@ -159,6 +159,6 @@ def test_the_level_is_five_deviations_above_untouched_peaks():
         (lambda: course_features(None), "touches must be a list"),
     ],
 )
-def test_bad_arguments(action, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(action, message):
+    with pytest.raises(ValueError, match=message):
         action()

@@ -49,9 +49,9 @@ def test_an_order_in_time_is_learnt(monkeypatch):
     course[label == 1] = course[label == 1, ::-1]
     features = np.hstack([rng.normal(size=(400, 3)), course.reshape(400, -1)])
     network = TemporalNetwork.fit(features[:300], label[:300], whole=3, values=2)
-    said = network.predict_proba(features[300:])
-    np.testing.assert_allclose(said.sum(axis=1), 1)
-    assert np.mean(said.argmax(axis=1) == label[300:]) > 0.95
+    predicted = network.predict_proba(features[300:])
+    np.testing.assert_allclose(predicted.sum(axis=1), 1)
+    assert np.mean(predicted.argmax(axis=1) == label[300:]) > 0.95
     again = TemporalNetwork.fit(features[:300], label[:300], whole=3, values=2)
     np.testing.assert_array_equal(network.last, again.last)
 
@@ -99,9 +99,9 @@ def test_a_model_with_a_network_is_saved(tmp_path, monkeypatch):
     assert (model.method, model.form) == ("temporal-network", "sequence")
     model.write(tmp_path / "gestures.skops")
     asked = touches(people=2, seed=5)
-    said, right = (one.predict(asked[0]) for one in (GestureModel.read(tmp_path / "gestures.skops"), model))
-    np.testing.assert_array_equal(said.probabilities, right.probabilities)
-    assert np.ptp(said.probabilities, axis=0).min() > 0
+    predicted, right = (one.predict(asked[0]) for one in (GestureModel.read(tmp_path / "gestures.skops"), model))
+    np.testing.assert_array_equal(predicted.probabilities, right.probabilities)
+    assert np.ptp(predicted.probabilities, axis=0).min() > 0
 
 
 @pytest.mark.slow

@@ -106,10 +106,10 @@ def test_a_cut_that_the_user_denies_is_removed_from_the_model(after):
 
 def test_a_figure_has_the_cut_and_its_length(after):
     ax = plot_health(after, title="a skin", ax=Figure().subplots())
-    said = [text.get_text() for text in ax.texts]
+    labels = [text.get_text() for text in ax.texts]
     event = after.open_events[0]
-    assert any(f"cut, {1e3 * event.length:.0f} ± {1e3 * event.deviation:.0f} mm" in text for text in said)
-    assert any(text.endswith("0 mm") and text[0].isdigit() for text in said)  # the scale bar
+    assert any(f"cut, {1e3 * event.length:.0f} ± {1e3 * event.deviation:.0f} mm" in text for text in labels)
+    assert any(text.endswith("0 mm") and text[0].isdigit() for text in labels)  # the scale bar
     lines = [np.column_stack(line.get_data()) for line in ax.lines]
     assert any(line.shape == (2, 2) and np.allclose(line, after.open_events[0].path) for line in lines)
     image = after.images(after.reference[None])[0]
@@ -126,7 +126,7 @@ def test_after_repair_the_skin_is_healthy(after, skin):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"model": "disk"}, "model"),
         ({"sign": 0, "conductivity": SHEET}, "sign"),
@@ -134,10 +134,10 @@ def test_after_repair_the_skin_is_healthy(after, skin):
         ({"conductivity": 1e-4 * SHEET}, "times what the model predicts"),
     ],
 )
-def test_bad_references_are_refused(options, said):
+def test_bad_references_are_refused(options, message):
     model = disk_model(300)
     frames = np.asarray(model.voltages(SHEET)) * (1 + 1e-3 * np.random.default_rng(0).normal(size=(60, 208)))
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         SkinHealth.fit(frames, **({"model": model} | options))
     with pytest.raises(ValueError, match="channels"):
         SkinHealth.fit(frames[:, :90], model=model, conductivity=SHEET)

@@ -144,13 +144,13 @@ def faulty(kind: str, channel: int = 9) -> np.ndarray:
     return frames
 
 
-@pytest.mark.parametrize(("kind", "said"), [("noisy", "noisy"), ("jumps", "noisy"), ("stuck", "stuck")])
-def test_a_single_faulty_channel_is_named_and_left_out(health, kind, said):
+@pytest.mark.parametrize(("kind", "message"), [("noisy", "noisy"), ("jumps", "noisy"), ("stuck", "stuck")])
+def test_a_single_faulty_channel_is_named_and_left_out(health, kind, message):
     after = watch(health, faulty(kind))
     (event,) = [one for one in after.events if one.kind in (EventKind.NOISY, EventKind.STUCK)]
-    assert event.kind == f"{said} channel"
+    assert event.kind == f"{message} channel"
     assert np.flatnonzero(event.channels).tolist() == [9]
-    assert f"Channel 9 {'is several' if said == 'noisy' else 'does not move'}" in event.reason
+    assert f"Channel 9 {'is several' if message == 'noisy' else 'does not move'}" in event.reason
     assert np.flatnonzero(~after.trusted).tolist() == [9]
     assert event.noticed - 300 <= 2.5 * health.healthy.window * health.healthy.stride
     denied = after.deny(event)
@@ -231,7 +231,7 @@ def test_frames_with_missing_readings(health):
 
 
 @pytest.mark.parametrize(
-    ("ask", "said"),
+    ("ask", "message"),
     [
         (lambda _: SkinHealth.fit(recording(0)[:10]), "too few"),
         (lambda _: SkinHealth.fit(np.zeros((100, 4))), "every channel"),
@@ -250,6 +250,6 @@ def test_frames_with_missing_readings(health):
         (lambda health: health.confirm("it"), "event"),
     ],
 )
-def test_bad_input_is_refused(health, ask, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_refused(health, ask, message):
+    with pytest.raises(ValueError, match=message):
         ask(health)

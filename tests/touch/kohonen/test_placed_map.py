@@ -17,8 +17,8 @@ from jeit.touch.kohonen import read_map, touches_reported, write_map
 def test_places_are_interpolated_between_neurons(placed):
     """16 neurons across 170 mm are 11 mm apart. The errors of estimated places are a tenth of that."""
     places = drawn_places(5, 300)
-    said, spread = placed.locate(frames_at(places))
-    off = np.linalg.norm(said - places, axis=1)
+    estimated, spread = placed.locate(frames_at(places))
+    off = np.linalg.norm(estimated - places, axis=1)
     assert np.median(off) < 1.2e-3
     assert np.quantile(off, 0.95) < 5e-3
     ratio = np.sqrt(np.mean(off**2) / np.mean(np.sum(spread**2, axis=1)))
@@ -42,16 +42,16 @@ def test_a_grid_without_order_does_not_locate(learnt, pressed, places):
 
 def test_places_stay_on_the_skin_for_any_reading(placed):
     random = np.random.default_rng(0)
-    said, _ = placed.locate(REST + random.normal(0, 1e-3, (200, CHANNELS)))
-    assert np.linalg.norm(said, axis=1).max() < 0.2
+    estimated, _ = placed.locate(REST + random.normal(0, 1e-3, (200, CHANNELS)))
+    assert np.linalg.norm(estimated, axis=1).max() < 0.2
 
 
 def test_neurons_that_never_win_have_no_place(learnt, places):
     few = PlacedMap.learn(learnt, frames_at(places[:30]), places[:30])
     assert few.placed.sum() <= 30
     assert np.isnan(few.places[~few.placed]).all()
-    said, _ = few.locate(frames_at(places[:30]))
-    assert np.median(np.linalg.norm(said - places[:30], axis=1)) < 0.01
+    estimated, _ = few.locate(frames_at(places[:30]))
+    assert np.median(np.linalg.norm(estimated - places[:30], axis=1)) < 0.01
 
 
 @pytest.mark.parametrize("strengths", [(1.0,), (1.0, 0.5), (1.0, 0.5, 0.2)])

@@ -33,8 +33,8 @@ def test_a_blend_predicts_the_mean_of_the_best_methods():
     assert len(place.members) == standing.method.count(" on ") >= 2
     changes = FRESH["frames"] - FRESH["reference"]
     each = [model.predict(features(changes, FRESH["reference"])) for features, model in place.members]
-    said = place.mean + place.scale * np.mean(each, axis=0)
-    np.testing.assert_allclose(skin.predict(**ASK).position, said, atol=1e-9)
+    expected = place.mean + place.scale * np.mean(each, axis=0)
+    np.testing.assert_allclose(skin.predict(**ASK).position, expected, atol=1e-9)
     assert off(skin.predict(**ASK), FRESH["positions"]).mean() < 4e-3
 
 
@@ -328,7 +328,7 @@ def test_constant_frames_are_refused():
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda skin: skin.predict(FRESH["frames"][:, :30], FRESH["reference"][:, :30]), "frames have 30 channels"),
         (lambda skin: skin.predict(FRESH["frames"]), "reference is missing"),
@@ -346,8 +346,8 @@ def test_constant_frames_are_refused():
         (lambda skin: LearntSkin.fit(Presses.create(0 * FRESH["frames"], force=FRESH["force"])), "no channel changes"),
     ],
 )
-def test_bad_arguments_are_refused(quick, call, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments_are_refused(quick, call, message):
+    with pytest.raises(ValueError, match=message):
         call(quick)
 
 

@@ -24,10 +24,10 @@ ASKED = RNG.normal(size=(50, 6)) * np.linspace(2, 0.5, 6)
 @pytest.mark.parametrize("name", sorted(REGRESSORS))
 def test_numbers_are_learnt(name, monkeypatch):
     monkeypatch.setattr("jeit.touch.learnt.methods._SHOWN", 20)  # a map with few presses, each presented this often
-    said = np.asarray(REGRESSORS[name](FEATURES, TARGETS).predict(ASKED))
+    predicted = np.asarray(REGRESSORS[name](FEATURES, TARGETS).predict(ASKED))
     right = np.stack([np.tanh(ASKED[:, 0]), np.sin(ASKED[:, 1])], axis=1)
     guess = np.abs(right - right.mean(axis=0)).mean()
-    assert np.abs(said - right).mean() < {"ridge": 0.75, "forest": 0.85}.get(name, 0.55) * guess
+    assert np.abs(predicted - right).mean() < {"ridge": 0.75, "forest": 0.85}.get(name, 0.55) * guess
 
 
 @pytest.mark.parametrize("name", sorted(CLASSIFIERS))

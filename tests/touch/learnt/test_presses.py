@@ -45,7 +45,7 @@ def test_infinite_readings_are_missing():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"positions": 1e3 * GOOD["positions"]}, "are these metres"),
         ({"positions": GOOD["positions"][:20]}, "positions has 20 rows and frames 24"),
@@ -76,9 +76,9 @@ def test_infinite_readings_are_missing():
         ({"group": np.ones((24, 3))}, "one plain value for each press"),
     ],
 )
-def test_bad_presses_are_refused(change, said):
+def test_bad_presses_are_refused(change, message):
     given = {**GOOD, **change}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         Presses.create(given.pop("frames"), **given)
 
 

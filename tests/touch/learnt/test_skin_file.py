@@ -77,9 +77,9 @@ def test_classifiers(method, tmp_path, recorded):
     skin = LearntSkin.fit(presses.rows(slice(60)), method=method)
     write_skin(skin, tmp_path / "one.skops")
     asked = FRESH["frames"], FRESH["reference"]
-    said = skin.predict(*asked)
-    assert np.isfinite(said.probability).any()
-    np.testing.assert_array_equal(read_skin(tmp_path / "one.skops").predict(*asked).probability, said.probability)
+    predicted = skin.predict(*asked)
+    assert np.isfinite(predicted.probability).any()
+    np.testing.assert_array_equal(read_skin(tmp_path / "one.skops").predict(*asked).probability, predicted.probability)
 
 
 class Payload:

@@ -17,19 +17,21 @@ def fine():
 def test_deviations_are_calibrated_for_errors_of_which_few_are_large():
     """Their root mean square would exceed nearly all of them."""
     rng = np.random.default_rng(0)
-    said, changes, errors = rng.normal(size=(3, 1500, 2))
+    predictions, changes, errors = rng.normal(size=(3, 1500, 2))
     errors = errors * np.where(rng.random((1500, 1)) < 0.1, 10.0, 1.0)
-    spread = DeviationModel.learn(said[:500], changes[:500], errors[:500], np.ones(500, bool))
+    spread = DeviationModel.learn(predictions[:500], changes[:500], errors[:500], np.ones(500, bool))
     for some, deviations in ((slice(500, None), spread), (slice(500), spread.held_out)):
-        within = np.mean(np.abs(errors[some]) <= deviations(said[some], changes[some]))
+        within = np.mean(np.abs(errors[some]) <= deviations(predictions[some], changes[some]))
         assert 0.6 < within < 0.86
 
 
 def test_deviations_are_in_the_units_of_the_targets():
     rng = np.random.default_rng(0)
-    said, changes, errors = rng.normal(size=(3, 300, 2))
+    predictions, changes, errors = rng.normal(size=(3, 300, 2))
     one, thousand = (
-        DeviationModel.learn(unit * said, changes, unit * errors, np.ones(300, bool))(unit * said, changes)
+        DeviationModel.learn(unit * predictions, changes, unit * errors, np.ones(300, bool))(
+            unit * predictions, changes
+        )
         for unit in (1.0, 1000.0)
     )
     np.testing.assert_allclose(thousand, 1000 * one, rtol=1e-6)

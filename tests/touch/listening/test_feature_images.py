@@ -126,7 +126,7 @@ def test_features_count_taps():
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda: sound_images(np.zeros((1, 9000))), "recording must be a Recording"),
         (lambda: sound_images(noise(1), 100.0), "highest must be a frequency"),
@@ -134,6 +134,6 @@ def test_features_count_taps():
         (lambda: sound_images(noise(1, rate=1000.0)), "no sound above 500 Hz"),
     ],
 )
-def test_bad_input_is_explained(call, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_explained(call, message):
+    with pytest.raises(ValueError, match=message):
         call()

@@ -60,8 +60,8 @@ def test_the_best_method_on_held_out_clips_is_selected(learnt, tmp_path, monkeyp
     class Killed(Exception):
         pass
 
-    def kill(said: str) -> None:
-        if said.startswith("network, fold 3"):
+    def kill(message: str) -> None:
+        if message.startswith("network, fold 3"):
             raise Killed
 
     with pytest.raises(Killed):
@@ -223,7 +223,7 @@ def test_different_rates_and_channels_are_reported():
 
 
 @pytest.mark.parametrize(
-    ("call", "said"),
+    ("call", "message"),
     [
         (lambda: LabelledClips.from_recordings([], []), "there are no clips"),
         (
@@ -243,8 +243,8 @@ def test_different_rates_and_channels_are_reported():
         (lambda: Listener.fit(clips(2), key=3), "key"),
     ],
 )
-def test_bad_input_is_explained(call, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_explained(call, message):
+    with pytest.raises(ValueError, match=message):
         call()
 
 

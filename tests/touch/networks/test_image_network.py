@@ -87,7 +87,7 @@ def test_frames(small_skin, learnt):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda frame, rest: (frame[:-1], rest), "voltages has shape"),
         (lambda frame, rest: (frame, rest[:-1]), "reference has shape"),
@@ -95,9 +95,9 @@ def test_frames(small_skin, learnt):
         (lambda frame, rest: (frame, np.stack([rest, rest])), "reference has shape"),
     ],
 )
-def test_frames_of_other_shapes(small_skin, learnt, change, said):
+def test_frames_of_other_shapes(small_skin, learnt, change, message):
     given, rest = voltages(small_skin, [[Indent(Disc(0.02), 5e-3)]])
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         learnt[1].network.depth(*change(given[0], rest))
 
 
@@ -118,7 +118,7 @@ from small_networks import PRESET, small_maps
 
 skin = Skin.create(named_layout("grid-4x4", Rectangle(0.1, 0.1)), num_layers=0, cell_size=8e-3)
 with small_maps():
-    learn_images(skin, sys.argv[1], preset=PRESET, progress=lambda said: print(said, flush=True))
+    learn_images(skin, sys.argv[1], preset=PRESET, progress=lambda report: print(report, flush=True))
 """
 
 
@@ -165,15 +165,15 @@ def test_another_skin_is_refused(small_skin, learnt):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"preset": "fast"}, "preset must be"),
         ({"design": "u"}, "design must"),
         ({"touches": 0}, "touches must be a whole number, 1 or more; it is 0"),
     ],
 )
-def test_bad_arguments(small_skin, tmp_path, change, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(small_skin, tmp_path, change, message):
+    with pytest.raises(ValueError, match=message):
         learn_images(small_skin, tmp_path, **change)
 
 
@@ -201,8 +201,8 @@ def test_the_number_of_touches(small_skin, tmp_path, monkeypatch):
 
     monkeypatch.setattr("jeit.touch.networks.learn.detection_noise", lambda skin: 1e-3)
 
-    def stop(said):
-        if said.startswith("touches held-out"):
+    def stop(message):
+        if message.startswith("touches held-out"):
             raise Stopped
 
     with pytest.raises(Stopped):

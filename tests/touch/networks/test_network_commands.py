@@ -132,7 +132,7 @@ def test_stream_from_standard_input(imaging, recorded, run, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--method", "network"), "--method network needs --model"),
         (("--model", "MODEL"), "--model is for --method network"),
@@ -140,12 +140,12 @@ def test_stream_from_standard_input(imaging, recorded, run, tmp_path, monkeypatc
         (("--method", "network", "--model", "nowhere"), "there is no such file"),
     ],
 )
-def test_incompatible_options(imaging, recorded, run, tmp_path, options, said):
+def test_incompatible_options(imaging, recorded, run, tmp_path, options, message):
     options = [imaging[0] if one == "MODEL" else one for one in options]
     given = recorded / "touched.npz", "--reference", recorded / "rest.npz", "--output", tmp_path, *options
     status, _, error = run("reconstruct", *given)
     assert status == 1
-    assert said in error
+    assert message in error
 
 
 def test_another_protocol_is_refused(small_skin, imaging, recorded, run, tmp_path):

@@ -259,8 +259,8 @@ def test_shuffled_maps_belong_to_other_touches(other):
 def test_training_interrupted_between_chunks_continues_to_the_same_bits(paper, stored, other, tmp_path):
     messages = []
 
-    def stop(said):
-        messages.append(said)
+    def stop(message):
+        messages.append(message)
         if len(messages) == 2 * PLAN.epochs + 1:
             raise Stopped
 

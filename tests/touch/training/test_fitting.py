@@ -91,8 +91,8 @@ def test_interrupted_training_resumes_to_the_same_bits(tmp_path):
     whole = fit(*given, key=KEY)
     reports = []
 
-    def stop(said):
-        reports.append(said)
+    def stop(report):
+        reports.append(report)
         if len(reports) in (3, 7):
             raise Stopped
 
@@ -116,8 +116,8 @@ def test_killed_at_any_moment(tmp_path, trained):
         "import sys\n"
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
         "from test_fitting import KEY, OBJECTIVE, PLAN, fit, network, rows\n"
-        "def report(said):\n    print(said, flush=True)\n"
-        "fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY, checkpoint=sys.argv[1], progress=report)\n",
+        "def show(report):\n    print(report, flush=True)\n"
+        "fit(network(), OBJECTIVE, rows(500), rows(100, 1), PLAN, key=KEY, checkpoint=sys.argv[1], progress=show)\n",
         "utf-8",
     )
     command = [sys.executable, str(script), str(tmp_path / "killed")]
@@ -128,10 +128,10 @@ def test_killed_at_any_moment(tmp_path, trained):
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert process.returncode == -signal.SIGKILL
-    said = []
+    report = []
     given = network(), OBJECTIVE, rows(500), rows(100, 1), PLAN
-    found = fit(*given, key=KEY, checkpoint=tmp_path / "killed", progress=said.append)
-    assert 0 < len(said) < len(trained.course.steps)
+    found = fit(*given, key=KEY, checkpoint=tmp_path / "killed", progress=report.append)
+    assert 0 < len(report) < len(trained.course.steps)
     assert bits(found.network) == bits(trained.network)
 
 
@@ -229,7 +229,7 @@ def test_leaves_that_are_not_trained():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"training": (np.zeros((3, 2)), np.zeros((4, 1)))}, "training must be arrays of one and the same number"),
         ({"validation": ()}, "validation must be arrays"),
@@ -237,9 +237,9 @@ def test_leaves_that_are_not_trained():
         ({"objective": loss}, "objective must be an Objective"),
     ],
 )
-def test_bad_arguments(change, said):
+def test_bad_arguments(change, message):
     given = {"objective": OBJECTIVE, "training": rows(10), "validation": rows(10), "key": KEY, **change}
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         fit(network(), given.pop("objective"), given.pop("training"), given.pop("validation"), **given)
 
 

@@ -47,7 +47,7 @@ def put(path, first, head, rest):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         (lambda first, head, rest: (b"something", head, rest), "of another kind"),
         (lambda first, head, rest: (first, {**head, "kind": "a map"}, rest), "it is 'a map'"),
@@ -63,10 +63,10 @@ def put(path, first, head, rest):
         (lambda first, head, rest: (first, head, b"x" * len(rest)), "magic string"),
     ],
 )
-def test_files_of_another_kind(written, change, said):
+def test_files_of_another_kind(written, change, message):
     path, _ = written
     put(path, *change(*parts(path)))
-    with pytest.raises(ValueError, match=said) as error:
+    with pytest.raises(ValueError, match=message) as error:
         read_model(path, KIND, 1, make)
     assert str(path) in str(error.value)
 

@@ -118,7 +118,7 @@ def test_a_set_is_resumed(sheet, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("make", "message"),
     [
         (lambda skin, draws: Indent("ball", 1e-3), "indenter must be an indenter"),
         (lambda skin, draws: Indent(Disc(0.01), 0.0), "depth must be a positive length"),
@@ -135,6 +135,6 @@ def test_a_set_is_resumed(sheet, tmp_path):
         (lambda skin, draws: simulate_presses("set", "here"), "presses must be a PressSet"),
     ],
 )
-def test_bad_arguments(sheet, draws, make, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(sheet, draws, make, message):
+    with pytest.raises(ValueError, match=message):
         make(sheet, draws)

@@ -127,11 +127,11 @@ def test_xarray_opens_the_set_and_its_frames_are_those_of_the_skin(presses, whol
 
 
 def test_a_finished_set_is_not_simulated_again(presses, whole, solved):
-    before, said = contents(whole), []
-    simulate_presses(presses, whole, progress=said.append)
+    before, reports = contents(whole), []
+    simulate_presses(presses, whole, progress=reports.append)
     assert solved == []
     assert contents(whole) == before
-    assert [now[:4] for now in said] == [(16, 16, 2, 2)]
+    assert [now[:4] for now in reports] == [(16, 16, 2, 2)]
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs kill -9")

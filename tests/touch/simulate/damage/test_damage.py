@@ -125,7 +125,7 @@ def test_a_recording_continues_through_damage_and_repair():
 
 
 @pytest.mark.parametrize(
-    ("ask", "said"),
+    ("ask", "message"),
     [
         (lambda: Cut([(0, 0)]), "path"),
         (lambda: Cut([(0, 0), (0, 0)]), "path"),
@@ -139,6 +139,6 @@ def test_a_recording_continues_through_damage_and_repair():
         (lambda: Mishap(-1.0), "time"),
     ],
 )
-def test_bad_input_is_refused(ask, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_input_is_refused(ask, message):
+    with pytest.raises(ValueError, match=message):
         ask()

@@ -136,7 +136,7 @@ def test_a_set_is_generated_and_saved(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("action", "said"),
+    ("action", "message"),
     [
         (lambda: Person.draw(0), "key must be one random key"),
         (lambda: Person(np.zeros((6, 4))), "medians have shape"),
@@ -156,6 +156,6 @@ def test_a_set_is_generated_and_saved(tmp_path):
         (lambda: still_skin().record_each(KEY, [1]), r"recordings\[0\]"),
     ],
 )
-def test_bad_arguments(action, said):
-    with pytest.raises(ValueError, match=said):
+def test_bad_arguments(action, message):
+    with pytest.raises(ValueError, match=message):
         action()
