@@ -216,8 +216,9 @@ def test_bad_arguments_are_refused(call, complaint):
 def test_the_paper_measures_94_of_496_pairs():
     """Park et al. 2022: 32 electrodes inside 200 × 200 mm.
 
-    Conductance varies by 25 % (2.5 of 10 mm pressed in) over 38 mm, the electrodes' pitch; noise is 1e-4 of a voltage.
-    With finer detail or more noise the 94 keep less, and so does any other 94: see `information_bound`.
+    Conductance varies by 25 % (2.5 of 10 mm pressed in) over 38 mm, the electrodes' pitch, and noise is 1e-4 of a
+    voltage. With finer detail or more noise the 94 keep less, and so does any other selection of 94: see
+    `information_bound`.
     """
     layout = named_layout("park-inner")
     mesh = rectangle(0.2, 0.2, cell_size=0.012, refine=Refine(layout.centres, cell_size=2.5e-3, distance=3e-3))

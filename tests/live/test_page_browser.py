@@ -1,7 +1,8 @@
 """The page of a live session in a real browser, Debian's Chromium, driven by Playwright.
 
-What is drawn is read from the canvas: the place of a Gaussian and of a rod, which are known, against the place of the
-strongest colour; each button, key and field by what it changes. Skipped where there is no browser or no Playwright.
+Drawn pictures are read from the canvas: the known place of a Gaussian or of a rod is compared with the place of the
+strongest colour. Each button, key and field is tested by its effect. Skipped where there is no browser or no
+Playwright.
 """
 
 import os
@@ -123,7 +124,7 @@ def resident_memory():
 
 
 def drawn(page):
-    """Number of the frame whose picture is drawn; -1 before the first."""
+    """Number of the frame whose picture is drawn, or -1 before the first."""
     return int(page.get_attribute("#image", "data-number") or -1)
 
 
